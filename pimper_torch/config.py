@@ -117,7 +117,6 @@ def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Confi
     unions, and dataclasses of these. Inverse of :func:`to_mapping`.
 
     Args:
-        cls: The dataclass.
         mapping: Keys are names of fields.
         where: What the mapping is, for messages; a file's name for instance.
 
@@ -344,7 +343,7 @@ def _convert_union(
 
 
 def _scalar(hint: type[object], value: object) -> object | None:
-    """Give the value as a ``hint``, or None where it is something else."""
+    """Return the value as a ``hint``, or None where it is something else."""
     if issubclass(hint, Enum):
         return hint.__members__.get(value) if isinstance(value, str) else None
     if hint is bool or isinstance(value, bool):

@@ -77,7 +77,6 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
     """Note what failed and was left out; outside of :func:`collecting`, warn of it at once.
 
     Args:
-        failures: What failed.
         error: That they failed with.
 
     Raises:
@@ -129,8 +128,6 @@ def solved_or(
         solve: What may fail.
         otherwise: Gives what stands in for the solution.
         stage: Named in the failure.
-        name: Of the system.
-        done: What stands in.
         memory: Whether that also helps where memory does not suffice.
     """
     try:
@@ -146,14 +143,14 @@ def solved_or(
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Tell whether an allocation failed."""
+    """Return whether an allocation failed."""
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
 
 
 def by_data(error: BaseException) -> bool:
-    """Tell whether numbers may have caused an error, rather than a mistake in a program.
+    """Return whether numbers may have caused an error, rather than a mistake in a program.
 
     >>> by_data(torch.linalg.LinAlgError("singular")), by_data(KeyError("lights"))
     (True, False)
@@ -164,7 +161,7 @@ def by_data(error: BaseException) -> bool:
 
 
 def reason_of(error: BaseException) -> str:
-    """Give an error in a line."""
+    """Return an error in a line."""
     text = " ".join(str(error).split()).rstrip(".")
     return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
 
@@ -224,7 +221,7 @@ def released(error: Exception) -> Exception:
 
 
 def halved(stage: str, name: str, error: BaseException) -> Failure:
-    """Say that work was divided for lack of memory."""
+    """State that work was divided for lack of memory."""
     return Failure(
         stage=stage,
         what="memory",

@@ -102,7 +102,7 @@ def _common(first: str, second: str) -> int:
 
 
 def _best(name: str, several: Sequence[str], folder: str) -> list[int]:
-    """Give the positions of those whose folders agree with a name's best, then the name itself."""
+    """Return positions of those whose folders agree with a name's best, then the name itself."""
     path = f"{folder}/{name}" if folder else name
     scores = [(_common(path, other), other == name) for other in several]
     return [index for index, score in enumerate(scores) if score == max(scores)]

@@ -197,7 +197,7 @@ def repeat_entries(kept: Sequence[Mapping[str, Any]]) -> None:
 
 
 def closing_line(left_out: Sequence[LeftOut]) -> str:
-    """Say in a line what guards left out, each in its last pass; empty where hardly anything.
+    """State in a line what guards left out, each in its last pass; empty where hardly anything.
 
     >>> cut = LeftOut(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")
     >>> closing_line([cut])

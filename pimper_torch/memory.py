@@ -75,7 +75,7 @@ def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -
 
 
 def resident_bytes() -> float:
-    """Give what the process holds now; 0 where the system does not tell."""
+    """Return what the process holds now; 0 where the system does not tell."""
     with suppress(OSError, IndexError, ValueError):
         fields = Path("/proc/self/status").read_text(encoding="ascii")
         return 1024.0 * float(fields.split("VmRSS:")[1].split()[0])
@@ -83,7 +83,7 @@ def resident_bytes() -> float:
 
 
 def release_memory() -> None:
-    """Give memory that was freed back to the system, where glibc can.
+    """Return memory that was freed to the system, where glibc can.
 
     With 30 photographs of 1600x1200 the threads that write them leave 400 MB, COLMAP's as much
     again, and patches before the fusion some 200, which would add to what comes after.

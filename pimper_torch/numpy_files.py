@@ -37,7 +37,6 @@ def read_npz(
     """Read arrays of an archive that :func:`numpy.savez` wrote, compressed or not.
 
     Args:
-        path: The file.
         wanted: Tells the names of arrays to read; others are not looked at.
 
     Raises:

@@ -28,7 +28,7 @@ _working: ContextVar[bool] = ContextVar("working", default=False)
 
 
 def num_workers() -> int:
-    """Give how many batches are worked on side by side: as many as torch has threads."""
+    """Return how many batches are worked on side by side: as many as torch has threads."""
     return 1 if _working.get() else torch.get_num_threads()
 
 
@@ -70,7 +70,6 @@ def over_rows(
     Args:
         kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
         rows: How many there are.
-        arguments: Of the kernel.
         size: How many rows of usual work one of them is.
 
     Returns:
@@ -88,7 +87,7 @@ def over_rows(
 
 @cache
 def _idle(workers: int) -> ThreadPoolExecutor:
-    """Give threads that wait for work as long as the process lives."""
+    """Return threads that wait for work as long as the process lives."""
     return ThreadPoolExecutor(workers, thread_name_prefix="rows")
 
 

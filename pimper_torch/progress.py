@@ -16,7 +16,7 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 def report(done: int, total: int) -> None:
-    """Tell the listener, if any, that ``done`` of ``total`` steps are behind us."""
+    """Report the listener, if any, that ``done`` of ``total`` steps are behind us."""
     listener = _listener.get()
     if listener is not None:
         listener(done, total)
@@ -47,7 +47,6 @@ def part(place: int, count: int) -> Iterator[None]:
 
     Args:
         place: Of the part, from 0.
-        count: Of parts.
     """
     whole = _listener.get()
 

@@ -220,7 +220,7 @@ def repeat(reports: Sequence[StageReport]) -> None:
 
 
 def peak_memory_mb() -> float:
-    """Give the highest resident memory of this process so far; 0 where the system does not tell."""
+    """Return highest resident memory of this process so far; 0 where the system does not tell."""
     if sys.platform == "win32":
         return 0.0
     import resource
@@ -231,7 +231,7 @@ def peak_memory_mb() -> float:
 
 @singledispatch
 def figures(record: object) -> dict[str, int | float]:
-    """Give the counts and fractions of a record that are worth telling."""
+    """Return the counts and fractions of a record that are worth telling."""
     return {}
 
 

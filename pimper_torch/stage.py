@@ -50,7 +50,7 @@ class Given(Stage, Generic[T]):
         self.record = record
 
     def forward(self, *_: object) -> T:
-        """Give it."""
+        """Return it."""
         return self.record
 
 
@@ -73,7 +73,7 @@ def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, obje
 def _handed(
     stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]
 ) -> list[tuple[str, object, object]]:
-    """Give the names, values and annotated types of what ``forward`` is handed."""
+    """Return the names, values and annotated types of what ``forward`` is handed."""
     try:
         bound = inspect.signature(stage.forward).bind(*args, **kwargs)
     except TypeError:

@@ -43,8 +43,6 @@ def read_camera_arrays(
     their names (``10`` before ``2``), of which there are as many.
 
     Args:
-        path: The file.
-        photographs: Their names.
         sizes_of: Of photographs, which the lenses are for.
 
     Returns:
@@ -84,10 +82,6 @@ def read_world_mats(
     ``world_mat_i`` is ``K [R t]`` as a 4x4 matrix, from the world to pixels, with our camera
     axes. IDR and NeuS cast rays through whole numbers (``uv`` of ``mgrid``, ``pixels_x`` of
     ``arange``): they count centres from 0, so half a pixel is added.
-
-    Args:
-        path: The file.
-        count: Of photographs.
 
     Returns:
         ``K`` with its skew, and ``cam_from_world``.

@@ -77,7 +77,7 @@ def inside(folder: Path, name: str, kind: str) -> Path:
 
 
 def first_of(candidates: Sequence[Path]) -> Path | None:
-    """Give the first path that exists."""
+    """Return the first path that exists."""
     return next((path for path in candidates if path.exists()), None)
 
 
@@ -140,7 +140,6 @@ def numbers(
         value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
         count: How many are needed.
         what: Their name in the file.
-        path: The file.
         kind: The data set, as its users call it.
 
     Raises:

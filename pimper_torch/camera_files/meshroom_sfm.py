@@ -105,7 +105,7 @@ def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, pa
 def _focal(
     entry: Mapping[str, object], version: tuple[int, ...], width: int, path: Path
 ) -> Float[Tensor, "2"]:
-    """Give the focal lengths in pixels, in the words of every version of the file."""
+    """Return the focal lengths in pixels, in the words of every version of the file."""
 
     def value(key: str, count: int = 1, default: object = None) -> Float[Tensor, " value"]:
         return numbers(entry.get(key, default), count, f"{key} of an intrinsic", path, KIND)

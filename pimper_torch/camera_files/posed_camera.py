@@ -48,7 +48,7 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
 def pinhole_lens(
     intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
 ) -> Lens:
-    """Give the lens of a pinhole's ``K``, but for its skew."""
+    """Return the lens of a pinhole's ``K``, but for its skew."""
     fx, fy, cx, cy = (float(intrinsics[row, column]) for row, column in _PINHOLE)
     return Lens(
         camera=camera, model="PINHOLE", params=(fx, fy, cx, cy), width=size_px[0], height=size_px[1]

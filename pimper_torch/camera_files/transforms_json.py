@@ -25,7 +25,7 @@ _POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL",
 
 
 def read_frames(path: Path) -> list[dict[str, object]]:
-    """Give the frames, each with what the whole file says.
+    """Return the frames, each with what the whole file says.
 
     Raises:
         InputError: The file has another structure, or a frame names no photograph.
@@ -50,7 +50,6 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     centre is that of the image's area: their pixels are ours.
 
     Args:
-        path: The file.
         sizes_of: Of photographs, by ``file_path``.
 
     Returns:
@@ -71,7 +70,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
 
 
 def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
-    """Give a frame's width and height, where the file says them."""
+    """Return a frame's width and height, where the file says them."""
     sides = frame.get("w"), frame.get("h")
     if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
         return None
@@ -87,7 +86,6 @@ def frame_camera(
         frame: Of :func:`read_frames`.
         name: Of its photograph, for messages too.
         size_px: That the lens is for.
-        path: The file.
 
     Raises:
         InputError: It is no camera.

@@ -158,7 +158,7 @@ class Chain(Stage):
         sparse_model: Path | str | None,
         mesh: Mesh | None = None,
     ) -> SparseScene:
-        """Give photographs with their cameras: those that come with them, or else find them.
+        """Return photographs with their cameras: those that come with them, or else find them.
 
         Views that cannot be used are left out. A scene without observed points gets some, unless a
         mesh stands in for them.
@@ -202,8 +202,6 @@ class Chain(Stage):
             mesh: If any. With photographs, in the frame of their cameras' model, with a scene in
                 that of the scene.
             views: What the chain was called with.
-            scene: What it became.
-            silhouettes: Of it.
 
         Raises:
             InputError: The mesh is no surface, or in another frame.

@@ -36,7 +36,6 @@ def kept_call(
 
     Args:
         store: Where records are; without, it is called.
-        name: Of the stage.
         call: The stage, or a function.
         inputs: What it is called with.
         derived: What it is called with by name, which follows from the inputs.
@@ -92,7 +91,7 @@ def _module(stage: nn.Module) -> str:
 
 
 def _returns(call: Callable[..., object]) -> type[Record] | None:
-    """Give the record that a call is annotated to return."""
+    """Return the record that a call is annotated to return."""
     function = call.forward if isinstance(call, nn.Module) else call
     cls: Any = typing.get_type_hints(function).get("return")
     return cls if isinstance(cls, type) and issubclass(cls, Record) else None

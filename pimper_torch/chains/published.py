@@ -137,5 +137,5 @@ class Published(Chain):
 def photometry(
     warp: Warping, factorize: Factorizing, views: Views, cameras: Cameras, patches: PatchSet
 ) -> PhotometricPatches:
-    """Give normals, albedo and light of all patches."""
+    """Return normals, albedo and light of all patches."""
     return factorize(warp(views, cameras, patches, None))

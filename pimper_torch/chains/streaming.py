@@ -67,14 +67,14 @@ class Prepared:
     _sources: Sources | None = None
 
     def hidden_by(self, patches: PatchSet) -> Sources | None:
-        """Give them with the surface that occludes: the one before, or the facets."""
+        """Return the views with the surface that occludes: the one before, or the facets."""
         if not isinstance(self.warp, Prepares):
             return None
         self._sources = self._sources or self.warp.prepare(self.views)
         return self._sources.hidden_by(patches.surface or patches.coarse.mesh)
 
     def release(self) -> None:
-        """Give back their memory."""
+        """Return their memory."""
         self._sources = None
 
 
@@ -102,7 +102,7 @@ def photometry_and_heights(
     patches: PatchSet,
     sources: Prepared | None = None,
 ) -> SweptPatches:
-    """Give normals, albedo, light and swept heights of all patches.
+    """Return normals, albedo, light and swept heights of all patches.
 
     What the three stages give one after the other, called with all patches, but for the samples
     that light is fitted to; a factorization that is not :class:`InParts` is called so.
@@ -111,9 +111,6 @@ def photometry_and_heights(
         warp: Resamples views on some buckets.
         factorize: Separates albedo, normals and light.
         sweep: Finds heights under that light.
-        views: Photographs.
-        cameras: Of all views.
-        patches: The decomposition.
         sources: The photographs as the warp prepares them; prepared for this call alone if not
             given.
 
@@ -176,6 +173,6 @@ class _Clock:
             self.seconds[part] = self.seconds.get(part, 0.0) + took
 
     def fractions(self) -> dict[str, float]:
-        """Give each part's fraction of the whole."""
+        """Return each part's fraction of the whole."""
         whole = sum(self.seconds.values()) or 1.0
         return {f"{part}_share": took / whole for part, took in self.seconds.items()}

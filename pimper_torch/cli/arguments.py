@@ -126,7 +126,7 @@ def _entry(option: Option, width: int) -> list[str]:
 
 
 def _value(option: Option, longest: int) -> str:
-    """Give what follows an option; where its choices are too long, a word for them."""
+    """Return what follows an option; where its choices are too long, a word for them."""
     if option.value.startswith("{") and len(option.value) > longest:
         return option.names[-1].lstrip("-").upper()
     return option.value
@@ -148,7 +148,7 @@ def _paragraph(told: str, name: str, options: Iterator[Option], arguments: Seque
 
 
 def _given(option: str, arguments: Sequence[str]) -> str:
-    """Give what stands behind an option, as it was written."""
+    """Return what stands behind an option, as it was written."""
     for index, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name.replace("_", "-") == option:

@@ -18,7 +18,7 @@ _LESS = (
 
 
 def tell_death(ended: int, said: str) -> int:
-    """Tell why the work ended, what to do, and what is kept.
+    """Report why the work ended, what to do, and what is kept.
 
     Args:
         ended: The exit code of a process that told nothing; less than 0, of which signal it died.
@@ -60,7 +60,7 @@ def _what(name: str) -> str:
 
 
 def _kept(arguments: Sequence[str]) -> str:
-    """Tell what the folder of the result keeps, as far as the arguments name it."""
+    """Report what the folder of the result keeps, as far as the arguments name it."""
     out = folder_of(arguments)
     if out is None or not out.is_dir():
         return " No result was written."

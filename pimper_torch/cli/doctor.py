@@ -21,7 +21,7 @@ from pimper_torch.reporting import stage
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Tell what is installed here, and whether photographs are fit for a run, in seconds.
+    """Report what is installed here, and whether photographs are fit for a run, in seconds.
 
     Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, how much the
     light varies, and an estimate of time and memory; each with what to do. Exit code 2 where

@@ -206,7 +206,7 @@ def _loaded(home: str) -> types.ModuleType:
 
 
 def _failed(output: Output, error: BaseException) -> int:
-    """Tell why a command failed, and give its exit code."""
+    """Report why a command failed, and give its exit code."""
     kind = type(error).__name__
     if isinstance(error, BrokenPipeError):
         raise error
@@ -233,7 +233,7 @@ def _failed(output: Output, error: BaseException) -> int:
 
 
 def _of_the_world(error: BaseException) -> str | None:
-    """Tell of an error that is no fault of the package what to do; ``None`` of any other."""
+    """Report of an error that is no fault of the package what to do; ``None`` of any other."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return (
             "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "

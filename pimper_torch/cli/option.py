@@ -95,7 +95,7 @@ def meanings(documented: object) -> dict[str, str]:
 
 
 def summary(documented: object) -> str:
-    """Give the paragraphs of a docstring that come before its sections."""
+    """Return the paragraphs of a docstring that come before its sections."""
     text = inspect.cleandoc(documented.__doc__ or "")
     return plain(re.split(r"\n\n\w+:\n", text)[0])
 
@@ -149,7 +149,7 @@ def _fields(given: _Given, name: str, kind: type, default: object) -> Iterator[O
 
 
 def value_of(kind: object, between: str = " ") -> str:
-    """Say in a word what a type's values are.
+    """State in a word what a type's values are.
 
     >>> value_of(Literal["auto", "none"] | float)
     '{auto,none}|FLOAT'

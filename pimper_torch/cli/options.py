@@ -175,8 +175,6 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
             photos: Folder of JPEG, PNG or TIFF files.
             out: Folder for the result; new or empty.
             inputs: What the photographs come with.
-            common: The run.
-            config: The stages.
         """
         return Job(photos=photos, out=out, common=common, inputs=inputs, config=config)
 
@@ -189,8 +187,6 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
 
         Args:
             out: Folder for the result; new or empty.
-            common: The run.
-            config: The stages.
         """
         return Job(photos=bundled_photographs(), out=out, common=common, config=config)
 
@@ -249,7 +245,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
 
 
 def _inputs(job: Job) -> dict[str, Path | None]:
-    """Give what a run reads, by what it is called."""
+    """Return what a run reads, by what it is called."""
     return {
         "PHOTOS": job.photos,
         "--masks": job.inputs.masks,
@@ -260,7 +256,7 @@ def _inputs(job: Job) -> dict[str, Path | None]:
 
 
 def _references(config: Config) -> set[str]:
-    """Give the names of photographs that settings ask for."""
+    """Return the names of photographs that settings ask for."""
     of_stages = [config.coarse_surface.reference]
     if isinstance(config, PublishedConfig):
         of_stages.append(config.triangulate.reference)
@@ -268,7 +264,7 @@ def _references(config: Config) -> set[str]:
 
 
 def bundled_photographs() -> Path:
-    """Give the folder of the skull's photographs; their licence lies beside them."""
+    """Return the folder of the skull's photographs; their licence lies beside them."""
     return Path(str(resources.files("pimper_torch"))) / "data" / "skull"
 
 

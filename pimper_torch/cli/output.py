@@ -65,12 +65,12 @@ class Output:
             sys.stdout.flush()
 
     def say(self, text: str) -> None:
-        """Tell on standard output what a command was asked for."""
+        """Report on standard output what a command was asked for."""
         if not self.as_json:
             sys.stdout.write(text.rstrip("\n") + "\n")
 
     def remark(self, text: str) -> None:
-        """Tell on standard output where a result is; ``--quiet`` leaves it out."""
+        """Report on standard output where a result is; ``--quiet`` leaves it out."""
         if self.shows("info"):
             self.say(text)
 
@@ -79,13 +79,13 @@ class Output:
         self.event("result", paths=paths or {}, **figures)
 
     def warning(self, message: str) -> None:
-        """Tell a warning."""
+        """Report a warning."""
         self.event("warning", message=message)
         if not self.as_json and self.shows("warning"):
             told("warning", message)
 
     def error(self, kind: str, message: str, exit_code: int) -> None:
-        """Tell why a command failed: on standard error in any case."""
+        """Report why a command failed: on standard error in any case."""
         self.event("error", kind=kind, message=message, exit_code=exit_code)
         told("error", message)
 
@@ -159,7 +159,7 @@ def plain(value: object) -> object:
 
 
 def told(kind: str, message: str) -> None:
-    """Tell something on standard error, in one paragraph."""
+    """Report something on standard error, in one paragraph."""
     from rich.console import Console
     from rich.text import Text
 

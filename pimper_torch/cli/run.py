@@ -89,7 +89,7 @@ def _preview(output: Output, path: Path, scene: SparseScene, coarse: CoarseMesh)
 
 
 def _store(job: Job) -> Store:
-    """Give the folder that every stage's record is kept in."""
+    """Return the folder that every stage's record is kept in."""
     common = job.common
     folder = common.cache or job.out / STAGES
     max_bytes = bytes_of(common.max_kept)
@@ -150,7 +150,7 @@ def _check_device(device: str) -> None:
 
 
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
-    """Say what came out and where it is."""
+    """State what came out and where it is."""
     fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
     output.remark(f"{_costs(result)}\n{headline(result)}")
     if result.scene.doubt:
@@ -164,7 +164,7 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
 
 
 def _costs(result: Reconstruction) -> str:
-    """Tell what every stage took, in columns."""
+    """Report what every stage took, in columns."""
     return "\n".join(
         ["stage             seconds   peak MB"]
         + [

@@ -128,7 +128,7 @@ def _comment(text: str, indent: str) -> list[str]:
 
 
 def _explained(job: _Job, owner: object, value: object) -> str:
-    """Tell what a setting means, what it may be, and how it is set."""
+    """Report what a setting means, what it may be, and how it is set."""
     name, kind = job.path[-1], type(owner)
     option = f"--{'.'.join(job.path)}".replace("_", "-")
     meaning = meanings(kind).get(name, "")

@@ -13,7 +13,7 @@ from pimper_torch.size.scaled import scaled
 
 
 def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
-    """Give scale bars with the sizes of the files, whose pixels they are in.
+    """Return scale bars with the sizes of the files, whose pixels they are in.
 
     People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
 
@@ -58,7 +58,7 @@ def sized(
 
 
 def told_size(scale: Scale) -> str:
-    """Say in a sentence what the size was taken from."""
+    """State in a sentence what the size was taken from."""
     if scale.count == 1:
         return f"Lengths are in {scale.unit}, by one {scale.source.removesuffix('s')}."
     return (

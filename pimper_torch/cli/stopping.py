@@ -32,7 +32,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def exit_code(error: BaseException) -> int:
-    """Give the exit code of an interrupted command, as shells have it: 128 and the signal.
+    """Return the exit code of an interrupted command, as shells have it: 128 and the signal.
 
     >>> exit_code(Stopped(signal.SIGTERM)), exit_code(KeyboardInterrupt())
     (143, 130)
@@ -64,7 +64,7 @@ def leave_at_once(number: int, frame: types.FrameType | None) -> None:
 
 
 def say(text: str, code: int) -> None:
-    """Tell why a command ended, with nothing but the system's calls."""
+    """Report why a command ended, with nothing but the system's calls."""
     if "--json" in sys.argv:
         line = f'{{"event": "error", "kind": "Interrupted", "message": "{text}", '
         _write(sys.__stdout__, f'{line}"exit_code": {code}}}\n')

@@ -87,7 +87,7 @@ class _Watch:
             os.kill(self.worker, number)
 
     def waited(self, number: int, frame: types.FrameType | None) -> None:
-        """Tell that the worker is still busy with what cannot be interrupted."""
+        """Report that the worker is still busy with what cannot be interrupted."""
         with suppress(OSError):  # the terminal is closed
             os.write(2, b"stopping after this step; Ctrl-C again ends it at once.\n")
 

@@ -19,7 +19,7 @@ _MIN_INFORMATION = 1e-6
 def point_covariances(
     scene: SparseScene, index: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
-    r"""Give the covariance of triangulated points.
+    r"""Return the covariance of triangulated points.
 
     .. math:: C = \sigma^2 \Big( \sum_{views} J^T J \Big)^{-1}
 

@@ -20,7 +20,6 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     of the photographs before undistortion.
 
     Args:
-        scene: Photographs and cameras.
         silhouettes: Of all views; unreliable ones mask their photographs too. Silhouettes that
             constrain nothing give the scene as it is.
     """
@@ -47,7 +46,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 
 def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
-    """Give the corners of boxes round the silhouettes, first inside, then outside."""
+    """Return the corners of boxes round the silhouettes, first inside, then outside."""
     masks = silhouettes.masks
     ends = []
     for along in (masks.any(dim=1), masks.any(dim=2)):  # columns, then rows

@@ -60,7 +60,7 @@ class DensifyConfig:
         require_at_most(self, coarsest_px=65_535, levels=16, max_hypotheses=10_000)
 
     def factors(self, longest_px: int) -> tuple[int, ...]:
-        """Give by how much photographs of that size are reduced, the coarsest first."""
+        """Return by how much photographs of that size are reduced, the coarsest first."""
         coarsest = max(1, round(longest_px / self.coarsest_px))
         return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(self.levels)))
 
@@ -95,8 +95,6 @@ def depth_maps(
 
     Args:
         scene: Photographs, cameras and cloud.
-        points: Reliable ones.
-        config: Settings.
 
     Returns:
         The maps of every resolution, the coarsest first.
@@ -226,7 +224,7 @@ def sweep(
 
 
 def _checked(factor: int, level: Level, found: Sequence[_Found]) -> DepthMaps:
-    """Mark as valid the depths whose windows match and that other views agree with."""
+    """Find as valid the depths whose windows match and that other views agree with."""
     inverse_depth = torch.stack([one.inverse_depth for one in found])
     score = torch.stack([one.score for one in found])
     sources = torch.full((len(found), _NUM_SOURCES), -1, device=score.device)

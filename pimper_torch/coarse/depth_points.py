@@ -54,10 +54,7 @@ _MAPS = DensifyConfig(levels=4)
 
 @torch.no_grad()
 def depth_points(scene: SparseScene) -> SparseScene:
-    """Give a scene points of depth maps that three views show, beside its own.
-
-    Args:
-        scene: Cameras and photographs.
+    """Return a scene points of depth maps that three views show, beside its own.
 
     Returns:
         Cameras untouched. A constant to autograd. A :class:`~pimper_torch.errors.PimperWarning`
@@ -82,7 +79,7 @@ def depth_points(scene: SparseScene) -> SparseScene:
 
 
 def _confirmed(maps: DepthMaps) -> float:
-    """Give the fraction of the pixels that one view agrees with where a second one does, too."""
+    """Return the fraction of the pixels that one view agrees with where a second one does, too."""
     once = int((maps.agreed >= 1).sum())
     return int((maps.agreed >= 2).sum()) / max(once, 1)
 
@@ -140,7 +137,7 @@ def _along_rays(cameras: Cameras, views: Views, view: int) -> Float[Tensor, "poi
 
 
 def _distance(cameras: Cameras, view: int) -> Float[Tensor, ""]:
-    """Give the distance to the point nearest to all optical axes, or else to the other cameras."""
+    """Return distance to the point nearest to all optical axes, or else to the other cameras."""
     axes, centers = cameras.cam_from_world[:, 2, :3].double(), cameras.centers_world.double()
     across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None, :]
     right = (across @ centers[..., None]).sum(dim=0)[:, 0]
@@ -157,7 +154,7 @@ def _distance(cameras: Cameras, view: int) -> Float[Tensor, ""]:
 def _framed(
     points: Float[Tensor, "point 3"], cameras: Cameras, views: Views
 ) -> tuple[Bool[Tensor, "point view"], Bool[Tensor, "point view"]]:
-    """Mark which views have points in their frames, and which show them in their masks."""
+    """Find which views have points in their frames, and which show them in their masks."""
     framed, shown = [], []
     for view in range(cameras.num_views):
         pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
@@ -173,7 +170,7 @@ def _framed(
 def _points_of(
     scene: SparseScene, maps: DepthMaps, view: int
 ) -> tuple[Float[Tensor, "point view 2"], Bool[Tensor, "point view"]]:
-    """Give where views show points of one depth map that another map agrees with.
+    """Return where views show points of one depth map that another map agrees with.
 
     In views whose own map agrees, it says where; in others that look alike there, this map does.
     """
@@ -193,7 +190,7 @@ def _points_of(
 def _in_source(
     maps: DepthMaps, view: int, source: int, chosen: Bool[Tensor, "height width"]
 ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-    """Give where a source shows the points of a view's pixels, and whether it does."""
+    """Return where a source shows the points of a view's pixels, and whether it does."""
     one = torch.tensor([source], device=chosen.device)
     pairing = pair(maps.level, view, one)
     field, there = maps.inverse_depth[view], maps.agreed > 0

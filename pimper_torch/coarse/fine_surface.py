@@ -112,7 +112,7 @@ class FineSurface(Record):
     pixel: float
 
     def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
-        """Give facets the support that this surface has nearest to most of their points."""
+        """Assign facets the support that this surface has nearest to most of their points."""
         centre = self.vertices_world[self.faces].mean(dim=1)
         points = torch.einsum("pk,fkc->fpc", corners.new_tensor(_VOTES) / 6, corners)
         tree = cKDTree(centre.detach().cpu().numpy())
@@ -139,7 +139,6 @@ def fine_surface(
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
         densify: How photographs are matched.
-        config: Settings.
 
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
@@ -181,7 +180,7 @@ def fine_surface(
 
 
 def min_fraction(contours: Contours) -> float:
-    """Give the fraction of the supported area that a component needs."""
+    """Return the fraction of the supported area that a component needs."""
     return _MIN_FRACTION_INSIDE if contours.confine else _MIN_FRACTION
 
 
@@ -238,13 +237,9 @@ def visible_vertices(
     cameras: Cameras,
     tolerance: float,
 ) -> Bool[Tensor, " vertex"]:
-    """Mark the vertices that face a camera and are not occluded.
+    """Find the vertices that face a camera and are not occluded.
 
     Args:
-        vertices: Of a surface.
-        faces: Of it.
-        normals: Of its vertices.
-        cameras: Of all views.
         tolerance: A surface closer than this in front of a vertex does not occlude it.
     """
     caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
@@ -261,7 +256,6 @@ def poisson(
     """Put a closed surface through points with outward normals.
 
     Args:
-        cloud: The points.
         cell: Side of the octree's cells, scene units.
     """
     points = cloud.points_world
@@ -281,7 +275,6 @@ def regions_seen_through(
     """Find the connected regions of some faces that views see through over enough of them.
 
     Args:
-        faces: Of the surface.
         some: True for faces that make up the regions.
         through: True for faces that views see through.
     """
@@ -299,7 +292,7 @@ def near_points(
     counts: ViewCounts,
     pixel: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark faces with points, and illuminated faces between points that are near to some.
+    """Find faces with points, and illuminated faces between points that are near to some.
 
     A component of faces further than the margin from all points is not marked if one of them is
     further than the gap: surface that spans a gap inside the object is joined to surface in
@@ -307,9 +300,6 @@ def near_points(
 
     Args:
         faces: Of the closed surface.
-        centre: Of them.
-        cloud: Matched points.
-        support: Of each face.
         counts: Of the views that see each.
         pixel: Size of one, scene units.
     """
@@ -328,11 +318,9 @@ def supports(
     counts: ViewCounts,
     reach: float,
 ) -> Int[Tensor, " face"]:
-    """Give the :class:`~pimper_torch.records.Support` of each face of a fine surface.
+    """Return the :class:`~pimper_torch.records.Support` of each face of a fine surface.
 
     Args:
-        centre: Of the faces.
-        cloud: Matched points.
         contour: Contour points.
         counts: Of the views that see each face.
         reach: Distance to a point, or a contour point, that supports a face.
@@ -358,7 +346,7 @@ def seen_surface(
     config: FineSurfaceConfig,
     fraction: float = _MIN_FRACTION,
 ) -> Bool[Tensor, " face"]:
-    """Mark the faces that stay: in the visual hull, and seen or supported.
+    """Find the faces that stay: in the visual hull, and seen or supported.
 
     Surface without points that views see through is dropped: it closes an opening, or floats in
     the air, and all of it goes where they see through enough of it. Faces that no view sees stay
@@ -367,12 +355,9 @@ def seen_surface(
 
     Args:
         vertices: Of the closed surface.
-        faces: Of it.
-        support: Of each face.
         counts: Of the views that see each.
         inside: True for faces in the visual hull.
         pixel: Size of one, scene units.
-        config: Settings.
         fraction: Of the supported area, that a component needs.
     """
     known = support >= Support.CONTOUR

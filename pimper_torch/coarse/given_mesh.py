@@ -30,8 +30,6 @@ def prepared(
 
     Args:
         mesh: In the scene's frame.
-        scene: Cameras and cloud.
-        silhouettes: Of all views.
 
     Returns:
         The mesh, of the scene's floating-point type and device, and figures of how far off it is.

@@ -23,7 +23,7 @@ _DAMPING = 0.01
 
 
 def normal_weights(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
-    """Give inverse variances of normals about those that facets blend, relative to the best.
+    """Return inverse variances of normals about those that facets blend, relative to the best.
 
     Args:
         information: Inverse variance of the normals, one over squared radians.
@@ -82,7 +82,7 @@ def with_points(
     index: Int[Tensor, " child"],
     source: Int[Tensor, " vertex"],
 ) -> CoarseMesh:
-    """Give the new mesh the points of the cloud on its facets, and the support of its facets.
+    """Return the new mesh the points of the cloud on its facets, and the support of its facets.
 
     A vertex that was a point of the cloud and has moved is none any more: the point lies on a
     facet, at its own position with its own covariance.
@@ -131,7 +131,7 @@ def with_points(
 def _relocated(
     coarse: CoarseMesh, points: FacetPoints, split: Split, index: Int[Tensor, " child"]
 ) -> FacetPoints:
-    """Give the points on facets to the children that they project into, along the old normal."""
+    """Assign the points on facets to the children that they project into, along the old normal."""
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[points.facet]]
     origin, along = corners[:, 0], corners[:, 1] - corners[:, 0]
     normal = torch.linalg.cross(along, corners[:, 2] - origin)

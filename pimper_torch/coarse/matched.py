@@ -26,7 +26,6 @@ def matched_cloud(
     Args:
         scene: Photographs, cameras and cloud.
         reliable: Points of the cloud, 4 at least.
-        config: Settings.
         cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
 
     Returns:
@@ -41,7 +40,7 @@ def matched_cloud(
 
 
 def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
-    """Give the size of a photograph's pixel at reliable points; the median over observations."""
+    """Return the size of a photograph's pixel at reliable points; the median over observations."""
     chosen = torch.isin(scene.observation_point, reliable)
     view, point = scene.observation_view[chosen], scene.observation_point[chosen]
     frames = scene.cameras.cam_from_world[view]
@@ -50,6 +49,6 @@ def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
 
 
 def pixel_size_at(point: Float[Tensor, " 3"], cameras: Cameras) -> float:
-    """Give the size of a photograph's pixel at a point; the median over views."""
+    """Return the size of a photograph's pixel at a point; the median over views."""
     distance = (cameras.centers_world - point).norm(dim=1)
     return float((distance / cameras.intrinsics[:, 0, 0]).median())

@@ -191,7 +191,7 @@ class Matcher:
 def shifted(
     values: Float[Tensor, "height width"], radius: int, padding: Literal["replicate", "constant"]
 ) -> list[Float[Tensor, "height width"]]:
-    """Give one map for each pixel of a window: the values shifted by its offset."""
+    """Return a map for each pixel of a window: the values shifted by its offset."""
     height, width = values.shape
     wide = pad(values[None, None], (radius,) * 4, mode=padding)[0, 0]
     side = range(2 * radius + 1)
@@ -199,6 +199,6 @@ def shifted(
 
 
 def _spatial(radius: int) -> Float[Tensor, " pixel"]:
-    """Give a Gaussian over the window whose standard deviation is the radius."""
+    """Return a Gaussian over the window whose standard deviation is the radius."""
     along = torch.exp(-(torch.arange(-radius, radius + 1) / radius).square() / 2)
     return (along[:, None] * along).reshape(-1)

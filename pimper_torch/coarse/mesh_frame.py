@@ -84,7 +84,6 @@ def compare_with_scene(
 
     Args:
         mesh: In the scene's frame.
-        scene: Cameras and cloud.
         silhouettes: Compared too where they are masks that came with the photographs.
 
     Returns:
@@ -133,7 +132,7 @@ def compare_with_scene(
 
 
 def _told(found: Fit, num_rays: int, distance: float, diagonal: float) -> str:
-    """Say how far off a mesh is, in a part of a sentence."""
+    """State how far off a mesh is, in a part of a sentence."""
     parts = [f"rays to {found.hits} of {num_rays} observed points meet it"]
     if not math.isnan(found.on_mesh):
         parts = [
@@ -180,7 +179,7 @@ def _frames() -> Iterator[Float[Tensor, "3 3"]]:
 
 
 def _named(matrix: Float[Tensor, "3 3"]) -> str:
-    """Say what a matrix makes of x, y and z.
+    """State what a matrix makes of x, y and z.
 
     >>> _named(0.1 * torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     'With (x, z, -y) in the place of (x, y, z), 0.1 times as large'
@@ -240,7 +239,7 @@ def _fit(
 
 
 def _median_distance(mesh: Mesh, caster: RayCaster, to_points: Rays) -> float:
-    """Give the median distance from the mesh of points whose rays meet it; NaN if none does."""
+    """Return the median distance from the mesh of points whose rays meet it; NaN if none does."""
     met = caster.cast(to_points.origins, to_points.directions).face >= 0
     points = (to_points.origins + to_points.directions)[met]
     if len(points) == 0:
@@ -249,7 +248,7 @@ def _median_distance(mesh: Mesh, caster: RayCaster, to_points: Rays) -> float:
 
 
 def _to_points(scene: SparseScene, masks: Bool[Tensor, "view height width"] | None) -> Rays:
-    """Give rays to observed points; with masks, to those on the object."""
+    """Return rays to observed points; with masks, to those on the object."""
     step = -(-len(scene.observation_point) // _MAX_RAYS) or 1
     point, view = scene.observation_point[::step], scene.observation_view[::step]
     centers = scene.cameras.centers_world.detach().double().cpu()
@@ -276,7 +275,7 @@ def _to_pixels(
     masks: Bool[Tensor, "view height width"] | None,
     reliable: Bool[Tensor, " view"],
 ) -> Rays:
-    """Give rays through a raster of every photograph that has a mask, and what that says."""
+    """Return rays through a raster of every photograph that has a mask, and what that says."""
     poses, intrinsics = cameras.cam_from_world.detach().double(), cameras.intrinsics.detach()
     none = poses.new_zeros(0, 3)
     origins, directions = [none], [none]

@@ -21,8 +21,6 @@ def choose_sources(
     """Choose the views to match a view with by shared points and the angles at them.
 
     Args:
-        scene: Cameras and tracks.
-        points: Reliable ones.
         view: The view that is matched.
         count: Maximum number.
 
@@ -47,7 +45,7 @@ def step_for_one_pixel(
     pixels: Float[Tensor, "point 2"],
     inverse_depth: Float[Tensor, " point"],
 ) -> float:
-    """Give the change of inverse depth that moves points by one pixel in the sources.
+    """Return the change of inverse depth that moves points by one pixel in the sources.
 
     The median over points and sources: cameras round an object have about the same base.
     """

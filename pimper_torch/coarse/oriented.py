@@ -73,13 +73,13 @@ class OrientedPoints(Record):
 
 
 def no_points(like: Float[Tensor, "..."]) -> OrientedPoints:
-    """Give a cloud without points, with the device and dtype of ``like``."""
+    """Return a cloud without points, with the device and dtype of ``like``."""
     none = like.new_zeros(0, 3)
     return OrientedPoints(points_world=none, normals_world=none, noise=none[:, 0])
 
 
 def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
-    """Give every valid pixel's point, on the plane fitted to its neighbours.
+    """Return every valid pixel's point, on the plane fitted to its neighbours.
 
     A point that more views contradict than agree with is dropped. Coarse pixels give points
     where no finer ones are near: their windows match weaker texture.
@@ -104,7 +104,7 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
 def _covered(
     finer: Bool[Tensor, "fine_height fine_width"], like: Bool[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
-    """Mark coarse pixels on or beside which a finer one is valid."""
+    """Find coarse pixels on or beside which a finer one is valid."""
     height, width = like.shape
     fraction = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
     return max_pool2d(fraction, 3, 1, 1)[0, 0] > 0
@@ -150,7 +150,6 @@ def fitted_planes(
     """Fit a plane to the inverse depths round every pixel; a plane's are affine in the pixel.
 
     Args:
-        inverse_depth: Of the view.
         valid: Pixels that count.
         step: Change of inverse depth that moves a pixel by one in the sources.
 
@@ -224,7 +223,6 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     is smooth.
 
     Args:
-        cloud: Points.
         cell: Side of the finest grid's cells, scene units; they hold points whose noise is a
             third of it at most.
     """
@@ -305,15 +303,13 @@ def sparse_oriented(
     dense: OrientedPoints,
     reach: float,
 ) -> OrientedPoints:
-    """Give the points of the sparse cloud that are far from all dense ones, with normals.
+    """Return the points of the sparse cloud that are far from all dense ones, with normals.
 
     A normal is that of the plane fitted to the nearest points, sparse and dense; a point whose
     neighbours lie on none is left out.
 
     Args:
         scene: Cameras, cloud and tracks.
-        index: Reliable points.
-        dense: Points with normals.
         reach: Distance to a dense point within which a sparse one is left out.
     """
     points = scene.points_world[index]

@@ -13,7 +13,6 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
     views at the side weigh more than one close twin.
 
     Args:
-        scene: Views and tracks.
         name: File name or stem; empty chooses the view.
 
     Raises:

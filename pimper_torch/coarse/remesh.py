@@ -139,7 +139,6 @@ def remesh(
         surface: Subdivided mesh vertices on shared edges shared.
         spacing: Of the samples that the next templates will have, scene units: the unit of the
             settings.
-        config: Settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
         seen: True for facets that have data even where the surface has no support.
         inside: False for facets outside the object, which are dropped even with data.
@@ -194,7 +193,7 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
 
 
 def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
-    """Mark facets with a vertex of the surface inside the hull, or without own vertices."""
+    """Find facets with a vertex of the surface inside the hull, or without own vertices."""
     inside = hull.holds(surface.vertices_world.detach())
     outside = torch.bincount(surface.facet[~inside], minlength=count)
     return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
@@ -240,7 +239,7 @@ def _with_data(
     seen: Bool[Tensor, " face"] | None,
     max_hole: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark facets with data, and small holes that those enclose."""
+    """Find facets with data, and small holes that those enclose."""
     everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
     supported = surface.supported
     inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
@@ -270,7 +269,7 @@ def _severity(
     residual: Float[Tensor, " face"] | None,
     config: RemeshConfig,
 ) -> Float[Tensor, " face"]:
-    """Give the largest ratio of each facet's measures to their limits."""
+    """Return the largest ratio of each facet's measures to their limits."""
     limit = config.max_departure * spacing
     worst = departures(corners, faces, surface) / limit
     spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
@@ -285,12 +284,10 @@ def _severity(
 def departures(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
 ) -> Float[Tensor, " face"]:
-    """Give the 90th percentile of the surface's distances from each facet's plane.
+    """Return the 90th percentile of the surface's distances from each facet's plane.
 
     Args:
         vertices: The facets' corners.
-        faces: The facets.
-        surface: Their subdivided mesh.
     """
     normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)
@@ -305,7 +302,7 @@ def departures(
 
 
 def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
-    """Give the root mean square angle between the surface's normals and their facet's mean."""
+    """Return the root mean square angle between the surface's normals and their facet's mean."""
     weight = normal_weights(surface.information)
     total = weight.new_zeros(count, 3)
     total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
@@ -318,7 +315,7 @@ def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
 def _side(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, " face"]:
-    """Give the side of the equilateral triangle of each facet's area."""
+    """Return the side of the equilateral triangle of each facet's area."""
     return (2 / 3**0.5 * face_normals(vertices, faces).norm(dim=1)).sqrt()
 
 
@@ -330,7 +327,7 @@ def _worst_first(
     kept: Bool[Tensor, " face"],
     max_facets: int,
 ) -> Bool[Tensor, " edge"]:
-    """Mark the edges of as many of the worst facets as the limit allows, by bisection."""
+    """Find the edges of as many of the worst facets as the limit allows, by bisection."""
     _, face_edge = face_edges(faces)
     wanted = torch.where(small, 0, severity)
     order = wanted.argsort(descending=True, stable=True)

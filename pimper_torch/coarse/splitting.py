@@ -42,7 +42,7 @@ class Split(Record):
     def relocate(
         self, parent: Int[Tensor, " point"], barycentric: Float[Tensor, "point 3"]
     ) -> tuple[Int[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Give the child that each point of a face lies in or nearest to, and its coordinates.
+        """Return the child that each point of a face lies in or nearest to, and its coordinates.
 
         Args:
             parent: The face before it was split.
@@ -74,8 +74,6 @@ def mark_edges(
     that no angle shrinks below half of the smallest there was, however often this is done.
 
     Args:
-        vertices: Of the mesh.
-        faces: Of the mesh.
         wanted: To be split in four.
         forbidden: Faces that keep all their edges, even if angles of others shrink.
     """

@@ -59,7 +59,7 @@ class CoarseSurfaceConfig:
 
 
 class CoarseSurface(Stage):
-    """Give the object's surface in a few thousand facets; the result is a constant to autograd."""
+    """Return object's surface in a few thousand facets; the result is a constant to autograd."""
 
     def __init__(
         self,

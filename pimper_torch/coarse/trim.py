@@ -59,8 +59,6 @@ def view_counts(
     where it meets the cloud that all views have in common.
 
     Args:
-        vertices: Of the surface.
-        faces: Of it.
         level: Photographs, at the resolution of the depth maps.
         maps: Of all views; without, none sees through a face.
         matched_world: Points of the cloud.
@@ -129,7 +127,7 @@ def enclosed_holes(
     kept: Bool[Tensor, " face"],
     largest: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark connected components of dropped faces, up to an area, that kept faces enclose.
+    """Find connected components of dropped faces, up to an area, that kept faces enclose.
 
     A component that reaches the border of the surface is not enclosed.
     """
@@ -153,15 +151,13 @@ def fringes(
     smallest: float,
     rings: int,
 ) -> Bool[Tensor, " face"]:
-    """Mark narrow strips and spurs beside dropped faces that are small or hardly supported.
+    """Find narrow strips and spurs beside dropped faces that are small or hardly supported.
 
     Narrow is what a morphological opening removes: erosion by some rings of faces, then
     dilation. Its components are marked that are smaller than an area, or less than half
     supported: a thin part with support, such as a handle seen from one side, is not.
 
     Args:
-        vertices: Of the surface.
-        faces: Of it.
         kept: True for faces that are not dropped.
         supported: True for faces with support.
         smallest: Area from which a supported component is not marked.
@@ -182,7 +178,7 @@ def supported_components(
     supported: Bool[Tensor, " face"],
     fraction: float,
 ) -> Bool[Tensor, " face"]:
-    """Mark components with at least a fraction of the supported area of all."""
+    """Find components with at least a fraction of the supported area of all."""
     everything = torch.zeros_like(faces[:, 0])
     own, total = (
         component_areas(vertices, faces, label, supported)

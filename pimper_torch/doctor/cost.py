@@ -38,9 +38,6 @@ def planned(
     scale's square.
 
     Args:
-        megapixels: Of all photographs.
-        num_views: Of photographs.
-        scales: Of the passes.
         cameras: Whether they are given.
         masks: Whether they are given.
     """
@@ -63,7 +60,7 @@ def planned(
 
 
 def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Iterator[Finding]:
-    """Tell the estimate, and whether the memory is there."""
+    """Report the estimate, and whether the memory is there."""
     if not photographs:
         return
     megapixels = sum(one.width * one.height for one in photographs) / 1e6

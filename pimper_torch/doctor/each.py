@@ -26,7 +26,7 @@ def each_alone(photographs: Sequence[Photograph]) -> list[Finding]:
 
 
 def number(photographs: Sequence[Photograph]) -> Iterator[Finding]:
-    """Tell how many there are, and of which sizes."""
+    """Report how many there are, and of which sizes."""
     sizes = Counter((one.width, one.height) for one in photographs)
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     told = ", ".join(f"{count} of {w}x{h}" for (w, h), count in sizes.most_common(3))

@@ -22,7 +22,6 @@ def examine_folder(
     """Examine the photographs of a folder, in seconds.
 
     Args:
-        folder: With the photographs.
         encoding: As of :func:`pimper_torch.io.photographs.load_views`.
         max_size_px: As of a run.
 

@@ -63,7 +63,7 @@ def variations(photographs: Sequence[Photograph], matches: Sequence[Match]) -> l
 
 
 def light(found: Sequence[float]) -> Iterator[Finding]:
-    """Tell whether the light varies from photograph to photograph."""
+    """Return whether the light varies from photograph to photograph."""
     if not found:
         yield Finding(
             check="light",

@@ -18,7 +18,7 @@ _LEAST_GB = 2.5  # of memory: the demo takes 2.06 (benchmarks/README.md, "Speed"
 
 
 def machine() -> Iterator[Finding]:
-    """Tell versions, device, threads and memory."""
+    """Report versions, device, threads and memory."""
     told = ", ".join(f"{name} {version}" for name, version in versions().items())
     missing = [name for name in _NEEDED if find_spec(name) is None]
     yield Finding(
@@ -50,7 +50,7 @@ def machine() -> Iterator[Finding]:
 
 
 def available_gb() -> float | None:
-    """Give the memory that a process may still take; ``None`` where the system does not tell."""
+    """Return the memory that a process may still take; ``None`` where the system does not tell."""
     free = None
     with suppress(OSError, IndexError, ValueError):
         fields = Path("/proc/meminfo").read_text(encoding="ascii")
@@ -64,7 +64,7 @@ def available_gb() -> float | None:
 
 
 def total_gb() -> float | None:
-    """Give the memory of the machine; ``None`` where the system does not tell."""
+    """Return the memory of the machine; ``None`` where the system does not tell."""
     with suppress(AttributeError, OSError, ValueError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GB
     return None

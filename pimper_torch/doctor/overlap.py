@@ -54,7 +54,7 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Match]
 
 
 def overlap(names: Sequence[str], matches: Sequence[Match]) -> Iterator[Finding]:
-    """Tell whether matches connect all photographs."""
+    """Return whether matches connect all photographs."""
     if len(names) < 2:
         return
     links = {tuple(match.pair.tolist()) for match in matches}
@@ -134,7 +134,7 @@ def _verified(first: Float[Tensor, "feature 2"], second: Float[Tensor, "feature 
 
 
 def _components(count: int, links: set[tuple[int, ...]]) -> list[list[int]]:
-    """Give the connected groups of photographs, the largest first."""
+    """Return the connected groups of photographs, the largest first."""
     group = list(range(count))
     for first, second in links:
         old, new = group[second], group[first]

@@ -84,7 +84,6 @@ def read_all(
     """Read photographs one by one, so that one that cannot be read hides no other.
 
     Args:
-        paths: Of the files.
         encoding: As of :func:`pimper_torch.io.photographs.load_views`; saturation that is to be
             found is taken for full scale, as one photograph alone cannot tell it.
         max_size_px: As of a run.

@@ -12,7 +12,7 @@ from pimper_torch.radiometry import Encoding
 
 
 def samples(paths: Sequence[Path | str], encoding: Encoding) -> Iterator[Finding]:
-    """Tell the response of the files that can be read, and warn of what is not followed."""
+    """Report the response of the files that can be read, and warn of what is not followed."""
     read = [(path, header) for path in paths if (header := _header(path)) is not None]
     if not read:
         return

@@ -25,7 +25,6 @@ class CoarsePart:
     """Gives the continuous function linear on every facet that is nearest to values.
 
     Args:
-        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
     """
 
@@ -52,7 +51,7 @@ class CoarsePart:
         )
 
     def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
-        """Give it at the subdivided mesh's vertices, in one column or several. Differentiable."""
+        """Return it at the subdivided mesh's vertices, in one column or several. Differentiable."""
         columns = values.double().reshape(len(values), -1)
         side = columns.new_zeros(self._size, columns.shape[1])
         for corner in range(3):

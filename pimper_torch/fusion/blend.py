@@ -86,7 +86,7 @@ class Blend(Record):
 
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
-    """Give the vertices' rays: smoothed normals of the coarse mesh, interpolated."""
+    """Return the vertices' rays: smoothed normals of the coarse mesh, interpolated."""
     mesh = coarse.mesh
     normals = mesh.normals_world
     if normals is None:
@@ -95,7 +95,7 @@ def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
-    """Give each facet's wanted distance between neighbouring vertices, scene units."""
+    """Return each facet's wanted distance between neighbouring vertices, scene units."""
     facet = torch.cat([bucket.facet for bucket in patches.buckets])
     spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
     return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
@@ -238,7 +238,7 @@ def _estimates(
 def _bands(
     coarse: CoarseMesh, templates: Templates
 ) -> tuple[Float[Tensor, "patch 3 2"], Float[Tensor, "patch 3"]]:
-    """Give corners in the patch frame, and how far outside the facet weights reach.
+    """Return corners in the patch frame, and how far outside the facet weights reach.
 
     The band is in barycentric coordinates and ends a little inside the enlarged triangle.
     """
@@ -301,7 +301,7 @@ class _Lists:
     def take(
         self, which: Int[Tensor, " taken"]
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
-        """Give the indices in some lists, and which of these lists each is of."""
+        """Return the indices in some lists, and which of these lists each is of."""
         count = self.count[which]
         taken = torch.arange(len(which), device=which.device).repeat_interleave(count)
         within = torch.arange(len(taken), device=which.device) - (count.cumsum(0) - count)[taken]
@@ -318,7 +318,7 @@ def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:
-    """Give the affine map from (x, y, 1) in the patch frame to barycentric coordinates."""
+    """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates."""
     ones = torch.ones_like(corners[..., :1])
     return torch.linalg.inv(torch.cat([corners, ones], dim=-1).mT)
 
@@ -369,7 +369,7 @@ def _beside_unknown(
 def _split(
     sums: Float[Tensor, "vertex layer"],
 ) -> tuple[Float[Tensor, " vertex"], Float[Tensor, "vertex value"]]:
-    """Give the summed information and the mean by it of what follows; 0 where there is none."""
+    """Return the summed information and the mean by it of what follows; 0 where there is none."""
     information = sums[:, 0]
     some = information > 0
     mean = sums[:, 1:] / torch.where(some, information, 1)[:, None]

@@ -54,7 +54,7 @@ class BaseSurface(Record):
     finest: float | Float[Tensor, ""]
 
     def lines_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Give the direction of the vertex nearest to each point; which one is constant."""
+        """Return the direction of the vertex nearest to each point; which one is constant."""
         tree = cKDTree(self.points.detach().cpu().numpy())
         _, nearest = tree.query(points.detach().cpu().numpy())
         return self.directions[torch.as_tensor(nearest, device=self.faces.device)]
@@ -90,7 +90,7 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
 
 
 def passing(contacts: Sequence[Contacts], surface: BaseSurface) -> list[Terms]:
-    """Give the terms that let the surface pass through points, kind by kind.
+    """Return the terms that let the surface pass through points, kind by kind.
 
     Differentiable; which face is nearest is constant.
     """

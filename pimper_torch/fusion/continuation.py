@@ -33,7 +33,6 @@ def continued(
 
     Args:
         values: Of the vertices; anything where they are not known.
-        known: Where they are.
         edges: Between neighbours, each once.
         otherwise: What the others are taken for, far from what is known.
         damping: How many neighbours that counts as, above 0.
@@ -93,7 +92,7 @@ def about_mean(
 def enclosed(
     known: Bool[Tensor, " vertex"], faces: Int[Tensor, "face 3"]
 ) -> Bool[Tensor, " vertex"]:
-    """Mark what known vertices enclose: groups of others that do not reach the border.
+    """Find what known vertices enclose: groups of others that do not reach the border.
 
     A group without any known vertex beside it is not enclosed.
 

@@ -66,7 +66,7 @@ class Fused(Record):
     def matrix(
         self,
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-        """Give rows, columns and values of the matrix that was solved last."""
+        """Return rows, columns and values of the matrix that was solved last."""
         start = torch.zeros_like(self.damping)
         return _system(self.kinds, self.weights, self.factors, start, self.damping)[0]
 
@@ -83,7 +83,6 @@ def fuse_terms(
         kinds: Of terms; those without equations are skipped.
         start: Heights that vertices keep without other terms.
         damping: Information of these.
-        iterations: Of solves.
 
     Differentiable in targets, coefficients, information, damping and start, through the weights and
     the factors too: every solve answers by the implicit function. That takes as many more solves
@@ -215,9 +214,6 @@ def _evaluated(
     """Give squared residuals in units of the claimed variance, and how many equations are used up.
 
     Args:
-        kind: Of terms.
-        weight: Of its equations.
-        heights: Of the surface.
         probe: Random signs.
         answer: The solution to these.
     """
@@ -265,7 +261,7 @@ def _system(
     tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
     Float[Tensor, " vertex"],
 ]:
-    """Give rows, columns and values of the matrix, and the right-hand side."""
+    """Return rows, columns and values of the matrix, and the right-hand side."""
     everything = torch.arange(len(start), device=start.device)
     rows, cols, values = [everything], [everything], [damping.double()]
     rhs = damping.double() * start.double()

@@ -46,13 +46,12 @@ _ACCURACY = 1e-2
 def expected_error(
     fine: Fused, coarse: Fused, subdivision: Subdivision, facets: Int[Tensor, "facet 3"], draws: int
 ) -> Float[Tensor, " vertex"]:
-    """Give the standard error of every height of the fused surface.
+    """Return the standard error of every height of the fused surface.
 
     Args:
         fine: The solve that detail is from.
         coarse: The solve that the coarse shape is from, with what neighbours err by together;
             the same record where there was only one solve. Noise has the factors of ``fine``.
-        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         draws: Of noise. The result is off by one over the square root of twice as many.
 
@@ -87,7 +86,7 @@ def _answers(
     noises: list[list[Float[Tensor, " _"]]],
     starts: list[Float[Tensor, " vertex"]],
 ) -> Float[Tensor, "vertex draw"]:
-    """Give the heights' answers to errors of the targets, all draws at once."""
+    """Return the heights' answers to errors of the targets, all draws at once."""
     sides = [_answerable(fused, *each) for each in zip(noises, starts, strict=True)]
     rows, cols, values = fused.matrix()
     what = "the expected error"
@@ -145,7 +144,7 @@ def _noise(
 def _answerable(
     fused: Fused, noise: list[Float[Tensor, " _"]], starts: Float[Tensor, " vertex"]
 ) -> Float[Tensor, " vertex"]:
-    """Give the right-hand side that errors of the targets make."""
+    """Return the right-hand side that errors of the targets make."""
     rhs = fused.damping.double() * starts
     for kind, weight, factor, off in zip(
         fused.kinds, fused.weights, fused.factors, noise, strict=True

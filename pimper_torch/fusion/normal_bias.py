@@ -41,7 +41,7 @@ class NormalBias(Record):
     known: Bool[Tensor, " facet"]
 
     def variance(self) -> Float[Tensor, ""]:
-        """Give the variance of a tilt, robustly, for normals that still have theirs."""
+        """Return the variance of a tilt, robustly, for normals that still have theirs."""
         return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
 
     def at(
@@ -68,7 +68,6 @@ def normal_bias(
     """Compare normals with those of a shape, facet by facet.
 
     Args:
-        subdivision: The facets, subdivided.
         facets: The coarse mesh's faces.
         normals: Photometric, unit.
         shape: Of the surface, unit.
@@ -92,12 +91,11 @@ def common_variance(
     facet: Int[Tensor, " vertex"],
     otherwise: Int[Tensor, " term"],
 ) -> Float[Tensor, ""]:
-    """Give the variance of the error that swept heights of one facet have in common.
+    """Return the variance of the error that swept heights of one facet have in common.
 
     Args:
         found: The heights; one equation has one unknown.
         heights: Of the surface, to which swept heights should have contributed little.
-        facet: Of each vertex.
         otherwise: Facets where the surface is known by other terms, which alone are evaluated.
 
     Differentiable.
@@ -116,6 +114,6 @@ def common_variance(
 def common(
     variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], known: Bool[Tensor, " vertex"]
 ) -> Common:
-    """Give the error that the known vertices of each facet have in common."""
+    """Return the error that the known vertices of each facet have in common."""
     count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
     return Common(variance=variance, count=count[facet].to(variance))

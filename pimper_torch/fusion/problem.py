@@ -110,7 +110,7 @@ class Problem(Record):
     def slopes(
         self, normals: Float[Tensor, "vertex 3"], shared: Float[Tensor, ""] | None = None
     ) -> Terms:
-        """Give the terms of photometric normals.
+        """Return the terms of photometric normals.
 
         Args:
             normals: Photometric, with or without their bias.
@@ -250,7 +250,7 @@ def transferred_height_fields(swept: SweptPatches) -> DepthPatches:
 
 
 def slope_variance(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
-    """Give the variance of a normal's angle along an edge, half that of both of its angles."""
+    """Return the variance of a normal's angle along an edge, half that of both of its angles."""
     low, high = (math.radians(error) ** 2 for error in _NORMAL_ERROR_DEG)
     return 0.5 / information.clamp(1 / high, 1 / low)
 
@@ -258,7 +258,7 @@ def slope_variance(information: Float[Tensor, " vertex"]) -> Float[Tensor, " ver
 def _rotation(
     normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]
 ) -> Float[Tensor, ""]:
-    """Give the mean squared angle between normals along edges, folds cut; squared radians."""
+    """Return the mean squared angle between normals along edges, folds cut; squared radians."""
     one, other = normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
     return (total(square) / max(len(edges), 1)).clamp_min(_MIN_ROTATION)

@@ -60,7 +60,7 @@ class Terms(Record):
     evaluated: bool = True
 
     def residual(self, heights: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
-        """Give the residual: target less sum."""
+        """Return the residual: target less sum."""
         return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
 
 
@@ -72,7 +72,7 @@ def slopes(
     variance: Float[Tensor, " vertex"],
     common: Common | None = None,
 ) -> Terms:
-    r"""Say that edges are at right angles to the normals at their ends.
+    r"""State that edges are at right angles to the normals at their ends.
 
     :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`, which is exact on a parabola. An error of the
     angle moves one end by the edge's length times it.
@@ -110,7 +110,7 @@ def upright(
     directions: Float[Tensor, "vertex 3"],
     normals: Float[Tensor, "vertex 3"],
 ) -> Bool[Tensor, " edge"]:
-    """Mark edges whose slope heights can follow.
+    """Find edges whose slope heights can follow.
 
     Others lie across a contour or a fold as seen along the directions: raising both ends by the
     same height would rotate the edge. Constant.
@@ -127,14 +127,13 @@ def kept_slopes(
     transferred: Float[Tensor, " vertex"],
     variance: Float[Tensor, " vertex"],
 ) -> Terms:
-    """Say that edges lie as they do on the surface that there is, where light tells nothing.
+    """State that edges lie as they do on the surface that there is, where light tells nothing.
 
     Args:
         edges: Those without normals at both ends.
         flat: ``q``.
         directions: ``d``, unit.
         shape: Normals of the surface.
-        transferred: Its heights.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
     found = slopes(edges, flat, directions, shape, variance)
@@ -150,10 +149,9 @@ def kept_steps(
     transferred: Float[Tensor, " vertex"],
     variance: float | Float[Tensor, ""],
 ) -> Terms:
-    """Say that heights go on differing as they do, where edges are not upright.
+    """State that heights go on differing as they do, where edges are not upright.
 
     Args:
-        edges: Those.
         flat: ``q``.
         transferred: Heights of the surface that there is.
         variance: Of its slopes, squared radians.
@@ -178,7 +176,7 @@ def swept_heights(
     correlated: float,
     common: Common | None = None,
 ) -> Terms:
-    """Say where the sweep has the surface.
+    """State where the sweep has the surface.
 
     Args:
         transferred: Heights of the surface that was swept.
@@ -207,5 +205,5 @@ def swept_heights(
 def upright_heights(
     information: Float[Tensor, " vertex"], facing: Float[Tensor, " vertex"]
 ) -> Bool[Tensor, " vertex"]:
-    """Mark vertices whose swept offsets tell heights."""
+    """Find vertices whose swept offsets tell heights."""
     return (information > 0) & (facing > MIN_FACING)

@@ -28,7 +28,6 @@ def cosine_fan(
     Args:
         normals: Unit.
         rotations: Of each fan about its normal, in radians: neighbours' fans then differ.
-        num_rays: Of each fan.
     """
     step = torch.arange(num_rays)
     across = ((step + 0.5) / num_rays).sqrt()  # even over the disc below the hemisphere

@@ -54,11 +54,9 @@ def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) 
 def cotangent_laplacian(
     mesh: Elements, weight: Float[Tensor, " face"], min_shape: float = 0.0
 ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-    r"""Give the entries of :math:`\int w \nabla \varphi_i \cdot \nabla \varphi_j`.
+    r"""Return the entries of :math:`\int w \nabla \varphi_i \cdot \nabla \varphi_j`.
 
     Args:
-        mesh: Its faces.
-        weight: Of each face.
         min_shape: A needle's area is taken as at least this fraction of its longest edge
             squared: its cotangents would otherwise spoil the condition of the whole matrix.
 
@@ -76,6 +74,6 @@ def cotangent_laplacian(
 
 
 def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> Float[Tensor, " vertex"]:
-    """Give each vertex a third of the mass of every face round it."""
+    """Assign each vertex a third of the mass of every face round it."""
     fraction = (mesh.area * density / 3)[:, None].expand(-1, 3)
     return fraction.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), fraction.flatten())

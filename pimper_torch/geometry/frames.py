@@ -23,7 +23,7 @@ def rotate(
 def invert_rigid(
     target_from_source: Float[Tensor, "*batch 4 4"],
 ) -> Float[Tensor, "*batch 4 4"]:
-    """Give ``source_from_target`` of a rotation and a translation."""
+    """Return ``source_from_target`` of a rotation and a translation."""
     rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
     return rigid(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])
 

@@ -126,7 +126,7 @@ def intersect_height_field(
 def continued_level(
     depth: Float[Tensor, "patch height width"], valid: Bool[Tensor, "patch height width"]
 ) -> Float[Tensor, "patch height width"]:
-    """Give invalid samples the mean of the valid ones among their eight neighbours.
+    """Assign invalid samples the mean of the valid ones among their eight neighbours.
 
     Rays that pass over the rim of the height field on their way are then not thrown off by what
     lies beyond it. A sample without valid neighbours becomes 0, the facet's plane.
@@ -156,7 +156,7 @@ class _Grid(NamedTuple):
 def _gap(
     grid: _Grid, rays: tuple[Float[Tensor, "patch ray"], ...], distance: Float[Tensor, "patch ray"]
 ) -> tuple[Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
-    """Give the ray's height over the height field along z, and its derivative along the ray.
+    """Return the ray's height over the height field along z, and its derivative along the ray.
 
     Args:
         grid: The height field; every sample has a value.
@@ -189,7 +189,7 @@ def _cell(
     spacing: Float[Tensor, " patch"],
     size: torch.Size,
 ) -> tuple[Int[Tensor, "patch ray 4"], Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
-    """Give the four samples round each point, and its place between them in [0, 1]."""
+    """Return the four samples round each point, and its place between them in [0, 1]."""
     height, width = size
     index = (xy - origin[:, None]) / spacing[:, None, None]
     column = index[..., 0].clamp(0, width - 1)

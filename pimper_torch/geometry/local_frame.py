@@ -60,7 +60,7 @@ def local_origin(
 def to_local(
     cam_from_world: Float[Tensor, "view 4 4"], offset: Offset
 ) -> Float[Tensor, "view 4 4"]:
-    """Give the poses that see points of which ``offset`` was subtracted; differentiable."""
+    """Return the poses that see points of which ``offset`` was subtracted; differentiable."""
     rotation, translation = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
     return rigid(rotation, translation + rotation @ rotation.new_tensor(offset))
 

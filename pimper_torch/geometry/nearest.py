@@ -96,7 +96,7 @@ class NearestSurface:
 def closest_on_triangles(
     points: Float[Tensor, "pair 3"], corners: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Give the point of each triangle that is nearest to its partner.
+    """Return the point of each triangle that is nearest to its partner.
 
     It is the foot of the perpendicular where that lies inside, else on the nearest edge. A
     degenerate triangle has edges only.

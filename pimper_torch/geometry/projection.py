@@ -40,7 +40,7 @@ def rays_through(
     cam_from_world: Float[Tensor, "*#batch 4 4"],
     intrinsics: Float[Tensor, "*#batch 3 3"],
 ) -> Float[Tensor, "*batch pixel 3"]:
-    """Give the world direction of the ray through each pixel.
+    """Return the world direction of the ray through each pixel.
 
     Not unit: its length is chosen so that ``center + depth * ray`` is the point at that
     depth along the camera's z.
@@ -57,7 +57,6 @@ def triangulate_rays(
     """Find the points nearest to their rays in the least-squares sense.
 
     Args:
-        cameras: Of the views.
         pixels: Where each view shows each point.
         seen: True where it does; by two views each point, from two places.
     """
@@ -75,7 +74,7 @@ def triangulation_angles(
     observed: Bool[Tensor, "point view"],
     centers_world: Float[Tensor, "view 3"],
 ) -> Float[Tensor, " point"]:
-    """Give each point's widest angle between two rays that saw it, in radians; 0 without two."""
+    """Return each point's widest angle between two rays that saw it, in radians; 0 without two."""
     if len(centers_world) == 0:
         return torch.zeros_like(points_world[:, 0])
     widest = []

@@ -110,7 +110,7 @@ def subdivide(
 def transferred(
     values: Float[Tensor, " vertex"], source: Subdivision, target: Subdivision
 ) -> Float[Tensor, " asked"]:
-    """Give values known on one subdivided mesh at the vertices of another over the same facets.
+    """Return values known on one subdivided mesh at the vertices of another over the same facets.
 
     They are blended from the three nearest vertices, by the inverse of the distance. For what is
     smooth. A constant to autograd but in ``values``.
@@ -200,14 +200,14 @@ def _pieces(
 
 
 def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:
-    """Give where each group begins when they are put in a row."""
+    """Return where each group begins when they are put in a row."""
     return counts.cumsum(dim=0) - counts
 
 
 def _subdivision_of(
     size: int, device: torch.device
 ) -> tuple[Int[Tensor, "point 3"], Int[Tensor, "triangle 3"]]:
-    """Give the vertices of one subdivided facet, as steps that add up to ``size``, and faces."""
+    """Return the vertices of one subdivided facet, as steps that add up to ``size``, and faces."""
     rows, columns = torch.tril_indices(size + 1, size + 1, device=device)
     steps = torch.stack([size - rows, rows - columns, columns], dim=1)
     row, column = torch.tril_indices(size, size, device=device)
@@ -264,7 +264,7 @@ def _barycentric(
     cut: Float[Tensor, "member point"],
     ends: Int[Tensor, "member point 2"],
 ) -> Float[Tensor, "member point 3"]:
-    """Give coordinates in slots: free inside, on the cut at an edge."""
+    """Return coordinates in slots: free inside, on the cut at an edge."""
     inner = (free > 0).all(dim=1)[:, None]
     on_edge = free.new_zeros(*cut.shape, 3)
     on_edge = on_edge.scatter(2, ends, torch.stack([1 - cut, cut], dim=-1))

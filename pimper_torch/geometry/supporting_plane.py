@@ -59,7 +59,7 @@ class Plane(Record):
     offset: Float[Tensor, ""]
 
     def height_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Give the distance above the plane, on the cameras' side."""
+        """Return the distance above the plane, on the cameras' side."""
         return points_world @ self.normal_world - self.offset
 
 
@@ -86,7 +86,7 @@ def fixation(cam_from_world: Float[Tensor, "view 4 4"]) -> Fixation:
 
 
 def well_tracked(scene: SparseScene, min_views: int = 3) -> Bool[Tensor, " point"]:
-    """Mark points that enough views see."""
+    """Find points that enough views see."""
     return scene.observed.sum(dim=1) >= min_views
 
 
@@ -102,7 +102,6 @@ def supporting_plane(
         points_world: Well tracked.
         eyes_world: The cameras' centres, all on its upper side.
         distance: Of the cameras from what they look at.
-        search: How.
 
     Returns:
         ``None`` where no plane has enough points on it and few enough below. Among those that

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 def slopes_from_normals(
     normals: Float[Tensor, "*batch 3"], steepest: float = 10.0
 ) -> Float[Tensor, "*batch 2"]:
-    """Give ``(dz/dx, dz/dy)`` of the depth whose viewer-facing normals these are.
+    """Return ``(dz/dx, dz/dy)`` of the depth whose viewer-facing normals these are.
 
     Slopes are limited to ``steepest`` (about 84 degrees by default), past which a normal
     is as good as on the rim. Differentiable below the limit.
@@ -26,7 +26,7 @@ def normals_from_slopes(slopes: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*ba
 def face_normals(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "face 3"]:
-    """Give outward normals whose length is twice the area of the face."""
+    """Return outward normals whose length is twice the area of the face."""
     a, b, c = vertices[faces].unbind(dim=1)
     return torch.linalg.cross(b - a, c - a)
 
@@ -34,7 +34,7 @@ def face_normals(
 def unit_face_normals(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "face 3"]:
-    """Give outward unit normals, whatever the unit of length; zero for a face without area."""
+    """Return outward unit normals, whatever the unit of length; zero for a face without area."""
     a, b, c = vertices[faces].unbind(dim=1)
     ab, ac = b - a, c - a
     longest = torch.stack([ab, ac]).detach().abs().amax(dim=(0, 2)).clamp_min(_least(vertices))
@@ -43,7 +43,7 @@ def unit_face_normals(
 
 
 def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
-    """Give the lengths of the faces' sides: from the last corner to the first, then on."""
+    """Return the lengths of the faces' sides: from the last corner to the first, then on."""
     return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
@@ -76,7 +76,7 @@ def component_areas(
 def barycentric_2d(
     points: Float[Tensor, "*#batch 2"], corners: Float[Tensor, "*#batch 3 2"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Give barycentric coordinates of points in the plane of triangles."""
+    """Return barycentric coordinates of points in the plane of triangles."""
     a, b, c = corners.unbind(dim=-2)
     ab, ac, ap = b - a, c - a, points - a
     area = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
@@ -88,7 +88,7 @@ def barycentric_2d(
 def barycentric(
     points: Float[Tensor, "pair 3"], corners: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Give barycentric coordinates of the feet of perpendiculars from points to triangles.
+    """Return barycentric coordinates of the feet of perpendiculars from points to triangles.
 
     A triangle without area gives all to its first corner.
     """

@@ -84,21 +84,21 @@ def face_counts(face_edge: Int[Tensor, "face 3"]) -> Int[Tensor, " edge"]:
 def boundary_vertices(
     faces: Int[Tensor, "face 3"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark vertices on an edge that has one face, or more than two."""
+    """Find vertices on an edge that has one face, or more than two."""
     return _marked(open_edges(faces), num_vertices)
 
 
 def corners_of(
     faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
-    """Mark the vertices of some faces."""
+    """Find the vertices of some faces."""
     return _marked(faces[chosen], num_vertices)
 
 
 def dilated(
     faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
 ) -> Bool[Tensor, " face"]:
-    """Mark some faces and a number of rings of faces round them."""
+    """Find some faces and a number of rings of faces round them."""
     for _ in range(rings):
         some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
     return some
@@ -107,7 +107,7 @@ def dilated(
 def connected_to(
     faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
 ) -> Bool[Tensor, " face"]:
-    """Mark the connected components of the faces ``among`` that have a marked face."""
+    """Find the connected components of the faces ``among`` that have a marked face."""
     pairs, _ = face_pairs(faces)
     label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
     count = torch.zeros_like(label).index_add(0, label, (marked & among).long())

@@ -56,9 +56,6 @@ class Hits(Record):
 
         Args:
             vertices: Of the mesh that was hit.
-            faces: Of it.
-            origins: Of the rays.
-            directions: Of the rays.
 
         Differentiable in vertices, origins and directions. A ray that lies in the plane of its
         face keeps what ray casting gave.
@@ -109,7 +106,6 @@ class RayCaster:
 
         Args:
             origins: World.
-            directions: Of the rays.
             reach: How far each goes, in lengths of its direction; without, to infinity.
         """
         shape = directions.shape[:-1]
@@ -130,7 +126,7 @@ class RayCaster:
         )
 
     def _near(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Give points by the origin that the mesh is stored round."""
+        """Return points by the origin that the mesh is stored round."""
         return points if self._origin is None else points - self._origin.to(points)
 
     def occluded(
@@ -139,7 +135,7 @@ class RayCaster:
         center: Float[Tensor, " 3"],
         tolerance: float | Float[Tensor, "*#batch"],
     ) -> Bool[Tensor, "*batch"]:
-        """Tell whether the mesh hides points from a camera.
+        """Return whether the mesh hides points from a camera.
 
         Args:
             points: World.
@@ -158,11 +154,10 @@ class RayCaster:
         directions: Float[Tensor, "*batch 3"],
         reach: Float[Tensor, "*#batch"],
     ) -> Bool[Tensor, "*batch"]:
-        """Tell whether a ray meets any face at all; several times as fast as its first one.
+        """Return whether a ray meets any face at all; several times as fast as its first one.
 
         Args:
             origins: World.
-            directions: Of the rays.
             reach: How far each goes, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]

@@ -19,7 +19,6 @@ def welded(
 
     Args:
         vertices: Finite.
-        faces: Of them.
 
     Returns:
         The first vertex of each place, in their order, and as many faces, some of which may now

@@ -236,7 +236,7 @@ def _transparent(png: PngHead | None) -> tuple[int, ...]:
 
 
 def _full_scale(array: np.ndarray, header: Header) -> int:
-    """Give the level of full scale, as the file says unless its samples contradict it.
+    """Return the level of full scale, as the file says unless its samples contradict it.
 
     PNG wants samples of fewer bits shifted up, and filled with zeros or their own highest bits.
     Those that end where the fewer bits do, and are neither, were not.
@@ -255,7 +255,7 @@ def _full_scale(array: np.ndarray, header: Header) -> int:
 
 
 def _colour(image: Image.Image, exif: Image.Exif, png: PngHead | None) -> Colour:
-    """Give what an image says of its samples: by its format's own means, or else by EXIF."""
+    """Return what an image says of its samples: by its format's own means, or else by EXIF."""
     if image.mode in ("CMYK", "LAB"):  # turned into sRGB by Pillow
         return SILENT
     if isinstance(image, TiffImagePlugin.TiffImageFile):
@@ -293,7 +293,6 @@ def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool
     """Open a file with Pillow.
 
     Args:
-        path: Of the file.
         use: What to do with it.
         whole: Read all of it at once; not needed for its header.
     """

@@ -94,7 +94,7 @@ def read_cameras(folder: Path | str) -> tuple[tuple[str, ...], Cameras]:
 
 
 def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
-    """Give the light of every named view; NaN where the file has none."""
+    """Return the light of every named view; NaN where the file has none."""
     if not path.is_file() or not names:
         return None
     try:

@@ -32,8 +32,6 @@ def find_cautions(
     """Find what photographs say and is not followed.
 
     Args:
-        paths: Of each.
-        headers: Of each.
         encoding: As given. A measured curve is not compared with what files say.
 
     Returns:

@@ -56,7 +56,6 @@ def finished(mesh: Mesh, files: MeshFiles) -> Finished:
 
     Args:
         mesh: Of a run, on the CPU.
-        files: How.
     """
     told: dict[str, dict[str, int | float]] = {}
     if isinstance(files.faces, int):

@@ -63,7 +63,7 @@ def read_profile(data: bytes) -> Colour:
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:
-    """Give what the tags hold, once every offset was seen to lie inside."""
+    """Return what the tags hold, once every offset was seen to lie inside."""
     if not _HEADER + 4 <= len(data) <= _MAX_BYTES or data[36:40] != b"acsp":
         raise InputError("is damaged")
     (count,) = struct.unpack_from(">I", data, _HEADER)

@@ -46,7 +46,6 @@ def read_variables(
     """Read the arrays of numbers; other variables are named only.
 
     Args:
-        path: The file.
         wanted: Tells the names of the arrays to read; others are named only.
 
     Raises:
@@ -111,7 +110,7 @@ def _variable(body: bytes, order: str, wanted: Callable[[str], bool]) -> Variabl
 
 
 def _element(body: bytes, at: int, order: str) -> tuple[int, bytes, int]:
-    """Give type and bytes of an element, short ones in their tag, and where the next begins."""
+    """Return type and bytes of an element, short ones in their tag, and where the next begins."""
     if at + 8 > len(body):
         raise ValueError("a variable is cut short")
     (word,) = struct.unpack_from(f"{order}I", body, at)

@@ -17,10 +17,9 @@ _Tree: TypeAlias = dict[str, Any]
 
 
 def impossible(data: bytes, suffix: str) -> str:
-    """Say what a PLY, STL or GLB file cannot hold; nothing where all is possible.
+    """State what a PLY, STL or GLB file cannot hold; nothing where all is possible.
 
     Args:
-        data: The file.
         suffix: Of its name, lower case.
     """
     try:
@@ -64,7 +63,7 @@ def _impossible_glb(data: bytes) -> str:
 
 
 def _impossible_tree(tree: _Tree, accessors: list[_Tree]) -> str:
-    """Say why a scene's tree is none, or too much."""
+    """State why a scene's tree is none, or too much."""
     nodes, meshes = _section(tree, "nodes"), _section(tree, "meshes")
     children = [_whole(child) for node in nodes for child in _list(node.get("children", []))]
     if len(set(children)) < len(children) or any(child >= len(nodes) for child in children):

@@ -51,8 +51,6 @@ def write_ply(
     as it does far from the origin.
 
     Args:
-        mesh: Any.
-        path: The file.
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
         measured: Written as the faces' property of this name, 0 of those that close a hole.
     """
@@ -95,7 +93,7 @@ def write_ply(
 
 
 def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
-    """Give positions as they are written: float32 where that tells them, else float64."""
+    """Return positions as they are written: float32 where that tells them, else float64."""
     vertices = mesh.vertices_world.detach().double()
     placed = vertices + vertices.new_tensor(offset_world)
     single = placed.float()
@@ -212,8 +210,6 @@ def write_glb(
     of structure from motion, whose up is arbitrary.
 
     Args:
-        mesh: Any.
-        path: The file.
         offset_world: Of the node; see ``SparseScene.offset_world``.
         measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
     """
@@ -243,8 +239,6 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
     STL has no doubles: far from the origin vertices stay round it, and the header tells the offset.
 
     Args:
-        mesh: Any.
-        path: The file.
         offset_world: Told in the file's header; see ``SparseScene.offset_world``.
     """
     corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
@@ -269,8 +263,6 @@ def write_obj(
     """Write an OBJ: vertex normals, and albedo as sRGB colour behind each position.
 
     Args:
-        mesh: Any.
-        path: The file.
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
         measured: Faces that are not stand in a group ``caps`` of their own.
     """
@@ -386,7 +378,7 @@ def _place(tree: dict[str, Any], offset_world: Offset) -> None:
 
 
 def _make_matte(tree: dict[str, Any]) -> None:
-    """Give every primitive one material, in place as trimesh wants it; glTF's own is metal."""
+    """Assign every primitive one material, in place as trimesh wants it; glTF's own is metal."""
     tree["materials"] = [
         {
             "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},

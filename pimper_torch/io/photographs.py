@@ -80,7 +80,6 @@ def load_views(
     the masks, and a warning says so; a photograph without one shows the object everywhere.
 
     Args:
-        folder: With the photographs.
         masks: Folder with one mask for each photograph, of the same name whatever the
             suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``), or of
             one that differs in case, spaces or Unicode form. They lie as their photographs are
@@ -144,7 +143,7 @@ def load_views(
 
 
 def _named_path(folder: Path | str) -> str:
-    """Give the whole path under the name that was given: links are not followed."""
+    """Return the whole path under the name that was given: links are not followed."""
     return Path(os.path.abspath(folder)).as_posix()  # noqa: PTH100 - `resolve` follows links
 
 
@@ -213,7 +212,7 @@ def _refuse_absent(entries: Sequence[Path]) -> None:
 
 
 def _refuse_video(entries: Sequence[Path]) -> None:
-    """Say what makes photographs of the first video."""
+    """State what makes photographs of the first video."""
     for path in sorted(entries):
         if path.is_file() and _VIDEO.fullmatch(path.suffix):
             raise InputError(
@@ -280,7 +279,7 @@ def _holds_images(folder: Path) -> bool:
 def _tell_alpha(
     opaque: Sequence[Bool[Tensor, "height width"] | None], names: tuple[str, ...], folder: Path
 ) -> None:
-    """Say that transparency is taken for masks."""
+    """State that transparency is taken for masks."""
     drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
     warnings.warn(
         f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
@@ -308,7 +307,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
-    """Give width and height after shrinking to a longest side; 0 shrinks nothing."""
+    """Return width and height after shrinking to a longest side; 0 shrinks nothing."""
     longer = max(header.width, header.height)
     if not 0 < max_size_px < longer:
         return header.width, header.height
@@ -362,7 +361,7 @@ def _is_dark(
     mask_object: Literal["auto", "bright", "dark"],
     folder: Path,
 ) -> bool:
-    """Tell whether masks show the object dark, by all of them together."""
+    """Return whether masks show the object dark, by all of them together."""
     if mask_object != "auto":
         return mask_object == "dark"
     border, centre = [], []

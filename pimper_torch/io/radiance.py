@@ -70,10 +70,7 @@ def read_pictures(
     of other primaries than sRGB's, as a file says, are turned into those of sRGB.
 
     Args:
-        paths: Of the files.
-        headers: Of each.
         sizes_px: Width and height of each, at most those of its header.
-        encoding: Of all.
 
     Raises:
         InputError: Names a file that cannot be read, that the encoding does not fit, or that is
@@ -122,8 +119,6 @@ def radiance_of(
     """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
 
     Args:
-        decoded: Of a file.
-        response: Its response.
         black: Fraction of full scale.
         white: Fractions of full scale, one a colour.
     """
@@ -188,10 +183,7 @@ def _fill(
 
     Args:
         images: Written to.
-        paths: Of the files.
-        sizes_px: Of each.
         given: Response of all; ``None`` for that of each file.
-        encoding: Of all.
         whites: Levels of saturation that were found.
         tally: Count levels.
     """
@@ -229,7 +221,7 @@ def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
 
 
 def file_response(decoded: Decoded) -> Response:
-    """Give the response that a file says it has, sRGB where it does not say."""
+    """Return the response that a file says it has, sRGB where it does not say."""
     said = decoded.colour.response
     if said is None or (isinstance(said, Curve) and len(said.radiance) > len(decoded.samples)):
         return Srgb()
@@ -245,7 +237,7 @@ def _on_full_scale(response: Response, decoded: Decoded) -> Response:
 
 
 def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
-    """Give the saturation of files of each kind, where it is below full scale.
+    """Return the saturation of files of each kind, where it is below full scale.
 
     A colour that shows none saturates where the highest of the others does.
     """
@@ -304,7 +296,7 @@ def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) ->
 def _levels(
     encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
-    """Give black and white of a file as fractions of its full scale.
+    """Return black and white of a file as fractions of its full scale.
 
     Raises:
         InputError: Levels above full scale, ones for other colours, or no span between them.

@@ -150,7 +150,7 @@ def _shown(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that
 
 
 def _white(raw: Any) -> int:  # noqa: ANN401 - as above
-    """Give the level of saturation: the lowest that the file tells."""
+    """Return the level of saturation: the lowest that the file tells."""
     told = [int(level) for level in raw.camera_white_level_per_channel or () if level]
     return min([int(raw.white_level), *told])
 
@@ -160,7 +160,7 @@ def _black(raw: Any) -> int:  # noqa: ANN401 - as above
 
 
 def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as above
-    """Mark pixels that hold a saturated sample, or into which one is interpolated."""
+    """Find pixels that hold a saturated sample, or into which one is interpolated."""
     samples, pattern = raw.raw_image_visible, raw.raw_pattern
     if samples is None:
         return None
@@ -175,7 +175,7 @@ def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as 
 
 
 def _srgb_from_sensor(raw: Any) -> Float[Tensor, "3 3"] | None:  # noqa: ANN401 - as above
-    """Give the matrix from the sensor's colours to linear sRGB, by the camera's white balance."""
+    """Return the matrix from the sensor's colours to linear sRGB, by the camera's white balance."""
     matrix = torch.tensor(np.asarray(raw.color_matrix), dtype=torch.float64)[:3, :3]
     if not _keeps_white(matrix):
         sensor = torch.tensor(np.asarray(raw.rgb_xyz_matrix), dtype=torch.float64)[:3]

@@ -21,7 +21,7 @@ _UNDETERMINED = 1e-6
 
 
 def lights_report(result: Reconstruction) -> Report:
-    """Tell the light of every view, for each patch and for all of them together.
+    """Report the light of every view, for each patch and for all of them together.
 
     Lights are first-order harmonics ``l`` in the world frame: radiance is
     ``albedo * (l[0] + l[1:] . n)`` with ``n`` the outward unit normal. A patch that a view
@@ -122,7 +122,6 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     """Count what went in and came out, and what every stage cost.
 
     Args:
-        result: Of the run.
         about: More to tell, such as where the photographs lay.
     """
     scene = result.scene

@@ -22,7 +22,7 @@ _LAYOUT = (
 
 
 def response_of(encoding: Encoding) -> Response:
-    """Give the response that was chosen, reading its file if it is a measured one.
+    """Return the response that was chosen, reading its file if it is a measured one.
 
     ``auto``, where no file says another, is sRGB.
 

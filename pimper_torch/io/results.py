@@ -91,7 +91,6 @@ def write_result(
     It is there whole or not at all; see :func:`pimper_torch.outputs.folders.written_whole`.
 
     Args:
-        result: Of the run.
         config: The dataclass of settings that it ran with.
         folder: New or empty; its parents are made.
         overwrite: Replace a former result.

@@ -142,7 +142,7 @@ def _refuse_thumbnail(path: Path, image: TiffImagePlugin.TiffImageFile) -> None:
 
 
 def _full(tags: Mapping[int, Any], bits: int) -> int:
-    """Give full scale: less than the samples' bits have where MaxSampleValue says so.
+    """Return full scale: less than the samples' bits have where MaxSampleValue says so.
 
     It may be a mere statistic of the picture; what is 2 to some power minus 1 is none.
     """

@@ -26,14 +26,10 @@ Mask = Float[Tensor, "_ _"]
 def mask_ways(
     drawn: Mask, path: Path | str, found: Header, photograph: Path | str, header: Header
 ) -> list[Mask]:
-    """Give the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
+    """Return the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
 
     Args:
         drawn: As the mask's file has it, turned by an EXIF of its own.
-        path: Of the mask.
-        found: Of the mask.
-        photograph: Its path.
-        header: Of the photograph.
 
     Raises:
         InputError: None is of the photograph's size.
@@ -56,7 +52,7 @@ def choose_ways(
     pictures: Sequence[Float[Tensor, "channel _ _"]],
     where: str,
 ) -> bool:
-    """Tell whether masks that may lie either way are drawn on the pixels that files store.
+    """Return whether masks that may lie either way are drawn on the pixels that files store.
 
     All of them together, as one program drew them. A warning says where they are, and where
     nothing tells.
@@ -95,7 +91,7 @@ def choose_ways(
 
 
 def _errors(one: Float[Tensor, " pixel"], other: Float[Tensor, " pixel"]) -> float:
-    """Give by how many standard errors the second mean is larger."""
+    """Return by how many standard errors the second mean is larger."""
     if min(len(one), len(other)) < 2 * _APART:
         return 0.0
     variance = sum(_APART * part.var() / len(part) for part in (one, other))
@@ -105,7 +101,7 @@ def _errors(one: Float[Tensor, " pixel"], other: Float[Tensor, " pixel"]) -> flo
 def _changes(
     mask: Bool[Tensor, "height width"], picture: Float[Tensor, "channel height width"]
 ) -> Float[Tensor, " pixel"]:
-    """Give how much a photograph changes at each pixel of an outline, as part of its mean."""
+    """Return how much a photograph changes at each pixel of an outline, as part of its mean."""
     level = picture.mean(dim=0).clamp_min(0).sqrt()
     down, right = torch.gradient(level)
     change = torch.hypot(down, right)

@@ -15,7 +15,7 @@ def installed_version(distribution: str = "pimper_torch") -> str:
 
 
 def versions() -> dict[str, str]:
-    """Give the versions that a report of a fault needs, without loading what they are of."""
+    """Return the versions that a report of a fault needs, without loading what they are of."""
     return {
         **{name: installed_version(name) for name in _TOLD},
         "Python": platform.python_version(),

@@ -119,13 +119,10 @@ def strong_connections(
     first: int,
     last: int,
 ) -> None:
-    """Mark the strong connections, which may root an aggregate.
+    """Find the strong connections, which may root an aggregate.
 
     Args:
         starts: Of the rows.
-        columns: Of the entries.
-        entries: Of the matrix.
-        scale: Of each unknown.
         largest: Coupling of each row.
         coupled: Sum of each row's couplings over its diagonal.
         min_strength: Of an entry over the largest coupling of both rows.
@@ -183,7 +180,7 @@ def assigned(
     first: int,
     last: int,
 ) -> None:
-    """Give unlabelled unknowns the label of their strongest connection that has one."""
+    """Assign unlabelled unknowns the label of their strongest connection that has one."""
     for row in range(first, last):
         found[row] = label[row]
         if label[row] >= 0:
@@ -215,7 +212,7 @@ def assigned_by_coupling(
     first: int,
     last: int,
 ) -> bool:
-    """Give unlabelled unknowns the label of their largest coupling; true if any got one.
+    """Assign unlabelled unknowns the label of their largest coupling; true if any got one.
 
     Couplings grow along such chains, so that they are short.
     """
@@ -252,7 +249,7 @@ def prolongation(
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
-    """Give rows of the prolongation: aggregates, smoothed by one averaging step.
+    """Return rows of the prolongation: aggregates, smoothed by one averaging step.
 
     Returns:
         Entries per row, their columns, and the entries.
@@ -307,18 +304,10 @@ def coarser(
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
-    """Give rows of the Galerkin product ``P^T A P``, without an intermediate product.
+    """Return rows of the Galerkin product ``P^T A P``, without an intermediate product.
 
     Args:
         starts: Of the rows of A.
-        columns: Of its entries.
-        entries: Of A.
-        prolong_starts: Of P.
-        prolong_columns: Of P.
-        prolong_entries: Of P.
-        restrict_starts: Of P^T.
-        restrict_columns: Of P^T.
-        restrict_entries: Of P^T.
         first: Row.
         last: Row after those.
     """

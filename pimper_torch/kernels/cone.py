@@ -110,7 +110,7 @@ def apply(a: Ten, v: Four) -> Four:
 
 @compiled(fast=True, inline=True)
 def objective(s: Four, image: Four, b: Four) -> float:
-    """Give ``s . (A s - 2 b)``."""
+    """Return ``s . (A s - 2 b)``."""
     return (
         s[0] * (image[0] - 2 * b[0])
         + s[1] * (image[1] - 2 * b[1])
@@ -151,7 +151,7 @@ def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
 
 @compiled(fast=True, inline=True)
 def project(b: float, x: float, y: float, z: float) -> Four:
-    """Give the nearest vector of the cone; see ``photometry.cone.project_to_cone``."""
+    """Return the nearest vector of the cone; see ``photometry.cone.project_to_cone``."""
     square = x * x + y * y + z * z
     length = math.sqrt(square if square > 0 else 1.0)
     albedo = max(b + length, 0.0) / 2
@@ -162,7 +162,7 @@ def project(b: float, x: float, y: float, z: float) -> Four:
 
 @compiled(fast=True, inline=True)
 def frame(s: Four) -> tuple[Three, Three, Three]:
-    """Give the normal, zero at the apex, and two tangents; see ``photometry.cone``."""
+    """Return the normal, zero at the apex, and two tangents; see ``photometry.cone``."""
     square = s[1] * s[1] + s[2] * s[2] + s[3] * s[3]
     inverse = 1 / math.sqrt(square if square > 0 else 1.0)
     x, y, z = s[1] * inverse, s[2] * inverse, s[3] * inverse
@@ -178,7 +178,7 @@ def frame(s: Four) -> tuple[Three, Three, Three]:
 
 @compiled(fast=True, inline=True)
 def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
-    """Give ``B^T A B``, packed, for the columns ``(1, n)``, ``(0, first)``, ``(0, second)``."""
+    """Return ``B^T A B``, packed, for the columns ``(1, n)``, ``(0, first)``, ``(0, second)``."""
     u = apply(a, (0.0, first[0], first[1], first[2]))
     v = apply(a, (0.0, second[0], second[1], second[2]))
     w = apply(a, (1.0, n[0], n[1], n[2]))
@@ -216,7 +216,7 @@ def inverse_factor(m: Six) -> Six:
 
 @compiled(fast=True)
 def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
-    """Give the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
+    """Return the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
 
     Args:
         equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.

@@ -101,7 +101,6 @@ def _fan(vertex: int, faces: Indices, links: Indices, ring: Numbers, owner: Numb
 
     Args:
         vertex: Removed faces, with -1 in their first slot, are unlinked from its list.
-        faces: Of the mesh.
         links: See :func:`link_corners`.
         ring: Result: the neighbours in order.
         owner: Result: the face between each neighbour and the next.
@@ -181,7 +180,6 @@ def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64
     """Compute the worst new shape for every neighbour that a vertex may be collapsed on.
 
     Args:
-        points: Of all vertices.
         vertex: To be removed.
         ring: Its neighbours in order.
         score: Result, of every neighbour; -1 where a new face is too thin or folded.
@@ -248,7 +246,6 @@ def _placed(
         cosine: Of the angle between normals.
         ring: The neighbours in order.
         index: The neighbour that the vertex is collapsed on.
-        removed: Vertices.
         step_of: Result: the new face of each, counted around the neighbour from 1.
         errors: Result: distance and cosine of each.
 
@@ -325,7 +322,6 @@ def decimate(
     iteration no face changes twice, so that the mesh is decimated evenly.
 
     Args:
-        points: Of all vertices.
         values: Unit normals, then attributes in units of their tolerance.
         bound: Distance.
         cosine: Of the angle between normals.

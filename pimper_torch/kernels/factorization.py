@@ -476,14 +476,11 @@ def solve_on_cone(
     Args:
         radiance: Patch, view, sample; zero where missing.
         given: The weights; 0 where missing.
-        anchor: Of the lights.
         regularization: Weight of the anchor.
         prior: Patch, packed, sample.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The deviation is estimated from every ``stride``-th sample.
         max_iterations: Maximum number of steps.
-        tolerance: See the twin.
-        small_steps: See the twin.
         curvature_samples: See the twin; 0 for all.
         lights: The start, replaced by the solution.
         shading: The start, replaced by the solution; samples without weight keep it.

@@ -30,7 +30,7 @@ _LARGE = 1e100
 
 @compiled(fast=True)
 def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Give the radiance of albedo 1, by the four harmonics or the five values of a point light."""
+    """Return radiance of albedo 1, by the four harmonics or the five values of a point light."""
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
         a, b, c, d = geometry[0], geometry[1], geometry[2], geometry[3]
@@ -56,7 +56,7 @@ def _direction(light: Doubles) -> tuple[float, float, float, float]:
 
 @compiled(fast=True)
 def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
-    """Give the derivatives of a view's shading by its light's parameters, for one tile."""
+    """Return the derivatives of a view's shading by its light's parameters, for one tile."""
     if len(light) == 4:
         for j in range(4):
             row = geometry[j, first : first + TILE]

@@ -34,14 +34,12 @@ def most_alike(
         first: Pixels in one photograph.
         second: In the other.
         first_descriptors: Of length 1.
-        second_descriptors: The same.
         matrix: Homography from the first photograph, or fundamental matrix.
         planar: Whether it is a homography.
         max_error_px: Distance from the mapped point, or Sampson's from the epipolar line.
         first_products: Result, -1 before: the largest and the second largest.
         second_products: The same for features of the other photograph.
         first_best: Result, -1 before: index of the feature with the largest.
-        second_best: The same.
     """
     count, length = len(second), second_descriptors.shape[1]
     x, y = np.empty(count, np.float32), np.empty(count, np.float32)

@@ -15,11 +15,9 @@ Array = NDArray[Any]
     "Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)",
 )
 def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
-    """Give the upper left one of the four pixels around a point, and bilinear weights.
+    """Return the upper left one of the four pixels around a point, and bilinear weights.
 
     Args:
-        height: Of the level.
-        width: Of it.
         x: To the right, counted from the first pixel's centre; clamped to the border.
         y: Down.
 
@@ -38,7 +36,7 @@ def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int,
 
 @compiled("Tuple((int64, float32))(float64, int64)")
 def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
-    """Give the finer of the two levels around a footprint, and the weight of the coarser one.
+    """Return the finer of the two levels around a footprint, and the weight of the coarser one.
 
     Args:
         squared_footprint: Area of the footprint, pixels of the finest level.
@@ -69,7 +67,7 @@ def bilinear(
 
 @compiled("float64[:,::1](int64[:,::1])")
 def shrinkage(levels: Array) -> Array:
-    """Give each level's height and width as fractions of the finest one's."""
+    """Return each level's height and width as fractions of the finest one's."""
     fractions = np.empty((len(levels), 2), np.float64)
     for level in range(len(levels)):
         for axis in range(2):

@@ -51,16 +51,10 @@ def register(
         levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
-        sizes_px: Of the views.
-        origin: Of every template.
-        spacing: Of every template.
-        depth: Of every sample.
         outward: Unit normals, patch frame.
         inside: Samples of the templates.
         min_facing: Cosine of the steepest viewing angle.
         dark_level: Mean over the channels below which a sample is invalid.
-        radiance: Result.
-        valid: Result.
     """
     patches, views, channels, height, width = radiance.shape
     fine_plane = levels[0, 0] * levels[0, 1]

@@ -56,7 +56,7 @@ def _gray(
 
 @compiled("float32(float32[::1], int64[::1], int64)")
 def _lower_median(values: Array, order: Array, count: int) -> float:
-    """Give the lower median of the first ``count`` values.
+    """Return the lower median of the first ``count`` values.
 
     By insertion sort of ``order``: linear time if it is nearly sorted.
     """
@@ -147,9 +147,6 @@ def costs(
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         focals: In pixels.
-        origin: Of every template.
-        spacing: Of every template.
-        depth: Of every sample.
         outward: Unit, along which a sample is swept; patch frame.
         normals: That light shades, patch frame.
         lights: First-order harmonics of every patch and view.
@@ -160,7 +157,6 @@ def costs(
         num_views: Maximum number of views of a sample.
         min_views: A sample with fewer views is not swept.
         min_facing: Lower bound of the cosine that shrinks footprints.
-        cost: Result, zero before.
         swept: Result, zero before: 1 where a sample has costs.
     """
     patches, views, height, width = valid.shape

@@ -24,7 +24,7 @@ def using(kernels: Kernels) -> Iterator[None]:
 
 
 def compiled_for(*tensors: Tensor) -> bool:
-    """Tell whether compiled kernels may be used: chosen, tensors on the CPU, no gradients."""
+    """Return whether compiled kernels may be used: chosen, tensors on the CPU, no gradients."""
     tracked = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
     on_cpu = all(each.device.type == "cpu" for each in tensors)
     return _chosen.get() == "numba" and on_cpu and not tracked

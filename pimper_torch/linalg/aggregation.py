@@ -52,7 +52,7 @@ _BLOCK = 4096
 
 
 def prolongation(matrix: csr_array) -> csr_array:
-    """Give the prolongation from coarse unknowns to those of ``matrix``.
+    """Return the prolongation from coarse unknowns to those of ``matrix``.
 
     Args:
         matrix: Symmetric, its diagonal positive; best with few positive entries off it.
@@ -69,7 +69,7 @@ def prolongation(matrix: csr_array) -> csr_array:
 
 
 def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
-    """Give a diagonal with which Jacobi's iteration has a spectrum within [0, 2].
+    """Return a diagonal with which Jacobi's iteration has a spectrum within [0, 2].
 
     It is the matrix's own wherever that is diagonally dominant.
     """
@@ -84,7 +84,7 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
 
 def _compiled(matrix: csr_array) -> csr_array:
-    """Give the prolongation by compiled kernels."""
+    """Return the prolongation by compiled kernels."""
     from pimper_torch.kernels import aggregation as kernels
 
     parts, size = parts_of(matrix), matrix.shape[0]
@@ -115,7 +115,7 @@ def _compiled(matrix: csr_array) -> csr_array:
 
 
 def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_array:
-    """Give the Galerkin matrix of the coarse unknowns.
+    """Return the Galerkin matrix of the coarse unknowns.
 
     Args:
         matrix: Of the fine ones.
@@ -134,7 +134,7 @@ def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_a
 
 
 def parts_of(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give the arrays of a compressed matrix: starts of rows, columns and entries."""
+    """Return the arrays of a compressed matrix: starts of rows, columns and entries."""
     return matrix.indptr, matrix.indices, matrix.data
 
 
@@ -147,14 +147,14 @@ def _concatenated(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width:
 
 
 def _order(size: int) -> Int[np.ndarray, " unknown"]:
-    """Give the order in which roots are chosen: random within blocks."""
+    """Return the order in which roots are chosen: random within blocks."""
     within = np.random.default_rng(0).permutation(min(size, _BLOCK))
     order = (np.arange(0, size, _BLOCK)[:, None] + within).ravel() if size else within
     return order[order < size]
 
 
 def _near_kernel(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
-    """Give the near-kernel vector: ones, smoothed."""
+    """Return the near-kernel vector: ones, smoothed."""
     found, diagonal = np.ones(matrix.shape[0]), dominant_diagonal(matrix)
     for _ in range(_KERNEL_STEPS):
         found = found - _DAMPING * (matrix @ found) / diagonal
@@ -162,7 +162,7 @@ def _near_kernel(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
 
 def _averaged(matrix: csr_array) -> csr_array:
-    """Give the prolongation for a matrix whose near-kernel is constant."""
+    """Return the prolongation for a matrix whose near-kernel is constant."""
     size = matrix.shape[0]
     rows = np.repeat(np.arange(size, dtype=matrix.indices.dtype), np.diff(matrix.indptr))
     couplings = np.where(rows == matrix.indices, 0, np.maximum(-matrix.data, 0))
@@ -254,7 +254,7 @@ def _selected(
     kept: Bool[np.ndarray, " entry"],
     values: Float[np.ndarray, " entry"],
 ) -> csr_array:
-    """Give the matrix of some of the entries, with other values."""
+    """Return the matrix of some of the entries, with other values."""
     starts = np.zeros_like(matrix.indptr)
     np.cumsum(np.bincount(rows[kept], minlength=matrix.shape[0]), out=starts[1:])
     return csr_array((values[kept], matrix.indices[kept], starts), shape=matrix.shape)

@@ -93,8 +93,6 @@ def compressed_gradients(
         precondition: Approximates the inverse in ``dtype``; it may reuse the memory of its result.
         rhs: Float64, one column a right-hand side.
         start: Where to begin; zero if not given.
-        tolerance: As there.
-        max_iterations: As there.
         dtype: Of the vectors of ``precondition``.
     """
     from pimper_torch.kernels import conjugate_gradients as kernels

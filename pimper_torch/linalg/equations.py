@@ -23,7 +23,7 @@ def normal_equations(
     Float[Tensor, " entry"],
     Float[Tensor, " unknown"],
 ]:
-    r"""Give :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
+    r"""Return :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
 
     Args:
         unknowns: Indices of each equation's unknowns.
@@ -54,7 +54,7 @@ Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Flo
 def compressed_equations(
     kinds: Sequence[Terms], damping: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
 ) -> tuple[csr_array, Float[Tensor, " unknown"]]:
-    """Give the normal equations of several sets by compiled kernels, in float64 on the CPU.
+    """Return the normal equations of several sets by compiled kernels, in float64 on the CPU.
 
     They take no memory beyond that of the matrix.
 

@@ -49,7 +49,6 @@ class Level:
     """A level: its matrix, smoother, prolongation and restriction.
 
     Args:
-        product: Of the matrix.
         inverse_diagonal: Of its dominant diagonal.
         prolong: From the next level's unknowns to this one's; ``None`` on the last.
         restrict: The transpose.
@@ -81,7 +80,7 @@ class Level:
     def coarse_residual(
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "coarse ..."]:
-        """Give the restricted residual of a solution."""
+        """Return the restricted residual of a solution."""
         assert self.restrict is not None
         return self.restrict(residual - self.product(found))
 
@@ -102,7 +101,6 @@ class CompiledLevel(Level):
     Its vectors are allocated once: results are valid until the next cycle.
 
     Args:
-        matrix: Of this level.
         inverse_diagonal: Of its dominant diagonal, in the dtype of the level.
         prolong_matrix: From the next level's unknowns to this one's; ``None`` on the last.
         restrict_matrix: The transpose.
@@ -155,7 +153,7 @@ class CompiledLevel(Level):
     def coarse_residual(
         self, residual: Float[Tensor, "unknown ..."], found: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "coarse ..."]:
-        """Give the restricted residual without new vectors."""
+        """Return the restricted residual without new vectors."""
         assert self._restrict_matrix is not None
         remaining = self._buffer("left", residual)
         with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=remaining)
@@ -170,7 +168,7 @@ class CompiledLevel(Level):
         with_product(self._prolong_matrix, coarse, found, keep=1.0, found=found)
 
     def _buffer(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
-        """Give a named buffer, kept from cycle to cycle while its shape is the same."""
+        """Return a named buffer, kept from cycle to cycle while its shape is the same."""
         shape = (len(like) if size is None else size, *like.shape[1:])
         if name not in self._vectors or self._vectors[name].shape != shape:
             self._vectors[name] = like.new_empty(shape)
@@ -182,7 +180,6 @@ class Hierarchy:
 
     Args:
         matrix: In float64; both triangles.
-        device: Where cycles run.
         product: Of the matrix, if there is a faster one than by compressed rows.
         dtype: Of compiled cycles: float32 takes half the memory, and as many cycles.
 
@@ -225,7 +222,7 @@ class Hierarchy:
         return self._cycle(0, residual)
 
     def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
-        """Give a copy for a similar matrix: only the finest level is new.
+        """Return a copy for a similar matrix: only the finest level is new.
 
         Args:
             product: Of the new matrix.
@@ -272,7 +269,7 @@ def _level(
 
 
 def sparse_product(matrix: csr_array, device: torch.device) -> Product:
-    """Give the fastest product of a sparse matrix with vectors on a device."""
+    """Return the fastest product of a sparse matrix with vectors on a device."""
     if device.type != "cpu":
         return torch_product(matrix, device)
     if compiled_for():
@@ -299,7 +296,7 @@ def with_product(
 
 
 def torch_product(matrix: csr_array, device: torch.device) -> Product:
-    """Give the product by torch's compressed rows."""
+    """Return the product by torch's compressed rows."""
     with warnings.catch_warnings():  # that compressed rows are in beta state
         warnings.simplefilter("ignore", UserWarning)
         moved = torch.sparse_csr_tensor(
@@ -313,13 +310,13 @@ def torch_product(matrix: csr_array, device: torch.device) -> Product:
 
 
 def _rounded(matrix: csr_array, real: np.dtype[np.floating]) -> csr_array:
-    """Give a matrix with entries of another type; the arrays of indices are shared."""
+    """Return a matrix with entries of another type; the arrays of indices are shared."""
     entries = matrix.data.astype(real, copy=False)
     return csr_array((entries, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _columns(vectors: Float[Tensor, "unknown ..."]) -> np.ndarray:
-    """Give vectors as arrays with one column per right-hand side."""
+    """Return vectors as arrays with one column per right-hand side."""
     array = as_array(vectors)
     return array.reshape(len(array), -1)
 

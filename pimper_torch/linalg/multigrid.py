@@ -55,7 +55,6 @@ def solve_with_hierarchy(
     """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
 
     Args:
-        product: Of A.
         hierarchy: Approximates the inverse of A.
         diagonal: Of A; only to measure the residual.
         rhs: ``b``, one column a right-hand side if there are several.
@@ -92,11 +91,6 @@ def solve_by_cycles(
 
     Args:
         matrix: A, float64, both triangles.
-        diagonal: See there.
-        rhs: See there.
-        tolerance: See there.
-        what: See there.
-        start: See there.
 
     Raises:
         SingularSystemError: See there.
@@ -123,15 +117,11 @@ def _checked(
     tolerance: float,
     what: str,
 ) -> Iterate:
-    """Give the result of conjugate gradients, or refuse it.
+    """Return the result of conjugate gradients, or refuse it.
 
     Args:
         reached: Values, steps and whether they converged.
-        residual: Of the values.
-        diagonal: Of the matrix.
         rhs: Right-hand side.
-        tolerance: Of the error.
-        what: Names the system.
 
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.
@@ -161,10 +151,6 @@ class Multigrid(PreparedMatrix):
 
     Args:
         rows: See :class:`~pimper_torch.linalg.prepared.PreparedMatrix`.
-        cols: The same.
-        values: The same.
-        size: The same.
-        what: The same.
         tolerance: Of the error, in the energy norm, relative.
 
     >>> index = torch.tensor([0, 1])

@@ -20,11 +20,6 @@ def refuse_hopeless(
 ) -> None:
     """Refuse entries that are not finite and unknowns without a positive diagonal.
 
-    Args:
-        entries: Of the matrix.
-        diagonal: Of the matrix.
-        what: Names the system.
-
     Raises:
         SingularSystemError: There are some.
     """

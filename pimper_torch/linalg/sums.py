@@ -31,5 +31,5 @@ def along_last(values: Float[Tensor, "*batch item"]) -> Float[Tensor, "*batch"]:
 
 
 def average(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Give the mean of all values, summed as by :func:`total`; NaN where there are none."""
+    """Return the mean of all values, summed as by :func:`total`; NaN where there are none."""
     return total(values) / values.numel()

@@ -76,11 +76,8 @@ def solutions(
 
     Args:
         rows: As in :func:`prepare`.
-        cols: The same.
-        values: The same.
         sides: Right-hand sides, one at least.
         what: Names the system in errors.
-        tolerance: Of multigrid.
 
     Differentiable in ``values`` and in the sides.
 
@@ -113,7 +110,6 @@ def solve_compressed(
         matrix: Symmetric positive definite; float64.
         sides: Right-hand sides, float64, on the CPU.
         what: Names the system in errors.
-        tolerance: Of multigrid.
         start: Initial values of multigrid.
 
     Raises:

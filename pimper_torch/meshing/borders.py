@@ -50,8 +50,6 @@ def protruding(
     are as large do not show what is narrower. A constant to autograd.
 
     Args:
-        vertices: Of the surface.
-        faces: Of it.
         length: What sticks out is about as wide, or narrower; scene units.
         unsure: False for faces that photographs determine, which stay.
     """
@@ -110,7 +108,7 @@ def _repeatedly(
 def _distance(
     points: Float[Tensor, "point 3"], border: Float[Tensor, "border 3"], most: float
 ) -> Float[Tensor, " point"]:
-    """Give the distance to the nearest point of a border; infinite where it is more than most."""
+    """Return the distance to the nearest point of a border; infinite where it is more than most."""
     tree = cKDTree(border.numpy())
     return torch.from_numpy(tree.query(points.numpy(), distance_upper_bound=most, workers=-1)[0])
 
@@ -118,7 +116,7 @@ def _distance(
 def _near(
     points: Float[Tensor, "point 3"], others: Float[Tensor, "other 3"], reach: float
 ) -> Bool[Tensor, " point"]:
-    """Mark points about as near to others as that: others of a cell stand at its centre."""
+    """Find points about as near to others as that: others of a cell stand at its centre."""
     cell = reach / 8
     centres = cell * (torch.unique((others / cell).floor(), dim=0) + 0.5)
     return _distance(points, centres, reach).isfinite()

@@ -92,7 +92,7 @@ def closed(mesh: Mesh) -> Closed:
 
 
 def _known(albedo: Float[Tensor, "vertex channel"]) -> Float[Tensor, "vertex channel"]:
-    """Give vertices whose albedo no photograph tells the mean of the others'."""
+    """Assign vertices whose albedo no photograph tells the mean of the others'."""
     known = albedo.isfinite()
     mean = torch.where(known, albedo, 0).sum(dim=0) / known.sum(dim=0).clamp_min(1)
     return torch.where(known, albedo, mean)

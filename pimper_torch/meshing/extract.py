@@ -145,7 +145,7 @@ class Extract(Stage):
 
 
 def facet_side(surface: Surface) -> float:
-    """Give the side of a typical facet, scene units."""
+    """Return the side of a typical facet, scene units."""
     edges = (len(surface.faces) / max(len(torch.unique(surface.facet)), 1)) ** 0.5
     corners = surface.vertices_world.detach()[surface.faces]
     sides = (corners - corners.roll(1, dims=1)).norm(dim=-1)
@@ -155,7 +155,7 @@ def facet_side(surface: Surface) -> float:
 def large_components(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], fraction: float
 ) -> Bool[Tensor, " face"]:
-    """Mark the components, connected by edges, with a fraction of the largest one's area.
+    """Find the components, connected by edges, with a fraction of the largest one's area.
 
     With a fraction of 1 only the first of the largest is marked.
     """

@@ -41,7 +41,7 @@ class Faults:
     longest: Float[Tensor, ""]
 
     def broken(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark faces stretched, on both sides of a fold, or overturned where a fold bounds them."""
+        """Find faces stretched, on both sides of a fold, or overturned where a fold bounds them."""
         return self.stretched(vertices) | self._folded(vertices)
 
     def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
@@ -50,15 +50,15 @@ class Faults:
         return Faults(faces=corners, along=self.along[chosen], longest=self.longest), used
 
     def stretched(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark faces with a side that is too long."""
+        """Find faces with a side that is too long."""
         return side_lengths(vertices[self.faces]).amax(dim=1) > self.longest
 
     def overturned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark faces turned by more than 90 degrees from the mean normal of their facet."""
+        """Find faces turned by more than 90 degrees from the mean normal of their facet."""
         return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
 
     def folded_over(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
-        """Mark overturned faces where a fold bounds their component."""
+        """Find overturned faces where a fold bounds their component."""
         return self._folded(vertices) & self.overturned(vertices)
 
     def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
@@ -83,7 +83,7 @@ class Faults:
         normals: Float[Tensor, "face 3"],
         overturned: Bool[Tensor, " face"],
     ) -> Bool[Tensor, " face"]:
-        """Mark the faces round vertices of overturned faces, and round those that may have a fold.
+        """Find the faces round vertices of overturned faces, and round those that may have a fold.
 
         Two faces whose normals are within half a fold of any axis have no fold between them, so
         that neighbours are looked for among few faces.
@@ -106,7 +106,6 @@ def faults(
 
     Args:
         vertices: World.
-        faces: Of the surface.
         facet: Of each vertex; a face belongs to the facet of most of its vertices.
         max_stretch: Longest side, in multiples of the median.
     """
@@ -122,7 +121,7 @@ def facet_means(
     faces: Int[Tensor, "face 3"],
     facet: Int[Tensor, " vertex"],
 ) -> Float[Tensor, "face 3"]:
-    """Give each face the mean normal of its facet, weighted by area, of any length."""
+    """Assign each face the mean normal of its facet, weighted by area, of any length."""
     one, other, last = facet[faces].unbind(dim=1)
     owner = torch.where(other == last, other, one)
     normals = face_normals(vertices, faces)

@@ -12,11 +12,10 @@ def small_groups(
     among: Bool[Tensor, " vertex"],
     max_extent: Float[Tensor, ""],
 ) -> Bool[Tensor, " vertex"]:
-    """Mark the vertices ``among`` whose connected component is small.
+    """Find the vertices ``among`` whose connected component is small.
 
     Args:
         vertices: World.
-        faces: Of the surface.
         among: Vertices to connect along edges.
         max_extent: Diagonal of a component's bounding box.
     """
@@ -31,5 +30,5 @@ def small_groups(
 
 
 def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
-    """Give the diagonal of the points' bounding box."""
+    """Return the diagonal of the points' bounding box."""
     return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

@@ -22,7 +22,6 @@ def least_bent(
 
     Args:
         vertices: World.
-        faces: Of the surface.
         free: Vertices to move; every connected component needs a neighbour that is not free.
 
     Differentiable in the fixed vertices; one solve.

@@ -152,7 +152,7 @@ def _median_edge(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3
 
 
 def _slices(points: np.ndarray) -> np.ndarray:
-    """Give each vertex its slice across the mesh's longest side; all have as many vertices."""
+    """Assign each vertex its slice across the mesh's longest side; all have as many vertices."""
     along = points[:, np.ptp(points, axis=0).argmax()]
     cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
     return np.searchsorted(cuts, along).astype(np.int8)

@@ -14,7 +14,7 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 
 def exchange(one: Path, other: Path, spare: Path) -> None:
-    """Give ``one`` the name of ``other`` and the other way round.
+    """Assign ``one`` the name of ``other`` and the other way round.
 
     At once, by `renameat2` of Linux or `renamex_np` of macOS; where system or disk have no such
     call, by three renames, with ``one`` under the name ``spare`` in between.

@@ -19,7 +19,6 @@ def prepare_file(path: Path, overwrite: bool, is_ours: Callable[[Path], bool]) -
     """Refuse, before the work, a file that cannot be written or is not ours.
 
     Args:
-        path: Of the file.
         overwrite: Replace a former one.
         is_ours: Whether a file is one that we wrote.
 
@@ -45,7 +44,7 @@ def prepare_file(path: Path, overwrite: bool, is_ours: Callable[[Path], bool]) -
 
 @contextmanager
 def file_written_whole(path: Path) -> Iterator[Path]:
-    """Give the name of a file to write, which takes the place of ``path`` when all went well.
+    """Return the name of a file to write, which takes the place of ``path`` when all went well.
 
     Raises:
         OutputError: The disk refuses; then what was there is there still.
@@ -64,7 +63,7 @@ def file_written_whole(path: Path) -> Iterator[Path]:
 
 
 def says_of_itself(path: Path, key: str, value: str) -> bool:
-    """Tell whether a file is a JSON object that has a value under a key."""
+    """Return whether a file is a JSON object that has a value under a key."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             return False
@@ -75,7 +74,7 @@ def says_of_itself(path: Path, key: str, value: str) -> bool:
 
 
 def is_titled(path: Path, title: str) -> bool:
-    """Tell whether a file is a PNG of a title."""
+    """Return whether a file is a PNG of a title."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD)

@@ -29,7 +29,6 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
 
     Args:
         folder: New, or empty but for what a former run kept.
-        kind: Of the result.
         overwrite: Replace a former result of that kind, if nothing but its own files is there, as
             they were written.
 
@@ -72,7 +71,6 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
 
     Args:
         folder: Its parents are made.
-        kind: Of the result.
         overwrite: As of :func:`prepare_output`.
 
     Yields:
@@ -117,7 +115,7 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
 
 @contextmanager
 def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a folder to fill, which takes the place of ``folder`` when all went well.
+    """Return a folder to fill, which takes the place of ``folder`` when all went well.
 
     It lies beside ``folder``: a folder that is there is whole, and a former result is replaced
     only when the new one is complete and on the disk. What a run kept for the next one stays; see
@@ -125,7 +123,6 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
 
     Args:
         folder: New, or empty but for what a former run kept; its parents are made.
-        kind: Of the result.
         overwrite: Replace a former result of that kind.
 
     Raises:
@@ -151,7 +148,6 @@ def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None
     """Refuse inputs in the folder of the result, which would be replaced with it.
 
     Args:
-        folder: Of the result.
         inputs: By what they are called. Links are followed.
 
     Raises:

@@ -71,7 +71,7 @@ def seal(folder: Path, kind: Kind) -> None:
 
 
 def mark(folder: Path, kind: Kind) -> None:
-    """Mark a folder as ours that lists nothing, as its contents check themselves.
+    """Find a folder as ours that lists nothing, as its contents check themselves.
 
     Raises:
         OSError: The disk refuses.

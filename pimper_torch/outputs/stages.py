@@ -30,7 +30,7 @@ _LOCKLESS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP)
 
 
 def is_ours(stages: Path) -> bool:
-    """Tell whether a folder of that name was made by us, or is empty."""
+    """Return whether a folder of that name was made by us, or is empty."""
     if stages.is_symlink() or not stages.is_dir():
         return False
     marker = read_marker(stages)
@@ -147,7 +147,7 @@ def _write_holder(path: Path) -> None:
 
 
 def _told(shown: Path, path: Path) -> str:
-    """Tell who holds a folder, as far as it can be read."""
+    """Report who holds a folder, as far as it can be read."""
     about: Any = None
     with suppress(OSError, ValueError, RecursionError):
         about = json.loads(path.read_text(encoding="utf-8")[:_MAX_HOLDER])

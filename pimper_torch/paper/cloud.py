@@ -23,9 +23,7 @@ def with_cloud(
     """Make a coarse mesh of facets and the points of the cloud on them, with covariances.
 
     Args:
-        scene: The cloud.
         reliable: Its points on the object.
-        mesh: The facets.
         reference: The view they were triangulated in.
         source: The point of the cloud at each vertex, -1 for none.
     """
@@ -56,7 +54,6 @@ def facets_under(
     """Find the facet that contains each point of an image, -1 outside all.
 
     Args:
-        pixels: The points.
         corners_px: Of facets that do not overlap in the image.
     """
     found = []

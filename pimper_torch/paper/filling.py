@@ -10,7 +10,7 @@ def fill_smoothly(
     values: Float[Tensor, "patch channel height width"],
     weight: Float[Tensor, "patch height width"],
 ) -> Float[Tensor, "patch channel height width"]:
-    """Give every sample without weight a smooth blend of those with weight around it.
+    """Assign every sample without weight a smooth blend of those with weight around it.
 
     Push and pull through a pyramid of halved rasters: holes are filled from the finest
     level that knows anything there.

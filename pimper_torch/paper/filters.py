@@ -9,7 +9,7 @@ from pimper_torch.records import Cameras
 
 
 def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:
-    """Mark the views whose optical axes are within an angle of the reference's."""
+    """Find the views whose optical axes are within an angle of the reference's."""
     axes = cameras.cam_from_world[:, 2, :3]
     cosine = (axes @ axes[reference]).clamp(-1, 1)
     return cosine >= torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
@@ -23,7 +23,7 @@ def behind_others(
     neighbours: int,
     slope: float,
 ) -> Bool[Tensor, " point"]:
-    """Mark points that a nearer surface occludes in the image, or probably does.
+    """Find points that a nearer surface occludes in the image, or probably does.
 
     Another view may see past the contour of the nearer surface, and some tracks have a false
     match in the very view that cannot see the point. Of the nearest points in the image those
@@ -61,7 +61,7 @@ def neighbours_agree(
     max_slope: float,
     max_deviation: float,
 ) -> Bool[Tensor, " point"]:
-    """Mark points that lie on the same surface as those around them in the image.
+    """Find points that lie on the same surface as those around them in the image.
 
     Two tests against the nearest points in the image. A point of another surface (the far
     side, the background) is steep against most of them: ``|dz|`` over the lateral distance
@@ -91,7 +91,7 @@ def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor
 
 
 def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
-    """Mark the corners of the points' convex hull in the image.
+    """Find the corners of the points' convex hull in the image.
 
     Chosen before all others, they let the mesh reach as far as the cloud does.
     """
@@ -104,7 +104,7 @@ def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
 def well_accompanied(
     pixels: Float[Tensor, "point 2"], max_isolation: float
 ) -> Bool[Tensor, " point"]:
-    """Mark all points but isolated corners of the hull, one hull after another.
+    """Find all points but isolated corners of the hull, one hull after another.
 
     Neighbours all on one side say little about a corner's depth, and the mesh would reach out
     to a wrong one. Isolation is the distance to the third nearest point over the median of

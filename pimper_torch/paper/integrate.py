@@ -126,7 +126,7 @@ def _slopes(
     valid: Bool[Tensor, "patch height width"],
     steepest: float,
 ) -> Float[Tensor, "patch height width 2"]:
-    """Give the slopes of valid normals, at most so steep, and 0 elsewhere."""
+    """Return the slopes of valid normals, at most so steep, and 0 elsewhere."""
     upright = torch.zeros_like(normals)
     upright[..., 2] = -1
     return slopes_from_normals(torch.where(valid[..., None], normals, upright), steepest)

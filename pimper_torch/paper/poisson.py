@@ -20,7 +20,7 @@ from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
 
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
-    """Give the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
+    """Return the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
     frequency = torch.arange(size, device=like.device, dtype=like.dtype)
     basis = (math.pi / size * frequency[:, None] * (frequency + 0.5)).cos()
     basis = basis * math.sqrt(2 / size)
@@ -30,7 +30,7 @@ def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size}
 def differences(
     heights: Float[Tensor, "*batch height width"],
 ) -> tuple[Float[Tensor, "*batch height steps_right"], Float[Tensor, "*batch steps_down width"]]:
-    """Give the steps to the right and down."""
+    """Return the steps to the right and down."""
     return heights.diff(dim=-1), heights.diff(dim=-2)
 
 

@@ -196,7 +196,7 @@ class Triangulate(Stage):
         reference: int,
         edge_px: float,
     ) -> Float[Tensor, "filled 3"]:
-        """Give new vertices between far-apart ones, on a spline through all reliable points."""
+        """Return new vertices between far-apart ones, on a spline through all reliable points."""
         pixels, _ = _project(vertices, cameras, reference)
         wanted = fill_pixels(pixels, faces, edge_px)
         known, depth = _project(points, cameras, reference)
@@ -278,7 +278,7 @@ def _project(
 
 
 def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
-    """Give the edge of the triangular grid that puts ``num_points`` on the hull's area."""
+    """Return the edge of the triangular grid that puts ``num_points`` on the hull's area."""
     faces = delaunay(pixels)
     a, b, c = pixels[faces].unbind(dim=1)
     ab, ac = b - a, c - a
@@ -289,7 +289,7 @@ def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
 def _shown(
     corners_px: Float[Tensor, "face 3 2"], shows_object: Bool[Tensor, "height width"]
 ) -> Float[Tensor, " face"]:
-    """Give the fraction of each triangle's pixels that show the object."""
+    """Return the fraction of each triangle's pixels that show the object."""
     steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
     weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside
     height, width = shows_object.shape
@@ -303,7 +303,7 @@ def _shown(
 
 
 def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
-    """Give the smallest height over the longest edge, in the image; 0.87 for equal sides."""
+    """Return the smallest height over the longest edge, in the image; 0.87 for equal sides."""
     longest = side_lengths(corners_px).amax(dim=1)
     a, b, c = corners_px.unbind(dim=1)
     ab, ac = b - a, c - a
@@ -312,7 +312,7 @@ def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
 
 
 def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[Tensor, "face 3"]:
-    """Mark corners with less than an angle between their edges, in the image."""
+    """Find corners with less than an angle between their edges, in the image."""
     ahead = normalize(corners_px.roll(-1, dims=1) - corners_px, dim=-1)
     back = normalize(corners_px.roll(1, dims=1) - corners_px, dim=-1)
     cosine = (ahead * back).sum(dim=-1)
@@ -320,7 +320,7 @@ def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[
 
 
 def _border_edges(faces: Int[Tensor, "face 3"]) -> Bool[Tensor, "face 3"]:
-    """Mark edges of one face only, the first of which runs from its first corner to its second."""
+    """Find edges of one face only, the first of which runs from its first corner to its second."""
     _, opposite = face_edges(faces)
     count = torch.bincount(opposite.flatten())
     return (count[opposite] == 1).roll(1, dims=1)  # the edge opposite to corner 2 comes first

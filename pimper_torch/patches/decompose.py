@@ -44,7 +44,7 @@ class DecomposeConfig:
 
 
 class Decompose(Stage):
-    """Give every facet a frame, an enlarged triangle and a raster."""
+    """Assign every facet a frame, an enlarged triangle and a raster."""
 
     def __init__(self, config: DecomposeConfig | None = None) -> None:
         super().__init__()
@@ -64,8 +64,6 @@ class Decompose(Stage):
         where ``max_samples`` asks for it.
 
         Args:
-            coarse: The facets.
-            cameras: Of all views.
             surface: What is transferred to the templates; without, they are flat.
             scale: Of the photographs, 1 for their own size.
 
@@ -134,7 +132,7 @@ def facet_frames(
     faces: Int[Tensor, "face 3"],
     cam_from_world: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "face 4 4"]:
-    """Give ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
+    """Return ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
 
     z is the inward normal; x is the reference camera's x made orthogonal to it, so that a
     facet that faces the camera appears in its template as in the image.
@@ -152,7 +150,7 @@ def facet_frames(
 def sample_spacing(
     vertices: Float[Tensor, "vertex 3"], cameras: Cameras, reference: int, samples_per_pixel: float
 ) -> Float[Tensor, ""]:
-    """Give the scene units that one sample spans: 1/zeta."""
+    """Return the scene units that one sample spans: 1/zeta."""
     intrinsics = cameras.intrinsics[reference]
     _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
     focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()

@@ -24,9 +24,6 @@ def resampled(
     Pixels are computed in float64; images are looked up in float32.
 
     Args:
-        cameras: Of all views.
-        sources: Photographs.
-        templates: The bucket.
         min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
@@ -70,7 +67,7 @@ def occluded(
     templates: Templates,
     stride: int,
 ) -> Bool[Tensor, "patch view height width"]:
-    """Mark samples that a surface occludes; a constant to autograd.
+    """Find samples that a surface occludes; a constant to autograd.
 
     One ray for every ``stride`` samples either way, from the camera to just before the surface,
     where one of these samples is valid; all of a bucket at once.
@@ -99,6 +96,6 @@ def occluded(
 
 
 def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
-    """Give the site nearest to each of a row of samples."""
+    """Return the site nearest to each of a row of samples."""
     index = torch.arange(sites, dtype=torch.float32)[None, None]
     return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()

@@ -44,7 +44,7 @@ class Pyramid(Record):
     def levels(
         self, view: int
     ) -> list[Float[Tensor, "channel _ _"] | UInt8[Tensor, "channel _ _"]]:
-        """Give a view's levels, the finest first."""
+        """Return a view's levels, the finest first."""
         channels = self.finest.shape[1]
         areas = [channels * height * width for height, width in self.sizes[1:]]
         coarser = zip(torch.split(self.coarser[view], areas), self.sizes[1:], strict=True)
@@ -52,7 +52,7 @@ class Pyramid(Record):
 
     @property
     def arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Give the finest level and the others as kernels take them: a row a view."""
+        """Return the finest level and the others as kernels take them: a row a view."""
         return as_array(self.finest.flatten(1)), as_array(self.coarser)
 
     @property
@@ -91,7 +91,6 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
     Differentiable in the photographs.
 
     Args:
-        views: Photographs.
         saturation_level: Radiance at or above which a pixel is unusable.
         levels: Maximum number; small photographs have fewer.
     """
@@ -129,7 +128,7 @@ def _one(
     UInt8[Tensor, "1 height width"],
     UInt8[Tensor, " entry"],
 ]:
-    """Give a view's further levels, its gray levels and its unusable ones."""
+    """Return a view's further levels, its gray levels and its unusable ones."""
     image = images[view][None]
     given = views.images[view]
     width, height = (int(side) for side in views.sizes_px[view])
@@ -153,7 +152,7 @@ def _one(
 
 
 def _sizes(height: int, width: int, levels: int) -> tuple[tuple[int, int], ...]:
-    """Give height and width of every level."""
+    """Return height and width of every level."""
     sizes = [(height, width)]
     while len(sizes) < levels and min(sizes[-1]) >= _SMALLEST:
         height, width = height // 2, width // 2

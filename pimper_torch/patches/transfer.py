@@ -43,7 +43,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
 def transferred_normals(
     coarse: CoarseMesh, templates: Templates
 ) -> Float[Tensor, "patch height width 3"]:
-    """Give the normals of a template, patch frame: of its surface, or else of the mesh."""
+    """Return the normals of a template, patch frame: of its surface, or else of the mesh."""
     if templates.normals_patch is None:
         return coarse_normals(coarse, templates)
     return facing_viewer(templates.normals_patch)

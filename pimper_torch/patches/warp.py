@@ -83,11 +83,9 @@ class Warp(Stage):
         patches: PatchSet,
         sources: Sources | None = None,
     ) -> PatchViews:
-        """Give J and D of every patch.
+        """Return J and D of every patch.
 
         Args:
-            views: Photographs.
-            cameras: Of all views.
             patches: All, or some buckets of them.
             sources: Pyramids as :meth:`prepare` builds them, and the surface that occludes;
                 made here where not given.
@@ -201,7 +199,7 @@ class Warp(Stage):
 
 
 def missing_fraction(seen: PatchViews) -> float:
-    """Give the fraction of the enlarged triangles' samples, over all views, that is missing."""
+    """Return the fraction of the enlarged triangles' samples, over all views, that is missing."""
     pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
     samples = sum(int(t.inside.sum()) * r.valid.shape[1] for t, r in pairs)
     return 1 - sum(int(registered.valid.sum()) for _, registered in pairs) / samples

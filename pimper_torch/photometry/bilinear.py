@@ -110,7 +110,7 @@ def robust_weights(
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch view sample"]:
-    """Give ``D`` times the loss's weights at the current residuals."""
+    """Return ``D`` times the loss's weights at the current residuals."""
     if isinstance(problem.loss, Squares):
         return problem.weight
     residual = problem.radiance - lights @ shading
@@ -147,7 +147,7 @@ def equations_of_views(
 def curvature_of_views(
     shading: Float[Tensor, "patch rank sample"], weight: Float[Tensor, "patch view sample"]
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Give the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
+    """Return the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
     batch, views, rank = len(weight), weight.shape[1], shading.shape[1]
     products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
     blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
@@ -173,7 +173,7 @@ def evaluate(
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
-    """Give the :func:`objective`, and minus half its gradient by the lights."""
+    """Return the :func:`objective`, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
     cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
@@ -240,7 +240,7 @@ def tangent_step(
 def curvature_along(
     columns: list[Tensor], packed: Float[Tensor, "patch packed sample"]
 ) -> Float[Tensor, "patch smaller sample"]:
-    """Give ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
+    """Return ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
     curvature = congruence(packed, columns)
     slot = diagonal(len(columns))
     curvature[:, slot] += 1e-9 * curvature[:, slot].sum(dim=1, keepdim=True)
@@ -270,7 +270,7 @@ def to_factors(
     iterations: Int[Tensor, " patch"],
     cause: Int[Tensor, " patch"],
 ) -> Factors:
-    """Give a solver's result, with its residuals; patches without data are marked empty."""
+    """Return a solver's result, with its residuals; patches without data are marked empty."""
     has_data = problem.weight.sum(dim=(1, 2)) > 0
     empty = torch.full_like(cause, int(StopCause.EMPTY))
     convergence = Convergence(
@@ -286,7 +286,7 @@ def root_mean_square(
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, " patch"]:
-    """Give each patch's weighted root mean square residual; 0 without data."""
+    """Return each patch's weighted root mean square residual; 0 without data."""
     residual = problem.radiance - lights @ shading
     count = problem.weight.sum(dim=(1, 2))
     mean = (problem.weight * residual**2).sum(dim=(1, 2)) / torch.where(count > 0, count, 1)

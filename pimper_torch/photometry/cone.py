@@ -54,7 +54,7 @@ def split_shading(
 def tangents(
     normals: Float[Tensor, "*batch 3"],
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """Give two unit vectors that span, with each unit normal, a right-handed frame.
+    """Return two unit vectors that span, with each unit normal, a right-handed frame.
 
     Continuous except where ``n_z`` changes sign, which viewer-facing normals never do.
 
@@ -87,7 +87,7 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
 
 
 def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
-    """Give lengths, 1 for zero vectors, and which vectors are not zero."""
+    """Return lengths, 1 for zero vectors, and which vectors are not zero."""
     x, y, z = vector
     square = x * x + y * y + z * z
     directed = square > 0

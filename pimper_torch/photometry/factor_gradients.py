@@ -149,7 +149,7 @@ def _gradient_size(problem: Bilinear, hessian: Hessian) -> Float[Tensor, " patch
 
 
 def _newton_step(problem: Bilinear, hessian: Hessian) -> Step:
-    r"""Give Newton's step; differentiable in the data, the Hessian constant.
+    r"""Return Newton's step; differentiable in the data, the Hessian constant.
 
     The scale of the robust weights is a multiple of the residuals' deviation :math:`d`, which
     adds a rank-one term to the Hessian: the gradient's derivative by :math:`d` times the
@@ -187,7 +187,7 @@ def _by_deviation(
     Float[Tensor, "patch view sample"],
     tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]],
 ]:
-    """Give the deviation's derivatives by the residuals, and the gradient's by the deviation."""
+    """Return the deviation's derivatives by the residuals, and the gradient's by the deviation."""
     residual = problem.radiance.double() - hessian.lights @ hessian.shading
     with torch.enable_grad():
         at = residual.detach().requires_grad_()
@@ -207,7 +207,7 @@ def _by_deviation(
 def _change_of(
     deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: Step
 ) -> Float[Tensor, " patch"]:
-    """Give the directional derivative of the deviation along a step."""
+    """Return the directional derivative of the deviation along a step."""
     samples = step.lights @ hessian.shading
     samples = samples + hessian.lights @ combination(hessian.columns, step.along_tangents)
     return -(deviation_slope * samples).sum(dim=(1, 2))
@@ -275,7 +275,7 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
 def _gradient(
     problem: Bilinear, hessian: Hessian
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
-    """Give minus half the gradient by lights and samples, as a function of the data."""
+    """Return minus half the gradient by lights and samples, as a function of the data."""
     L, N = hessian.lights, hessian.shading
     residual = problem.radiance.double() - L @ N
     deviation = residual_deviation(problem, residual)[:, None, None]

@@ -435,7 +435,7 @@ def _tell_failed(facets: Int[Tensor, " failed"]) -> None:
 
 
 def _finite(convergence: Convergence, status: Int[Tensor, " patch"]) -> Convergence:
-    """Give patches without a solution no residual, where it is not finite."""
+    """Assign patches without a solution no residual, where it is not finite."""
     failed = status == int(PatchStatus.FAILED)
     residual = convergence.residual
     return convergence.replace(
@@ -444,7 +444,7 @@ def _finite(convergence: Convergence, status: Int[Tensor, " patch"]) -> Converge
 
 
 def _lost(bucket: _Bucket, some: slice) -> Photometry:
-    """Give a patch that cannot be factorized: coarse normals, and nothing else."""
+    """Return a patch that cannot be factorized: coarse normals, and nothing else."""
     registered, normals = bucket.registered.take(some), bucket.normals[some]
     _, views, channels, _, _ = registered.radiance.shape
     blank = torch.zeros_like(normals[..., 0])
@@ -465,7 +465,7 @@ def _lost(bucket: _Bucket, some: slice) -> Photometry:
 
 
 def _illuminated(bucket: _Bucket, light: Illumination) -> Bool[Tensor, "patch view height width"]:
-    """Mark observed samples that are not in cast shadows, or near their edges."""
+    """Find observed samples that are not in cast shadows, or near their edges."""
     registered, templates = bucket.registered, bucket.templates
     if light.caster is None:
         return registered.valid

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """Give ``(1, n)``, the basis in which shading is linear in the light.
+    """Return ``(1, n)``, the basis in which shading is linear in the light.
 
     >>> harmonics(torch.tensor([0.0, 0.0, -1.0]))
     tensor([ 1.,  0.,  0., -1.])

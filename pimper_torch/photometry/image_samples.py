@@ -30,27 +30,27 @@ class ImageSamples:
     def residual(
         self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
     ) -> Float[Tensor, "sample view"]:
-        """Give the residuals of a model of albedo and shading; zero where not seen."""
+        """Return the residuals of a model of albedo and shading; zero where not seen."""
         return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
 
     def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
-        """Give the scale of Cauchy's loss for each view."""
+        """Return the scale of Cauchy's loss for each view."""
         least = 1e-4 * self.level
         return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
     def weights(
         self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
     ) -> Float[Tensor, "sample view"]:
-        """Give Cauchy's weights; zero where not seen."""
+        """Return Cauchy's weights; zero where not seen."""
         return self.seen * cauchy_weights(residual, scale)
 
     def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
-        """Give the sum of Cauchy's loss."""
+        """Return the sum of Cauchy's loss."""
         relative = residual / torch.where(scale > 0, scale, 1)
         return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
 
     def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
-        """Give median radiance of each view, and of each sample relative to its views."""
+        """Return median radiance of each view, and of each sample relative to its views."""
         missing = torch.where(self.seen, self.radiance, torch.nan)
         gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
         known = self.seen & (gain > 0)
@@ -61,7 +61,7 @@ class ImageSamples:
     def albedo_under(
         self, shading: Float[Tensor, "sample view"], weight: Float[Tensor, "sample view"]
     ) -> Float[Tensor, " sample"]:
-        """Give the weighted least-squares albedo under a shading; NaN without weight."""
+        """Return the weighted least-squares albedo under a shading; NaN without weight."""
         square = (weight * shading**2).sum(dim=1)
         product = (weight * shading * self.radiance).sum(dim=1)
         return torch.where(square > 0, product / torch.where(square > 0, square, 1), torch.nan)

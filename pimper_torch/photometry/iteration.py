@@ -47,8 +47,6 @@ def iterate(
     """Iterate until every patch has stopped; those that have leave the batch.
 
     Args:
-        problem: All patches.
-        state: The initial state.
         advance: One step of the remaining patches: from problem, state and index of the step
             to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
         max_iterations: Steps at most.

@@ -39,7 +39,7 @@ class LightField(Record):
     closeness: Float[Tensor, " view"]
 
     def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
-        """Give ``E``, the direction to the point light times its irradiance."""
+        """Return ``E``, the direction to the point light times its irradiance."""
         strength = self.point_light.norm(dim=1)
         direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
         away = direction - self.closeness[:, None] * (points - self.origin)[:, None]
@@ -47,7 +47,7 @@ class LightField(Record):
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
     def lights_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
-        """Give first-order light at points whose normals face the point light; world frame."""
+        """Return first-order light at points whose normals face the point light; world frame."""
         point_light = self.point_light_at(points)
         soft = self.soft.expand(len(points), -1, -1)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
@@ -56,7 +56,7 @@ class LightField(Record):
 def faces_light(
     point_light: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
 ) -> Bool[Tensor, "patch view sample"]:
-    """Tell where the surface faces the point light; true everywhere in a view without one.
+    """Find where the surface faces the point light; true everywhere in a view without one.
 
     Elsewhere it is in attached shadow, where shading is not linear in ``(1, n)``.
     """

@@ -192,7 +192,7 @@ def _best_albedo(
     weight: Float[Tensor, "sample view"],
     scale: Float[Tensor, " view"],
 ) -> Float[Tensor, " sample"]:
-    """Give the albedo that minimizes the loss, by two steps of reweighted least squares.
+    """Return the albedo that minimizes the loss, by two steps of reweighted least squares.
 
     The model is bilinear: after a joint step of lights and albedo it is not the minimum.
     """
@@ -237,7 +237,6 @@ def _normal_equations(
     Args:
         shading: Radiance of albedo 1, which is the derivative by the albedos.
         jacobian: The derivatives by the parameters of the lights.
-        weight: Of each residual.
         damping: Fraction of the diagonal that is added to it.
     """
     _, num_views, size = jacobian.shape

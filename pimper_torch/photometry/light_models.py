@@ -25,23 +25,23 @@ class SoftLight:
         return (self.basis,)
 
     def inside_bounds(self, lights: Float[Tensor, "view 4"]) -> Bool[Tensor, "view 4"]:
-        """Mark parameters that are not at a bound."""
+        """Find parameters that are not at a bound."""
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:]) > 0], dim=1)
 
     def initialize(
         self, samples: ImageSamples
     ) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
-        """Give lights along the mean normal with the views' median brightness, and albedo."""
+        """Return lights along the mean normal with the views' median brightness, and albedo."""
         gain, albedo = samples.brightness()
         mean = self.basis.mean(dim=0)
         return gain[:, None] * mean / (mean @ mean).clamp_min(1e-12), albedo
 
     def shade(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "sample view"]:
-        """Give the radiance of albedo 1."""
+        """Return the radiance of albedo 1."""
         return self.basis @ lights.mT
 
     def jacobian(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "sample view 4"]:
-        """Give the derivatives of :meth:`shade` by the view's parameters."""
+        """Return the derivatives of :meth:`shade` by the view's parameters."""
         return self.basis[:, None].expand(-1, len(lights), -1)
 
     def clamp(self, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "view 4"]:
@@ -61,26 +61,26 @@ class PointLight:
         return self.normals, self.points
 
     def inside_bounds(self, lights: Float[Tensor, "view 5"]) -> Bool[Tensor, "view 5"]:
-        """Mark parameters that are not at a bound."""
+        """Find parameters that are not at a bound."""
         inner = (lights[:, 4:] > 0) & (lights[:, 4:] < 1 / MIN_DISTANCE)
         return torch.cat([lights[:, :1] > 0, torch.ones_like(lights[:, 1:4]) > 0, inner], dim=1)
 
     def initialize(
         self, samples: ImageSamples
     ) -> tuple[Float[Tensor, "view 5"], Float[Tensor, " sample"]]:
-        """Give lights and albedo from a search over directions; see ``point_light_search``."""
+        """Return lights and albedo from a search over directions; see ``point_light_search``."""
         lights, albedo = search_point_lights(samples, self.normals)
         near = torch.full_like(lights[:, :1], 1 / _FIRST_DISTANCE)
         return torch.cat([lights, near], dim=1), albedo
 
     def shade(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "sample view"]:
-        """Give the radiance of albedo 1."""
+        """Return the radiance of albedo 1."""
         strength, _, away, distance = self._geometry(lights)
         facing = (self.normals[:, None] * away).sum(dim=-1)
         return lights[:, 0] + strength * facing.clamp_min(0) / distance**3
 
     def jacobian(self, lights: Float[Tensor, "view 5"]) -> Float[Tensor, "sample view 5"]:
-        """Give the derivatives of :meth:`shade` by the view's parameters."""
+        """Return the derivatives of :meth:`shade` by the view's parameters."""
         strength, direction, away, distance = self._geometry(lights)
         facing = (self.normals[:, None] * away).sum(dim=-1)
         fall = distance**-3

@@ -170,13 +170,13 @@ def fit_light_field(
 
 
 def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
-    """Give the mean distance of points from the origin; 1 if all are there."""
+    """Return the mean distance of points from the origin; 1 if all are there."""
     offsets = positions[(positions != 0).any(dim=1)]
     return offsets.norm(dim=1).sum() / len(positions) if len(offsets) else positions.new_ones(())
 
 
 def _median_length(square: Float[Tensor, " view"]) -> Float[Tensor, ""]:
-    """Give the median length of the lights that are not zero, from their squares."""
+    """Return the median length of the lights that are not zero, from their squares."""
     shining = square[square > 0]
     return shining.sqrt().median() if len(shining) else square.new_ones(())
 

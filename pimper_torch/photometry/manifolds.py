@@ -33,7 +33,7 @@ class Manifold(Protocol):
         """Whether it is the whole space, so that normal equations give the minimum."""
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Give the nearest vector of the manifold."""
+        """Return the nearest vector of the manifold."""
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
         """Map the end of a small step along the tangents back to the manifold."""
@@ -46,7 +46,7 @@ class Manifold(Protocol):
         shading: Float[Tensor, "*batch rank sample"],
         slope: Float[Tensor, "*batch rank sample"],
     ) -> Float[Tensor, "*batch sample tangent tangent"]:
-        r"""Give :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
+        r"""Return :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
 
         It is the manifold's part of the second derivatives of a function with gradient ``g``.
         """
@@ -54,17 +54,17 @@ class Manifold(Protocol):
     def split(
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Give albedo and unit normal of the vectors."""
+        """Return albedo and unit normal of the vectors."""
 
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch rank"]:
-        """Give the vectors of albedo and normal."""
+        """Return the vectors of albedo and normal."""
 
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch packed sample"]:
-        """Give the quadratic penalty on the distance from known normals, packed."""
+        """Return the quadratic penalty on the distance from known normals, packed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Cone:
     def curvature(
         self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
     ) -> Float[Tensor, "*batch sample 3 3"]:
-        r"""Give the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
+        r"""Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
         albedo, normal = self.split(shading.mT)
         first, second = tangents(normal)
         along = [(slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)]
@@ -90,13 +90,13 @@ class Cone:
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch 4"]:
-        """Give the vectors of albedo and normal."""
+        """Return the vectors of albedo and normal."""
         return albedo[..., None] * harmonics(normals)
 
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 10 sample"]:
-        r"""Give the penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
+        r"""Return penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
         n = normals
         one, zero = torch.ones_like(n[..., 0, :]), torch.zeros_like(n[..., 0, :])
         x, y, z = n.unbind(dim=-2)

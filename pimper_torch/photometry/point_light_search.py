@@ -87,7 +87,7 @@ def _fit_directions(
     Float[Tensor, "view direction"],
     Float[Tensor, "view direction"],
 ]:
-    """Give ambient light, strength and sum of squared residuals for every direction."""
+    """Return ambient light, strength and sum of squared residuals for every direction."""
     J = samples.radiance
     lit = albedo[:, None] * facing
     own = (weight * albedo[:, None] ** 2).sum(dim=0)[:, None]

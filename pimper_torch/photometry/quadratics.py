@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch packed item"]:
-    """Give the upper triangle of ``v v^T`` for each column ``v``.
+    """Return the upper triangle of ``v v^T`` for each column ``v``.
 
     >>> outer(torch.tensor([[1.0], [2.0]]))[:, 0]
     tensor([1., 2., 4.])
@@ -24,7 +24,7 @@ def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch p
 
 
 def diagonal(size: int) -> list[int]:
-    """Give the indices of the diagonal in the packed form."""
+    """Return the indices of the diagonal in the packed form."""
     rows, columns = _triangle(size)
     return [slot for slot, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
 
@@ -32,7 +32,7 @@ def diagonal(size: int) -> list[int]:
 def unpacked(
     packed: Float[Tensor, "*batch packed item"], size: int
 ) -> Float[Tensor, "*batch item size size"]:
-    """Give the full matrices."""
+    """Return the full matrices."""
     rows, columns = _triangle(size)
     index = torch.zeros(size, size, dtype=torch.long, device=packed.device)
     slot = torch.arange(len(rows), device=packed.device)
@@ -59,7 +59,7 @@ def apply_packed(
 def dot(
     first: Float[Tensor, "*batch size item"], second: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch item"]:
-    """Give inner products; several times as fast as a sum over the axis."""
+    """Return inner products; several times as fast as a sum over the axis."""
     total = torch.zeros_like(second[..., 0, :])
     for a, b in zip(first.unbind(dim=-2), second.unbind(dim=-2), strict=True):
         total = torch.addcmul(total, a, b)
@@ -69,14 +69,14 @@ def dot(
 def coordinates(
     columns: Sequence[Tensor], vectors: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch smaller item"]:
-    """Give ``B^T v`` for matrices ``B`` given by their columns."""
+    """Return ``B^T v`` for matrices ``B`` given by their columns."""
     return torch.stack([dot(column, vectors) for column in columns], dim=-2)
 
 
 def combination(
     columns: Sequence[Tensor], weights: Float[Tensor, "*batch smaller item"]
 ) -> Float[Tensor, "*batch size item"]:
-    """Give ``B c`` for matrices ``B`` given by their columns."""
+    """Return ``B c`` for matrices ``B`` given by their columns."""
     total = torch.zeros_like(columns[0])
     for slot, column in enumerate(columns):
         total = total + column * weights[..., slot : slot + 1, :]
@@ -86,7 +86,7 @@ def combination(
 def congruence(
     packed: Float[Tensor, "*batch packed item"], columns: list[Float[Tensor, "*batch size item"]]
 ) -> Float[Tensor, "*batch smaller item"]:
-    """Give ``B^T A B``, packed, for matrices ``B`` given by their columns."""
+    """Return ``B^T A B``, packed, for matrices ``B`` given by their columns."""
     images = [apply_packed(packed, column) for column in columns]
     rows, others = _triangle(len(columns))
     return torch.stack(
@@ -127,7 +127,7 @@ class PackedCholesky:
                 lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
 
     def solve(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
-        """Give ``A^-1 b``, in the dtype of ``b``."""
+        """Return ``A^-1 b``, in the dtype of ``b``."""
         solution = self.whiten(rhs.unbind(dim=-2))
         for i in reversed(range(self._size)):
             value = solution[i]
@@ -137,7 +137,7 @@ class PackedCholesky:
         return torch.stack(solution, dim=-2).to(rhs.dtype)
 
     def whiten(self, rows: Sequence[Float[Tensor, "*batch item"]]) -> list[Tensor]:
-        """Give ``C^-1 b`` row by row in float64; inner products of these are ``b^T A^-1 b'``."""
+        """Return ``C^-1 b`` row by row in float64; inner products of these are ``b^T A^-1 b'``."""
         forward: list[Tensor] = []
         for i, row in enumerate(rows):
             value = row.double()

@@ -30,13 +30,13 @@ class Squares:
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Give weights for iteratively reweighted least squares: 1."""
+        """Return weights for iteratively reweighted least squares: 1."""
         return torch.ones_like(residual)
 
     def curvatures(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Give the second derivative of the loss."""
+        """Return the second derivative of the loss."""
         return torch.ones_like(residual)
 
 
@@ -56,13 +56,13 @@ class Cauchy:
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Give weights for iteratively reweighted least squares; 1 for a zero residual."""
+        """Return weights for iteratively reweighted least squares; 1 for a zero residual."""
         return cauchy_weights(residual, self.scale * deviation)
 
     def curvatures(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Give the second derivative of the loss, negative for outliers."""
+        """Return the second derivative of the loss, negative for outliers."""
         weight = self.weights(residual, deviation)
         return weight * (2 * weight - 1)
 
@@ -161,7 +161,7 @@ def _fractions(
 def cauchy_weights(
     residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Give the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
+    """Return the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
 
     Iteratively reweighted least squares with them minimizes the sum of
     ``scale^2 / 2 * log(1 + (r / scale)^2)``.

@@ -67,7 +67,7 @@ def fit_albedo(
     lights: Float[Tensor, "patch view rank"],
     basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch channel sample"]:
-    """Give every channel's least-squares albedo, lights and normals given.
+    """Return every channel's least-squares albedo, lights and normals given.
 
     Args:
         radiance: Linear.
@@ -91,7 +91,7 @@ def initial_shading(
     lights: Float[Tensor, "patch view rank"],
     basis: Float[Tensor, "patch rank sample"],
 ) -> Float[Tensor, "patch rank sample"]:
-    """Give shading vectors in the directions of ``basis``, with the least-squares albedo."""
+    """Return shading vectors in the directions of ``basis``, with the least-squares albedo."""
     weight = seen.to(radiance.dtype)
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
 
@@ -99,7 +99,7 @@ def initial_shading(
 def _information(
     problem: Bilinear, factors: Factors, curvature: Float[Tensor, "patch 6 sample"]
 ) -> Float[Tensor, "patch sample"]:
-    """Give the inverse variance of the normals; 0 where they are not determined."""
+    """Return the inverse variance of the normals; 0 where they are not determined."""
     residual = problem.radiance - factors.lights @ factors.shading
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)

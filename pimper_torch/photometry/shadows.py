@@ -148,12 +148,12 @@ def cast_shadows_on_rasters(
 def _any_in_blocks(
     valid: Bool[Tensor, "patch view height width"], stride: int
 ) -> Bool[Tensor, "patch view rows columns"]:
-    """Tell which blocks of ``stride`` by ``stride`` samples have any true sample."""
+    """Find which blocks of ``stride`` by ``stride`` samples have any true sample."""
     return max_pool2d(valid.float(), stride, ceil_mode=True) > 0
 
 
 def _ray_indices(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tensor, " ray"]:
-    """Give the index, in each block of ``stride`` samples, that a ray is cast from."""
+    """Return the index, in each block of ``stride`` samples, that a ray is cast from."""
     first = torch.arange(0, size, stride, device=like.device)
     return (first + stride // 2).clamp_max(size - 1)
 
@@ -161,7 +161,7 @@ def _ray_indices(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tens
 def _direction_to_light(
     field: LightField, view: Int[Tensor, "*#batch"], points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-    """Give the unit direction to the point light, and its distance, infinite if distant."""
+    """Return the unit direction to the point light, and its distance, infinite if distant."""
     direction = normalize(field.point_light, dim=1).to(points)[view]
     closeness = field.closeness.to(points)[view]
     away = direction - closeness[..., None] * (points - field.origin.to(points))
@@ -186,7 +186,7 @@ def _unblocked(
 def _hexagon(
     normals: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"]
 ) -> Float[Tensor, "sample ring 3"]:
-    """Give offsets in the tangent plane: the corners of a hexagon around a circle."""
+    """Return offsets in the tangent plane: the corners of a hexagon around a circle."""
     # The axis least aligned with the normal: their cross product does not vanish.
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first_axis = normalize(torch.linalg.cross(axis, normals), dim=1)

@@ -24,7 +24,7 @@ def patch_status(
     min_views: int,
     min_light_variation: float,
 ) -> Int[Tensor, " patch"]:
-    """Give each patch's :class:`~pimper_torch.records.PatchStatus` before it is factorized.
+    """Return each patch's :class:`~pimper_torch.records.PatchStatus` before it is factorized.
 
     Args:
         observed: Whether any view has a valid sample.
@@ -49,7 +49,7 @@ def light_varies(
     weight: Float[Tensor, "patch view"] | Int[Tensor, "patch view"],
     min_ratio: float,
 ) -> Bool[Tensor, " patch"]:
-    r"""Tell in which patches the light changes enough between the views.
+    r"""Report in which patches the light changes enough between the views.
 
     A shading vector has three degrees of freedom: the third singular value of the matrix of
     lights, over the first, must reach ``min_ratio``. Lights are normalized, so that exposure does

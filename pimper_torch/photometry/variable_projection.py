@@ -112,13 +112,12 @@ def curvature_of_lights(
     weight: Float[Tensor, "patch view sample"],
     samples: int | None = None,
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Give the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
+    """Return the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
 
     Args:
         problem: Gives manifold, regularization and prior.
         lights: Where to linearize.
         shading: The minimum for the lights.
-        weight: Of each entry.
         samples: Sum over about so many, evenly spaced, in place of all.
     """
     rank = lights.shape[2]
@@ -217,7 +216,7 @@ def _whitened(
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> list[Float[Tensor, "patch view sample"]]:
-    """Give ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
+    """Return ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
     packed, _ = equations_of_samples(problem, lights, weight)
     if problem.manifold.flat:
         slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
@@ -258,7 +257,7 @@ def _eliminated(
 
 
 def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
-    """Give the damped Gauss-Newton step."""
+    """Return the damped Gauss-Newton step."""
     normal = state.curvature.double()
     diagonals = normal.diagonal(dim1=1, dim2=2)
     ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)
@@ -268,12 +267,12 @@ def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
 
 
 def _is_free(problem: Bilinear) -> bool:
-    """Tell whether the ambiguity is any invertible matrix."""
+    """Return whether the ambiguity is any invertible matrix."""
     return problem.manifold.flat and not bool((problem.regularization > 0).any())
 
 
 def _has_kernel(problem: Bilinear) -> bool:
-    """Tell whether the compiled kernel applies: first-order light in float32."""
+    """Return whether the compiled kernel applies: first-order light in float32."""
     return (
         compiled_for(problem.radiance)
         and problem.radiance.dtype == torch.float32

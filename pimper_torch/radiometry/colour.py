@@ -37,7 +37,7 @@ SILENT = Colour()
 
 
 def plain(response: Response) -> Response:
-    """Give the standard response that a file's own cannot be told from, or the file's own."""
+    """Return the standard response that a file's own cannot be told from, or the file's own."""
     levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
     known: tuple[Response, ...] = (Linear(), Srgb())
     for standard in known:
@@ -48,7 +48,7 @@ def plain(response: Response) -> Response:
 
 
 def disagree(one: Response, other: Response) -> bool:
-    """Tell whether two responses give radiance that differs by more than 0.02 of full scale."""
+    """Return whether two responses give radiance that differs by more than 0.02 of full scale."""
     levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
     return float((_through(one, levels) - _through(other, levels)).abs().max()) > _DISAGREE
 

@@ -40,7 +40,7 @@ DISPLAY_P3: Chromaticities = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), _D
 def srgb_from_primaries(
     primaries_xyz: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "3 3"] | None:
-    """Give the matrix from linear values of some primaries to linear sRGB; white stays white.
+    """Return the matrix from linear values of some primaries to linear sRGB; white stays white.
 
     Args:
         primaries_xyz: Columns are red, green and blue in XYZ adapted to D50, as an ICC profile
@@ -60,7 +60,7 @@ def srgb_from_primaries(
 
 
 def primaries_of(chromaticities: Chromaticities) -> Float[Tensor, "3 3"] | None:
-    """Give primaries in XYZ adapted to D50 from x and y of red, green, blue and white.
+    """Return primaries in XYZ adapted to D50 from x and y of red, green, blue and white.
 
     Adapted by Bradford's cone responses. ``None`` where they span no colours.
     """

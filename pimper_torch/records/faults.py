@@ -19,7 +19,7 @@ _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
 
 def once(tensor: Tensor, test: Callable[[], str], context: object = None) -> str:
-    """Give what ``test`` finds wrong with a tensor, or nothing where it found nothing before.
+    """Return what ``test`` finds wrong with a tensor, or nothing where it found nothing before.
 
     Args:
         tensor: Looked through again only if it is another one, not if it was written into.
@@ -38,7 +38,7 @@ def once(tensor: Tensor, test: Callable[[], str], context: object = None) -> str
 
 
 def beyond(index: Int[Tensor, "..."], count: int) -> str:
-    """Say which indices name nothing among so many."""
+    """State which indices name nothing among so many."""
     if index.numel() == 0:
         return ""
     low, high = (int(value) for value in index.aminmax())
@@ -46,7 +46,7 @@ def beyond(index: Int[Tensor, "..."], count: int) -> str:
 
 
 def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None = None) -> str:
-    """Say how many values are NaN or infinite."""
+    """State how many values are NaN or infinite."""
     if values.numel() == 0 or bool(torch.stack(values.aminmax()).isfinite().all()):
         return ""
     bad = ~values.isfinite()
@@ -57,7 +57,7 @@ def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None =
 
 
 def outside(values: Float[Tensor, "..."], high: float) -> str:
-    """Say how many values are not finite, below 0 or above ``high``."""
+    """State how many values are not finite, below 0 or above ``high``."""
     bad = ~((values >= -_ROUNDING) & (values <= high + _ROUNDING) & values.isfinite())
     count = int(bad.sum())
     if count == 0:
@@ -67,7 +67,7 @@ def outside(values: Float[Tensor, "..."], high: float) -> str:
 
 
 def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] | None) -> str:
-    """Say how many normals are not of unit length, and what they look like."""
+    """State how many normals are not of unit length, and what they look like."""
     length = normals.norm(dim=-1)
     bad = ~((length - 1).abs() <= _UNIT)  # NaN is bad
     if where is not None:
@@ -87,7 +87,7 @@ def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] |
 
 
 def turned_away(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"]) -> str:
-    """Say how many normals of patches face away from the viewer."""
+    """State how many normals of patches face away from the viewer."""
     away = where & (normals[..., 2] >= 0)
     count, among = int(away.sum()), int(where.sum())
     if count == 0:
@@ -101,7 +101,7 @@ def turned_away(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"
 
 
 def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
-    """Say which matrices are no rotation and shift."""
+    """State which matrices are no rotation and shift."""
     rotation = cam_from_world[:, :3, :3].double()
     eye = torch.eye(3, dtype=torch.float64, device=rotation.device)
     off = (rotation @ rotation.mT - eye).abs().amax(dim=(1, 2))
@@ -120,7 +120,7 @@ def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
 
 
 def no_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
-    """Say which matrices are no ``K``."""
+    """State which matrices are no ``K``."""
     last = intrinsics.new_tensor([0.0, 0.0, 1.0])
     focal = intrinsics.diagonal(dim1=1, dim2=2)[:, :2]
     bad = ~(focal > 0).all(dim=1) | (intrinsics[:, 2] != last).any(dim=1)

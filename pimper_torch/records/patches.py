@@ -242,7 +242,7 @@ _HALF_CONFIDENCE_DEG = 8.0
 
 
 def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    r"""Give a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
+    r"""Return a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
 
     >>> confidence_of(1 / torch.tensor([8.0, 24.0]).deg2rad().square())
     tensor([0.5000, 0.1000])

@@ -96,7 +96,7 @@ class Record:
         return pytree.tree_map_only(Tensor, moved, self)
 
     def detach(self: AnyRecord) -> AnyRecord:
-        """Give the same values, cut off from what they were computed from."""
+        """Return the same values, cut off from what they were computed from."""
         return pytree.tree_map_only(Tensor, Tensor.detach, self)
 
     def replace(self: AnyRecord, **changes: object) -> AnyRecord:
@@ -173,7 +173,7 @@ def _hints(cls: type[Record]) -> dict[str, Any]:
 
 
 def _arrays(cls: type[Record]) -> dict[str, Any]:
-    """Give the fields that are tensors of a stated shape, or may be."""
+    """Return the fields that are tensors of a stated shape, or may be."""
     if cls not in _ARRAYS:
         hints = _hints(cls)
         fields = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
@@ -186,7 +186,7 @@ def _arrays(cls: type[Record]) -> dict[str, Any]:
 
 
 def _choices(hint: object) -> tuple[object, ...]:
-    """Give the types of a union."""
+    """Return the types of a union."""
     blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
     return typing.get_args(hint) if blend else ()
 
@@ -279,7 +279,7 @@ def _wanted(hint: Any) -> str:  # noqa: ANN401
 
 
 def _others(record: Record, name: str) -> str:
-    """Tell the fields before, whose shapes bind the same names."""
+    """Report the fields before, whose shapes bind the same names."""
     before = []
     for other in _arrays(type(record)):
         if other == name:

@@ -125,7 +125,7 @@ class SparseScene(Record):
 def pairs_table(
     point: Int[Tensor, " observation"], view: Int[Tensor, " observation"], shape: tuple[int, int]
 ) -> Bool[Tensor, "point view"]:
-    """Mark the pairs of point and view that are observations."""
+    """Find the pairs of point and view that are observations."""
     table = torch.zeros(shape, dtype=torch.bool, device=point.device)
     table[point, view] = True
     return table

@@ -39,10 +39,9 @@ class Silhouettes(Record):
     def everything(
         cls, views: Views, planes_world: Float[Tensor, "plane 4"] | None = None
     ) -> "Silhouettes":
-        """Give silhouettes that leave nothing out.
+        """Return silhouettes that leave nothing out.
 
         Args:
-            views: The photographs.
             planes_world: What lies below one of them is not the object.
         """
         reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)

@@ -51,7 +51,6 @@ def save_record(record: Record, path: str | Path) -> None:
     computed from is not kept.
 
     Args:
-        record: Of any class.
         path: A former file is replaced when the new one is complete. Folders are made.
 
     Raises:
@@ -90,10 +89,6 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
     does not change the file. Fields that shared a tensor share one again. All structure, names and
     shapes are checked before a tensor's memory is touched; values are checked by the stages that
     take the record (:meth:`Record.check`). Paths in a record are returned, never opened.
-
-    Args:
-        cls: The record's class.
-        path: The file.
 
     Returns:
         The record, on the CPU.
@@ -214,7 +209,7 @@ class _Reader:
         raise self._refused(where, f"is {_shortly(found)}", " or ".join(map(_named, choices)))
 
     def _made(self, found: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
-        """Give a value whose kind is right; what is inside it may not be."""
+        """Return a value whose kind is right; what is inside it may not be."""
         if _is_a(hint, Record):
             return self._record(found["fields"], hint, where)
         if _is_a(hint, AbstractArray) or _is_a(hint, Tensor):
@@ -309,7 +304,7 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _may_be(found: Any, hint: Any) -> bool:  # noqa: ANN401 - JSON
-    """Tell whether a value of JSON is of the annotated kind, not whether its contents are."""
+    """Return whether a value of JSON is of the annotated kind, not whether its contents are."""
     origin = typing.get_origin(hint) or hint
     if origin is typing.Literal:
         return any(type(found) is type(one) and found == one for one in typing.get_args(hint))

@@ -50,7 +50,6 @@ def judged(
 
     Args:
         model: Its names are among ``files``.
-        files: Of all photographs.
         pairs: With numbers of photographs.
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
     """
@@ -79,7 +78,7 @@ def _agreeing_fraction(pairs: Collection[tuple[int, float]]) -> float:
 
 
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:
-    """Give the fraction of a pair's matches that the model's epipolar geometry explains."""
+    """Return the fraction of a pair's matches that the model's epipolar geometry explains."""
     ends = [
         undistorted_pixels(model, view, pixels)
         for view, pixels in zip(pair.views, (pair.first, pair.second), strict=True)
@@ -89,7 +88,7 @@ def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> fl
 
 
 def epipolar_geometry(model: SparseModel, views: PhotographPair) -> Float[Tensor, "3 3"]:
-    """Give ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
+    """Return ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
     poses = (model.cam_from_world[view] for view in views)
     motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))
     intrinsics = (pinhole_of(model.lenses[view]) for view in views)
@@ -100,7 +99,7 @@ def epipolar_geometry(model: SparseModel, views: PhotographPair) -> Float[Tensor
 def undistorted_pixels(
     model: SparseModel, view: int, pixels: Float[Tensor, "match 2"]
 ) -> Float[Tensor, "match 2"]:
-    """Give where a pinhole of the lens's own focal length has pixels of a photograph."""
+    """Return where a pinhole of the lens's own focal length has pixels of a photograph."""
     K = pinhole_of(model.lenses[view])
     plane = undistort_pixels(model.lenses[view], pixels)
     return plane * K.diagonal()[:2] + K[:2, 2]

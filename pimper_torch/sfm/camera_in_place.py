@@ -98,7 +98,7 @@ def reference_from_photographs(
 
 
 def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float) -> float:
-    """Give the length up to which a match is still, between photographs mapped to one of them.
+    """Return the length up to which a match is still, between photographs mapped to one of them.
 
     A tripod that was touched has moved by a little, too, and things at other depths than most of
     the room are then brought back less exactly. Three times the median length of the matches
@@ -142,7 +142,6 @@ def tied_to(
 
     Args:
         matched: Pixels in the reference and in each other photograph.
-        centre: Of the pictures.
         max_error_px: Distance up to which a match follows a map.
         fewest: Matches that tie a photograph.
         generator: Of random numbers.
@@ -160,13 +159,13 @@ def tied_to(
 
 
 def shift_px(maps: Sequence[Float[Tensor, "3 3"]], keypoints: Keypoints) -> float:
-    """Give the largest shift of the pictures' middle among maps to a reference."""
+    """Return the largest shift of the pictures' middle among maps to a reference."""
     middle = picture_centre(keypoints)[None]
     return max(float((mapped(one, middle) - middle).norm()) for one in maps)
 
 
 def picture_centre(keypoints: Keypoints) -> Float[Tensor, " 2"]:
-    """Give the middle of what features cover in all photographs; float64."""
+    """Return the middle of what features cover in all photographs; float64."""
     everywhere = torch.cat(list(keypoints)).double()
     return (everywhere.amin(dim=0) + everywhere.amax(dim=0)) / 2
 
@@ -190,7 +189,6 @@ def fit_map(
         second: Of the same points.
         centre: Of the picture, where the camera's axis meets it.
         max_error_px: Distance up to which a match follows.
-        generator: Of the hypotheses.
         any_homography: Whether the last fits are of all homographies, which large turns need: a
             plane seen from round it follows them, too, and no similarity with a perspective row.
 

@@ -51,7 +51,6 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
     """Write a model as COLMAP's binary files.
 
     Args:
-        model: Any.
         colors: 8-bit RGB, one a point.
         folder: Made if it does not exist; files of those names in it are replaced.
 
@@ -72,12 +71,12 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
 
 
 def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
-    """Give ``K`` with the lens's focal length and principal point, in float64."""
+    """Return ``K`` with the lens's focal length and principal point, in float64."""
     return torch.from_numpy(np.array(_camera_of(lens).calibration_matrix(), dtype=np.float64))
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Tell whether the lens images straight lines as straight lines.
+    """Return whether the lens images straight lines as straight lines.
 
     COLMAP calls a lens undistorted whose coefficients are all zero. Of a fisheye that is the
     equidistant one, ``r = f theta``: an oblique ray tells it from a pinhole.
@@ -207,7 +206,7 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> A
 
 
 def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
-    """Give every view its pinhole; views with equal ones share a camera."""
+    """Assign every view its pinhole; views with equal ones share a camera."""
     numbers: dict[tuple[float, ...], int] = {}
     lenses = []
     for K, (width, height) in zip(

@@ -36,7 +36,6 @@ def count_spread_views(model: SparseModel, fewest: int) -> int:
     """Count the views that see enough points under a triangulation angle that tells depth.
 
     Args:
-        model: Any.
         fewest: Points that a view must see whose widest angle between rays is 4 degrees or more.
     """
     seen = model.observed[wide_points(model)].sum(dim=0)
@@ -44,7 +43,7 @@ def count_spread_views(model: SparseModel, fewest: int) -> int:
 
 
 def wide_points(model: SparseModel) -> Bool[Tensor, " point"]:
-    """Mark points whose widest angle between rays is 4 degrees or more."""
+    """Find points whose widest angle between rays is 4 degrees or more."""
     centers = invert_rigid(model.cam_from_world)[:, :3, 3]
     angles = triangulation_angles(model.points_world, model.observed, centers)
     return torch.rad2deg(angles) >= MIN_ANGLE_DEG
@@ -76,7 +75,6 @@ def choose_component(
         components: Names of the views in each component; they may overlap.
         spread: How many views of each see enough points under real triangulation angles, see
             :func:`count_spread_views`.
-        names: Of all photographs.
         min_fraction: Of the photographs that the chosen component must have when another one
             holds at least 3 views that it lacks.
 

@@ -159,7 +159,6 @@ def follow_crops(
 
     Args:
         model: Its views are the photographs, in their order.
-        views: The photographs.
         sizes_px: Their sizes before they were shrunk on reading.
         where: The model is, for messages, as a sentence starts.
 
@@ -227,7 +226,6 @@ def cut(
     """Cut the pictures of some views: their lenses and observations follow, as another camera's.
 
     Args:
-        model: Any.
         views: Their numbers.
         size: Width and height of what is cut out.
         shift: Its corner, pixels of the pictures.

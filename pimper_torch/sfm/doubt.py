@@ -40,10 +40,9 @@ _MOST = 0.5
 
 
 def doubt(model: SparseModel, num_photographs: int) -> str:
-    """Say why the cameras may be wrong, and what to do; empty where nothing speaks against them.
+    """State why the cameras may be wrong, and what to do; empty where nothing speaks against them.
 
     Args:
-        model: As registered.
         num_photographs: Registered or not.
     """
     following = following_fraction(model)
@@ -88,7 +87,7 @@ def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[i
 
 
 def following_fraction(model: SparseModel) -> float:
-    """Give the fraction of points that move as before a camera in one place; median over views.
+    """Return the fraction of points that move as before a camera in one place; median over views.
 
     Of those that a view shares with a reference, for the reference of which it is the largest.
     """
@@ -113,7 +112,7 @@ def following_fraction(model: SparseModel) -> float:
 
 
 def _by_view(model: SparseModel) -> tuple[list[Tensor], list[Float[Tensor, "_ 2"]]]:
-    """Give the points that each view observes, and where."""
+    """Return the points that each view observes, and where."""
     own = [model.observation_view == view for view in range(model.num_views)]
     return (
         [model.observation_point[one] for one in own],

@@ -102,7 +102,7 @@ def _largest(views: Views, folder: Path) -> Path:
 
 
 def place(path: Path) -> str:
-    """Say what cameras come from, at the start of a sentence."""
+    """State what cameras come from, at the start of a sentence."""
     return f"The file of cameras {path}" if path.is_file() else f"The COLMAP model in {path}"
 
 
@@ -145,7 +145,7 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
 
 
 def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
-    """Give the sizes of photographs in their files, which others' programs count pixels of.
+    """Return the sizes of photographs in their files, which others' programs count pixels of.
 
     Where there is no such file, those that they were read at.
     """

@@ -106,8 +106,6 @@ def guided_matches(
     """Match features among those that can show the same point.
 
     Args:
-        first: Of one photograph.
-        second: Of another.
         near: Which can.
         max_ratio: Of the angles between a descriptor and the two most like it.
 
@@ -159,7 +157,7 @@ def likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alik
 
 
 def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:
-    """Tell whose smallest angle is small, and the second smallest enough larger."""
+    """Find whose smallest angle is small, and the second smallest enough larger."""
     best, rival = alike.products.clamp(0, 1).acos().unbind(dim=1)  # without one, a right angle
     return (best < max_ratio * rival) & (
         best <= loaded().FeatureMatchingOptions().sift.max_distance

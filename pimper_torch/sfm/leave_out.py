@@ -79,7 +79,7 @@ def enter_room(rest: StaticBackground) -> tuple[int, int]:
 
 
 def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:
-    """Give the maps of photographs that show enough features of the room."""
+    """Return the maps of photographs that show enough features of the room."""
     pairs = zip(found.maps, found.rest.features, strict=True)
     return tuple(
         one if int(resting.sum()) >= fewest else torch.full_like(one, torch.nan)
@@ -283,7 +283,7 @@ def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_mat
 
 
 def among(matches: Int[Tensor, "match 2"], some: Int[Tensor, "some 2"]) -> Bool[Tensor, " match"]:
-    """Mark the matches that are among some of them."""
+    """Find the matches that are among some of them."""
     width = 1 + int(matches.max()) if len(matches) else 1
     keys, chosen = (rows[:, 0] * width + rows[:, 1] for rows in (matches, some))
     return torch.isin(keys, chosen)

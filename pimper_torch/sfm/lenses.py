@@ -79,7 +79,7 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
 
 
 def sensor_turns(views: Views) -> tuple[int, ...]:
-    """Tell by how many clockwise quarters each photograph is turned from how its sensor lies.
+    """Find by how many clockwise quarters each photograph is turned from how its sensor lies.
 
     Sensors lie broadside; a photograph that stands upright beside others that lie is turned, by
     EXIF's orientation if it says so. Where all stand or all lie, none counts as turned.

@@ -69,7 +69,6 @@ def match_pairs(space: Workspace, pairs: Sequence[PhotographPair], settings: Mat
     """Match pairs of photographs and verify the matches.
 
     Args:
-        space: With features.
         pairs: Not matched before.
         settings: What counts as a match.
     """
@@ -156,6 +155,6 @@ def photograph_numbers(
     stored: Any,  # noqa: ANN401 - pycolmap is untyped
     space: Workspace,
 ) -> dict[int, int]:
-    """Give the number of the photograph behind each image of the database."""
+    """Return the number of the photograph behind each image of the database."""
     number = {file: index for index, file in enumerate(space.files)}
     return {image.image_id: number[image.name] for image in stored.read_all_images()}

@@ -68,7 +68,6 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     """Keep some views of a model, in the order given, and the points that two of them see.
 
     Args:
-        model: Any.
         chosen: Indices into the model's views, without repetition.
 
     Returns:
@@ -103,7 +102,6 @@ def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
     """Drop views that see too few points for their pose to be trusted, until none is left.
 
     Args:
-        model: Any.
         fewest: Points that a view must see.
     """
     while model.num_views:
@@ -120,7 +118,6 @@ def longest_tracks(model: SparseModel, most: int) -> SparseModel:
     """Keep of every view the points that most views see, and with them all who sees them.
 
     Args:
-        model: Any.
         most: Points a view; more where they are among another view's.
     """
     length = torch.bincount(model.observation_point)[model.observation_point]
@@ -142,8 +139,6 @@ def match_names(
     see :func:`~pimper_torch.file_names.match_files`.
 
     Args:
-        model: Any.
-        names: Of the photographs.
         where: The model came from, for the message.
         photographs: Path of the folder that they lie in.
 

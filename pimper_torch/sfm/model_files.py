@@ -275,7 +275,7 @@ def _binary_points(data: bytes) -> FilePoints:
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, str]]:
-    """Give the lines that are no comments, and their numbers; empty ones too."""
+    """Return the lines that are no comments, and their numbers; empty ones too."""
     text = data.decode("utf-8-sig", "surrogateescape")
     lines = text.removesuffix("\n").split("\n")  # a name may hold what else Unicode ends lines by
     for number, line in enumerate(lines, start=1):

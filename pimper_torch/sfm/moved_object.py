@@ -72,7 +72,7 @@ def find_moved_object(
     max_error_px: float,
     fewest: int,
 ) -> MovedObject:
-    """Tell photographs of two or more series apart, and what ties them together.
+    """Report photographs of two or more series apart, and what ties them together.
 
     Of the two bodies the object is the one nearer to the middle of the photographs.
 
@@ -124,7 +124,7 @@ def object_votes(
     verified: Mapping[PhotographPair, Rows],
     seconds: Mapping[PhotographPair, Rows],
 ) -> list[Float[Tensor, " _"]]:
-    """Say how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
+    """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
     Features that match are of one body, and so are those of one geometry in a pair that has two.
 
@@ -169,7 +169,6 @@ def series_of(
     tells.
 
     Args:
-        num_views: Photographs.
         verified: Matches of each pair that its geometry explains.
         seconds: Matches of a second body, where there is one.
         votes: As of :func:`object_votes`.
@@ -213,7 +212,7 @@ def _perhaps_own(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> R
 def _contradict(
     keypoints: Keypoints, pair: PhotographPair, first: Rows, second: Rows, max_error_px: float
 ) -> bool:
-    """Tell whether no geometry explains both sets of matches."""
+    """Return whether no geometry explains both sets of matches."""
 
     def ends(rows: Rows) -> Ends:
         return keypoints[pair[0]][rows[:, 0]], keypoints[pair[1]][rows[:, 1]]

@@ -18,7 +18,7 @@ _SCALE_PX, _TOLERANCE = 1.0, 1e-5
 
 
 def doubt_one_lens(model: SparseModel) -> str:
-    """Say why photographs were taken with several lenses, if a lens each fits much better.
+    """State why photographs were taken with several lenses, if a lens each fits much better.
 
     Args:
         model: Adjusted.

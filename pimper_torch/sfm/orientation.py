@@ -36,14 +36,13 @@ _SWEEPS = 5
 
 
 def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
-    """Tell by how many clockwise quarters each of a model's pictures is turned in the photographs.
+    """Find by how many clockwise quarters each of a model's pictures is turned in the photographs.
 
     Tried are the pixels as they are and as their file has them; then each view by itself, where
     its neighbourhoods agree much better another way round.
 
     Args:
         model: Its views are the photographs, in their order.
-        views: The photographs.
         where: The model is, for messages, as a sentence starts.
 
     Raises:
@@ -97,7 +96,7 @@ def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
 
 
 def _exif_turns(views: Views) -> Int[Tensor, " view"]:
-    """Give the clockwise quarters that EXIF turned each photograph by; -1 where it mirrored it."""
+    """Return clockwise quarters that EXIF turned each photograph by; -1 where it mirrored it."""
     tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
     return torch.tensor([QUARTERS.get(tag, -1) for tag in tags])
 
@@ -105,7 +104,7 @@ def _exif_turns(views: Views) -> Int[Tensor, " view"]:
 def _hypotheses(
     exif: Int[Tensor, " view"], allowed: Bool[Tensor, "view 4"]
 ) -> tuple[Int[Tensor, " view"], Int[Tensor, " view"]]:
-    """Give the turns of a model of the photographs as they are, and as their files store them."""
+    """Return the turns of a model of the photographs as they are, and as their files store them."""
     first = allowed.long().argmax(dim=1)
     as_stored = (exif >= 0) & allowed[torch.arange(len(exif)), exif]
     stored = torch.where(as_stored, exif, first)
@@ -187,7 +186,7 @@ def _other_shape(name: str, lens: Lens, size: tuple[int, int], why: str) -> Inpu
 def _tell(
     model: SparseModel, views: Views, turns: Int[Tensor, " view"], where: str, *, sure: bool
 ) -> None:
-    """Say which way round was taken for how many photographs."""
+    """State which way round was taken for how many photographs."""
     turned = {
         90 * quarters: [model.names[view] for view in (turns == quarters).nonzero()[:, 0].tolist()]
         for quarters in (1, 2, 3)

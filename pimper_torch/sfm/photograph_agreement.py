@@ -50,7 +50,7 @@ def _agreement(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: fl
 
 
 def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
-    """Mark the matches on each other's epipolar lines whose point is before both cameras.
+    """Find the matches on each other's epipolar lines whose point is before both cameras.
 
     Args:
         cameras: Pinholes; axes may be mirrored.
@@ -84,7 +84,7 @@ def _errors(cameras: Cameras, pair: VerifiedPair) -> Float[Tensor, " match"]:
 
 
 def pinholes_of(model: SparseModel) -> Cameras:
-    """Give the pinholes behind a model's lenses."""
+    """Return the pinholes behind a model's lenses."""
     return Cameras(
         intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
         cam_from_world=model.cam_from_world,

@@ -35,7 +35,7 @@ def turned_size(width: int, height: int, quarters: int) -> tuple[int, int]:
 def turned_pixels(
     pixels: Float[Tensor, "*batch 2"], width: int, height: int, quarters: int
 ) -> Float[Tensor, "*batch 2"]:
-    """Give where pixels are after clockwise quarter turns of their picture.
+    """Return where pixels are after clockwise quarter turns of their picture.
 
     Args:
         pixels: In the picture before.
@@ -53,7 +53,7 @@ def turned_pixels(
 
 
 def turned_vectors(vectors: Float[Tensor, "*batch 2"], quarters: int) -> Float[Tensor, "*batch 2"]:
-    """Give what differences of pixels are after clockwise quarter turns."""
+    """Return what differences of pixels are after clockwise quarter turns."""
     return turned_pixels(vectors, 0, 0, quarters)
 
 
@@ -107,7 +107,7 @@ def _focals(lens: Lens) -> int:
 
 
 def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:
-    """Give :func:`turned_pixels` as a matrix on homogeneous pixels; float64."""
+    """Return :func:`turned_pixels` as a matrix on homogeneous pixels; float64."""
     corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
     origin, right, down = turned_pixels(corners, width, height, quarters)
     matrix = torch.eye(3, dtype=torch.float64)

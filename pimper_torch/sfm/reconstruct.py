@@ -197,7 +197,6 @@ class Reconstruct(Stage):
     A constant to autograd.
 
     Args:
-        config: How.
         cache: Folder where models are kept and looked for, see
             :class:`~pimper_torch.store.Store`; without, every call finds its own.
     """
@@ -312,7 +311,6 @@ def kept_model(
 
     Args:
         store: Where; without it, or a key, nothing is kept.
-        key: Of the model.
         find: Finds it.
 
     Returns:
@@ -342,7 +340,6 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
 
     Args:
         views: At least 3.
-        config: How.
 
     Returns:
         The model of the registered views, in the photographs' order and under their names.

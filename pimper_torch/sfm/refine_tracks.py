@@ -74,7 +74,6 @@ def refine_tracks(
     Args:
         views: The photographs, in the model's order.
         model: As structure from motion found it.
-        settings: How.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:
@@ -198,7 +197,7 @@ def _with_others(
 def _leading(
     model: SparseModel, aligned: Bool[Tensor, " observation"], fewest_points: int
 ) -> Bool[Tensor, " point"]:
-    """Mark the points that tell cameras: those aligned, and all in views that show few of them."""
+    """Find the points that tell cameras: those aligned, and all in views that show few of them."""
     counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
     leading = aligned | (counts < fewest_points)[model.observation_view]
     wanted = torch.zeros(len(model.points_world), dtype=torch.bool)

@@ -10,7 +10,7 @@ from pimper_torch.sfm.model import SparseModel
 
 
 def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
-    """Give the distance between where a point is seen and where it should be, in pixels.
+    """Return the distance between where a point is seen and where it should be, in pixels.
 
     Infinite for a point that a camera sees from behind.
     """

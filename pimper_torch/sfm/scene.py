@@ -66,7 +66,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
 def _undistorted_maps(
     model: SparseModel, intrinsics: Float[Tensor, "view 3 3"]
 ) -> Float[Tensor, "mapped 3 3"]:
-    """Give the maps to a static background between undistorted pictures, as one lens has them.
+    """Return the maps to a static background between undistorted pictures, as one lens has them.
 
     A homography between distorted pictures is none between undistorted ones: fitted to a raster.
     """
@@ -96,7 +96,7 @@ def _undistorted_map(
 
 
 def model_of_scene(scene: SparseScene) -> SparseModel:
-    """Give the cameras of a scene, as pinholes of its undistorted photographs, and its tracks.
+    """Return the cameras of a scene, as pinholes of its undistorted photographs, and its tracks.
 
     They are in the frame of the model that the scene came from.
     """
@@ -129,7 +129,7 @@ def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
 def photographed(
     scene: SparseScene, pixels: Float[Tensor, "pixel 2"], view: Int[Tensor, " pixel"]
 ) -> Float[Tensor, "pixel 2"]:
-    """Give where the photographs, before undistortion, have pixels of the undistorted ones."""
+    """Return where the photographs, before undistortion, have pixels of the undistorted ones."""
     found = pixels.clone()
     pinholes = colmap.pinhole_lenses(scene.cameras)
     for index, (own, pinhole) in enumerate(zip(scene.lenses, pinholes, strict=True)):
@@ -148,7 +148,6 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     reading it back with them gives the same scene.
 
     Args:
-        scene: Any.
         folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
             installed COLMAP writes; made if it does not exist.
 

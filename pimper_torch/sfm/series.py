@@ -31,7 +31,6 @@ def series_in(
 
     Args:
         model: In the object's frame; of all photographs or some.
-        names: Of all photographs.
         around: Matches of the surroundings, with numbers of photographs.
     """
     view_of = {names.index(name): view for view, name in enumerate(model.names)}
@@ -61,7 +60,6 @@ def with_series(
     Args:
         model: In the object's frame; of all photographs or some.
         numbers: Of its views' series.
-        names: Of all photographs.
     """
     kept = torch.nonzero(torch.bincount(numbers)[numbers] >= FEWEST_VIEWS)[:, 0]
     small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS
@@ -84,7 +82,7 @@ def with_series(
 
 
 def _apart_message(num_views: int, apart: Sequence[str]) -> str:
-    """Say which photographs stand apart, and what would join them."""
+    """State which photographs stand apart, and what would join them."""
     return (
         f"The object was moved on what it stands on, and too little of it ties {len(apart)} of "
         f"{num_views} photographs to the others, which are reconstructed alone; apart stand "

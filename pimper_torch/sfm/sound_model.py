@@ -30,7 +30,6 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     there, or not each other.
 
     Args:
-        files: As they stand.
         folder: Of the model, for messages.
 
     Raises:
@@ -144,7 +143,7 @@ def _pose(image: FileImage) -> Float[Tensor, "4 4"]:
 def _observations(
     files: FileModel, kept: list[FileImage], new_point: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
-    """Give point, view and pixel of each sound observation by rising point; count the others.
+    """Return point, view and pixel of each sound observation by rising point; count the others.
 
     Observations of what was dropped are not counted.
     """

@@ -110,7 +110,7 @@ def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
 
 
 def _blank(image: Tensor, shown: Bool[Tensor, "height width"]) -> str:
-    """Say why a photograph shows nothing, if so."""
+    """State why a photograph shows nothing, if so."""
     low, high = image.aminmax()
     if bool((low >= 0) & (low < SATURATED) & (high > 0) & (high < torch.inf)) and bool(shown.all()):
         return ""
@@ -126,7 +126,7 @@ def _blank(image: Tensor, shown: Bool[Tensor, "height width"]) -> str:
 
 
 def _nowhere(scene: SparseScene, view: int) -> str:
-    """Say why a camera cannot be where it is said to be, if so."""
+    """State why a camera cannot be where it is said to be, if so."""
     pose, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
     if not bool(pose.isfinite().all() and intrinsics.isfinite().all()):
         return "its camera has numbers that are not finite"

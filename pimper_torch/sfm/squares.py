@@ -60,7 +60,6 @@ def others_of(
     """Average the squares of each observation's point without its own, and those of another point.
 
     Args:
-        own: Of each observation.
         point: That it sees.
 
     Returns:

@@ -95,7 +95,7 @@ def find_static_background(
     max_error_px: float,
     fewest: int,
 ) -> StaticBackground:
-    """Tell features of a room at rest from those of what moves.
+    """Report features of a room at rest from those of what moves.
 
     Each pair that has both still matches and moving ones that one epipolar geometry explains
     votes: a still match says that its features rest, a moving one that they move. Features rest
@@ -147,14 +147,14 @@ def find_static_background(
 def moving_matches(
     keypoints: Keypoints, pair: Pair, rest: StaticBackground, still_px: float
 ) -> Bool[Tensor, " match"]:
-    """Mark matches that are neither still nor of a feature at rest."""
+    """Find matches that are neither still nor of a feature at rest."""
     first, second = pair.matches.unbind(dim=1)
     touched = rest.features[pair.first][first] | rest.features[pair.second][second]
     return ~touched & ~is_still(keypoints, pair, still_px)
 
 
 def is_still(keypoints: Keypoints, pair: Pair, still_px: float) -> Bool[Tensor, " match"]:
-    """Mark matches whose features lie at the same pixel."""
+    """Find matches whose features lie at the same pixel."""
     first, second = _pixels(keypoints, pair)
     return (first - second).norm(dim=-1) < still_px
 
@@ -168,7 +168,6 @@ def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Ten
 
     Args:
         still: Pixels in the first and in the second photograph.
-        moving: The same.
         max_error_px: Scale of the loss.
     """
     first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
@@ -216,7 +215,7 @@ def sampson_errors(
     first: Float[Tensor, "match 2"],
     second: Float[Tensor, "match 2"],
 ) -> Float[Tensor, " match"]:
-    """Give the first-order distance of matches from an epipolar geometry, in pixels."""
+    """Return the first-order distance of matches from an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
     errors: Tensor = sampson_epipolar_distance(*ends, geometry, squared=False)
     return errors

@@ -47,7 +47,6 @@ def tangents(
     """Lay a plane through every point and choose the views to look for it in.
 
     Args:
-        points_world: The cloud.
         observed: Which views see which points, every point in one at least.
         cameras: In float64, like the points.
     """
@@ -79,7 +78,7 @@ def tangents(
 def plane_normals(
     points: Float[Tensor, "point 3"], towards: Float[Tensor, "point 3"]
 ) -> Float[Tensor, "point 3"]:
-    """Give the unit normals of the planes that points and their nearest ones lie on.
+    """Return the unit normals of the planes that points and their nearest ones lie on.
 
     Args:
         points: At least one.
@@ -99,7 +98,7 @@ def plane_normals(
 def plane_homographies(
     tangent: Tangents, cameras: Cameras, view: int, some: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
-    """Give the homographies from planes, in steps from the centre, to a view's pixels."""
+    """Return the homographies from planes, in steps from the centre, to a view's pixels."""
     steps = tangent.steps_world[some]
     centre = transform(cameras.cam_from_world[view], tangent.points_world[some])
     rotated = steps @ cameras.cam_from_world[view, :3, :3].mT
@@ -107,7 +106,7 @@ def plane_homographies(
 
 
 def _along(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 2 3"]:
-    """Give two unit vectors at right angles to each normal and to one another."""
+    """Return two unit vectors at right angles to each normal and to one another."""
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first = normalize(torch.linalg.cross(normals, axis), dim=-1)
     return torch.stack([first, torch.linalg.cross(normals, first)], dim=1)

@@ -173,7 +173,6 @@ def sight(
     Args:
         pictures: Of the undistorted photographs.
         cameras: Theirs, float64.
-        tangents: Of the points.
         settings: When a point counts as found.
 
     Returns:
@@ -287,7 +286,7 @@ def _shifted(
 
 
 def _own(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
-    """Give the points' pixels in their reference views."""
+    """Return the points' pixels in their reference views."""
     frames = cameras.cam_from_world[tangents.reference]
     points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
     homogeneous = (cameras.intrinsics[tangents.reference] @ points[..., None])[..., 0]
@@ -299,7 +298,7 @@ def _complete(
     homographies: Float[Tensor, "point 3 3"],
     window: _Window,
 ) -> Bool[Tensor, " point"]:
-    """Tell whose patches a view shows nearly all of."""
+    """Find whose patches a view shows nearly all of."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
     fraction = (lacking * window.root.square()).sum(dim=1) / window.total
     return fraction <= _MAX_LACKING

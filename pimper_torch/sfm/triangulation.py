@@ -68,7 +68,7 @@ class TriangulationSettings:
 
 
 def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
-    """Tell whether most views observe fewer points."""
+    """Return whether most views observe fewer points."""
     count = model.num_views if isinstance(model, SparseModel) else model.cameras.num_views
     seen = torch.bincount(model.observation_view, minlength=count)
     return float(seen.double().median()) < fewest
@@ -89,10 +89,8 @@ def triangulate(
     patches. On one thread where the order of sums tells, so that bits repeat.
 
     Args:
-        views: The photographs.
         models: Of them, in their order: cameras in the ways in which they may be meant; the one
             that fits best is taken. Points that it has are replaced where more are found.
-        settings: How.
         where: The cameras are, for messages.
         crops: Of them, those of photographs that may have been cropped.
 

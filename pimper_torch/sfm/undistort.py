@@ -68,7 +68,7 @@ def undistorted(
 
 
 def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
-    """Give ``K`` of each lens's :func:`pinhole_for`, in float64."""
+    """Return ``K`` of each lens's :func:`pinhole_for`, in float64."""
     found = {lens: pinhole_for(lens) for lens in dict.fromkeys(lenses)}
     return torch.stack([found[lens] for lens in lenses])
 
@@ -77,7 +77,7 @@ _Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
 
 
 def _grid(lens: Lens, like: Tensor) -> _Grid | None:
-    """Give where pixels of the pinhole image are in the photograph, and which are in it at all.
+    """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
 
     Nothing for a lens without distortion.
     """

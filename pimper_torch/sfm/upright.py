@@ -56,7 +56,7 @@ def upright(model: SparseModel) -> SparseModel:
 
 
 def up_direction(model: SparseModel) -> Float[Tensor, "3"]:
-    """Give the direction that is up in a model's world, unit.
+    """Return the direction that is up in a model's world, unit.
 
     Where the object was turned over between series of photographs, it is that of the first.
     """
@@ -72,7 +72,7 @@ def up_direction(model: SparseModel) -> Float[Tensor, "3"]:
 
 
 def level_up(cam_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
-    """Give the direction that cameras held level call up, unit.
+    """Return the direction that cameras held level call up, unit.
 
     Least squares with Cauchy's weights, as some cameras may have been turned: x axes are level, y
     axes point down. Where x axes do not differ, it is the mean of the y axes, turned round.

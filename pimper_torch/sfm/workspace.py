@@ -63,7 +63,6 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
     """Write photographs and masks to a temporary folder, which goes when the block ends.
 
     Args:
-        views: Any.
         threads: That write at the same time; at least 1.
     """
     with tempfile.TemporaryDirectory(prefix="pimper_") as folder:

@@ -46,7 +46,7 @@ class Agreement(Record):
     held: Float[Tensor, " view"]
 
     def reliable(self, details: SilhouetteDetails) -> Bool[Tensor, " view"]:
-        """Mark views whose cut shows something, nearly all of the object and nothing else."""
+        """Find views whose cut shows something, nearly all of the object and nothing else."""
         hull = (self.covered >= details.min_covered) & (self.extent > 0)
         return hull & (self.exposed <= details.max_exposed) & (self.held >= details.min_held)
 

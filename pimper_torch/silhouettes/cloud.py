@@ -43,7 +43,6 @@ def split_cloud(
     that point.
 
     Args:
-        scene: With tracks.
         fixation: Where the cameras look.
         plane: The object stands on.
         tolerance: Of the plane, scene units.
@@ -70,7 +69,7 @@ def split_cloud(
 def pixels_seen(
     scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
 ) -> list[Float[Tensor, "_ 2"]]:
-    """Give where each view shows those of the chosen points that it observes."""
+    """Return where each view shows those of the chosen points that it observes."""
     points = scene.points_world.cpu().float()
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = (scene.observed & chosen[:, None]).cpu()
@@ -80,7 +79,7 @@ def pixels_seen(
 def pixels_of(
     scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
 ) -> list[Float[Tensor, "_ 2"]]:
-    """Give where the chosen points are in each view, whether or not it observes them.
+    """Return where the chosen points are in each view, whether or not it observes them.
 
     A point of the object is inside its silhouette also where another part hides it.
     """

@@ -39,7 +39,7 @@ class Contours(Record):
 
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
-        """Give contours without rays; the hull holds everything, or what is above planes."""
+        """Return contours without rays; the hull holds everything, or what is above planes."""
         like = cameras.cam_from_world
         rays = ContourRays(
             view=torch.zeros(0, dtype=torch.long, device=like.device),
@@ -91,7 +91,6 @@ class TraceContours(Stage):
         """Cast rays through the silhouettes and build their visual hull.
 
         Args:
-            silhouettes: Of all views.
             cameras: Of the same views.
 
         Returns:
@@ -121,7 +120,7 @@ class TraceContours(Stage):
 
 
 def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
-    """Give the corners of a box that holds what the silhouettes show.
+    """Return the corners of a box that holds what the silhouettes show.
 
     Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
     there it reaches as far as the largest of them, seen from its camera, and half as far again:

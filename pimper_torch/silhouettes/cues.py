@@ -69,7 +69,7 @@ class Cues(Record):
         return self.plane is not None and len(self.background_from_view) > 0
 
     def surrounded(self) -> Bool[Tensor, "view height width"]:
-        """Mark what the object's points surround in each view."""
+        """Find what the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
         return of_views(
             lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
@@ -104,7 +104,6 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
 
     Args:
         scene: Of the photographs' size.
-        config: Settings.
         details: Settings that are the same for all photographs.
     """
     scene = scene.to("cpu", torch.float32)
@@ -133,7 +132,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
-    """Give the region in the scene's frame.
+    """Return the region in the scene's frame.
 
     Raises:
         InputError: No point of the cloud is in it, and no view sees any of it.

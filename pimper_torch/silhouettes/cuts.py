@@ -174,7 +174,7 @@ def _cut(
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Mark what takes part in the vote though cuts may lack it: what no light makes of the plane.
+    """Find what takes part in the vote though cuts may lack it: what no light makes of the plane.
 
     That is what is brighter or darker than the plane can be, as the inside of a vessel.
     """

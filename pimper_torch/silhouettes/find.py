@@ -110,7 +110,7 @@ class FindSilhouettes(Stage):
         return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
 
     def _top(self, cues: Cues) -> Float[Tensor, "plane 4"] | None:
-        """Give the upper side of the supporting plane, as thick as its points are rough."""
+        """Return the upper side of the supporting plane, as thick as its points are rough."""
         if cues.plane is None:
             return None
         thickness = self.details.plane.tolerance * cues.fixation.distance
@@ -118,7 +118,7 @@ class FindSilhouettes(Stage):
         return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
 
     def _doubt(self, agreement: Agreement) -> str:
-        """Say why silhouettes are unreliable, or nothing."""
+        """State why silhouettes are unreliable, or nothing."""
         reliable = agreement.reliable(self.details)
         overlap = float(agreement.overlap.median())
         if overlap < self.details.min_overlap:
@@ -145,10 +145,9 @@ class FindSilhouettes(Stage):
 
 
 def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
-    """Give the scene with silhouettes that were found for masks, a little wider where unsure.
+    """Return the scene with silhouettes that were found for masks, a little wider where unsure.
 
     Args:
-        scene: With photographs.
         silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
             that were not believed.
     """

@@ -70,7 +70,7 @@ class Hull(Record):
     def holds(
         self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
-        """Mark points inside, or so little outside that silhouettes do not tell.
+        """Find points inside, or so little outside that silhouettes do not tell.
 
         Args:
             points_world: Anywhere.
@@ -79,7 +79,7 @@ class Hull(Record):
         return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
 
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Say how deep points lie inside the hull; negative outside.
+        """Return how deep points lie inside the hull; negative outside.
 
         Trilinear between voxels. Off the grid it is the value at its border less the distance
         to it. Differentiable where a point is not level with the voxels' centres.
@@ -125,7 +125,7 @@ class Everywhere(Hull):
         )
 
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Say that points lie infinitely deep inside."""
+        """State that points lie infinitely deep inside."""
         return torch.full_like(points_world[..., 0], torch.inf)
 
 
@@ -155,7 +155,7 @@ class HalfSpace(Everywhere):
     def holds(
         self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
     ) -> Bool[Tensor, "*batch"]:
-        """Mark points above the planes; the tolerance is of silhouettes."""
+        """Find points above the planes; the tolerance is of silhouettes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 
@@ -216,7 +216,7 @@ def margins(
     cam_from_world: Float[Tensor, "4 4"],
     size_px: tuple[int, int],
 ) -> Float[Tensor, "height width"]:
-    """Give how far each pixel is inside the hull's projection, in pixels; negative outside.
+    """Return how far each pixel is inside the hull's projection, in pixels; negative outside.
 
     It is how deep the ray gets into the hull, over the size of a pixel there: right to a fraction
     of a pixel at the border, less so far from it. Rays are followed through every fourth pixel.
@@ -238,7 +238,7 @@ def margins(
 def _deepest(
     hull: Hull, eye: Float[Tensor, "3"], rays: Float[Tensor, "ray 3"]
 ) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-    """Give how deep each ray gets into the hull, and where on the ray that is.
+    """Return how deep each ray gets into the hull, and where on the ray that is.
 
     A ray that misses the grid is as far outside as the grid is long.
     """
@@ -308,7 +308,7 @@ def _vote(
     reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
     fractions: tuple[float, float],
 ) -> Float[Tensor, "x y z"]:
-    """Give the smallest distance to a silhouette after those that may disagree.
+    """Return the smallest distance to a silhouette after those that may disagree.
 
     Args:
         maps: Distances to the silhouettes in pixels, one a view.

@@ -11,7 +11,7 @@ PERHAPS_BACKGROUND, PERHAPS_OBJECT = cv2.GC_PR_BGD, cv2.GC_PR_FGD
 
 
 def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Give each pixel's distance to the border of a mask in pixels, positive inside.
+    """Return each pixel's distance to the border of a mask in pixels, positive inside.
 
     The border runs midway between the centres of unlike neighbours. Where nothing is masked,
     or all is, the distance is minus or plus the sum of the sides.
@@ -26,7 +26,7 @@ def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height
 
 
 def _exact_distance(drawn: np.ndarray) -> np.ndarray:
-    """Give each pixel's distance to the nearest zero.
+    """Return each pixel's distance to the nearest zero.
 
     The last bit of OpenCV's depends on where in memory the pixels lie. Squares of distances
     between centres of pixels are whole numbers.
@@ -92,7 +92,6 @@ def grab_cut(
     Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004. Deterministic.
 
     Args:
-        colours: The photograph.
         labels: ``BACKGROUND`` or ``OBJECT`` for certain, or ``PERHAPS_BACKGROUND`` or
             ``PERHAPS_OBJECT``; some of each side.
         iterations: Of estimating the mixtures and cutting.
@@ -116,7 +115,7 @@ def grab_cut(
 def _open_sides(
     labels: UInt8[Tensor, "height width"],
 ) -> tuple[Bool[Tensor, " height"], Bool[Tensor, " width"]]:
-    """Mark rows and columns with anything but certain background."""
+    """Find rows and columns with anything but certain background."""
     other = labels != BACKGROUND
     return other.any(dim=1), other.any(dim=0)
 
@@ -150,7 +149,7 @@ def convex_hull_of(
 def discs_at(
     pixels: Float[Tensor, "point 2"], radius_px: float, size_px: tuple[int, int]
 ) -> Bool[Tensor, "height width"]:
-    """Mark what is within a distance of pixels."""
+    """Find what is within a distance of pixels."""
     drawn = np.ones(size_px[::-1], dtype=np.uint8)
     column, row = pixels.floor().long().T.numpy()
     inside = (column >= 0) & (row >= 0) & (column < size_px[0]) & (row < size_px[1])
@@ -195,7 +194,7 @@ def _large(
 def blind_holes(
     mask: Bool[Tensor, "height width"], seen_through: Bool[Tensor, "height width"], fraction: float
 ) -> Bool[Tensor, "height width"]:
-    """Mark the holes of a mask of which less than a fraction is seen through."""
+    """Find the holes of a mask of which less than a fraction is seen through."""
     drawn = (~mask).numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
     through = np.bincount(labels[seen_through.numpy()], minlength=count)

@@ -57,7 +57,7 @@ def plane_agreement(
     fixation: Fixation,
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
-    """Say how well each view agrees with a plane's texture; see :func:`texture_agreement`.
+    """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
 
     Args:
         pictures: At the working size.
@@ -75,7 +75,7 @@ def room_agreement(
     background_from_view: Float[Tensor, "view 3 3"],
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
-    """Say how well each view agrees with a room at rest; see :func:`texture_agreement`.
+    """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
     Args:
         pictures: At the working size.
@@ -93,7 +93,7 @@ def texture_agreement(
     far: Raster,
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
-    r"""Say how well each view agrees with the texture of a background.
+    r"""Return how well each view agrees with the texture of a background.
 
     Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
     radiance without its smooth part.
@@ -133,7 +133,7 @@ def texture_agreement(
 def _common(
     values: Float[Tensor, "view height width"], raster: Raster
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
-    """Give the views' median on a background, and its spread, as each view sees it."""
+    """Return the views' median on a background, and its spread, as each view sees it."""
     maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
     sees = maps.isfinite().flatten(1).all(dim=1).tolist()
 
@@ -157,7 +157,7 @@ def _common(
 
 
 def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
-    """Give the views' median and the spread round it; NaN where too few see the plane."""
+    """Return the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
     few = seen.isfinite().sum(dim=0) < _MIN_VIEWS

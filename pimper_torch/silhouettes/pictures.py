@@ -73,7 +73,7 @@ def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
 
 
 def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:
-    """Give brightness and two ratios of colours, which shadows and shading leave as they are."""
+    """Return brightness and two ratios of colours, which shadows and shading leave as they are."""
     red, green, blue = torch.log(radiance + _FAINT)
     luma = 255 * srgb_from_linear(radiance.mean(dim=0))
     ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]

@@ -21,8 +21,6 @@ def silhouettes_of(cuts: Cuts, views: Views, details: SilhouetteDetails) -> Silh
     """Repair single cuts, and give silhouettes at the photographs' size.
 
     Args:
-        cuts: Of all views.
-        views: The photographs.
         details: What makes a view reliable.
     """
     cuts = repaired(cuts)

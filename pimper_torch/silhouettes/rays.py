@@ -95,8 +95,6 @@ def contour_rays(
     Args:
         silhouettes: Probabilities that pixels show the object; views that are not reliable get
             no rays.
-        cameras: Of all views.
-        config: Settings.
 
     Returns:
         Rays of all reliable views. Corners, where the surface has no single normal, specks,
@@ -175,7 +173,7 @@ class _Line:
     closed: bool
 
     def shifted(self, values: Array, by: int) -> Array:
-        """Give what stands so many points further along; the end's beyond an open one's end."""
+        """Return what stands so many points further along; the end's beyond an open one's end."""
         at = np.arange(len(values)) + by
         at = at % len(values) if self.closed else at.clip(0, len(values) - 1)
         shifted: Array = values[at]
@@ -192,7 +190,7 @@ def _resampled(corners: Array) -> _Line:
 
 
 def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Array:
-    """Give rows of place, tangent and outward direction, two numbers each, and slope."""
+    """Return rows of place, tangent and outward direction, two numbers each, and slope."""
     points = line.points
     how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
     tangent = _unit(gaussian_filter1d(points, config.tangent_px, axis=0, order=1, mode=how))

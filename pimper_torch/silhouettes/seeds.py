@@ -99,13 +99,13 @@ def labels_from_hull(
 
 
 def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark what does not show the plane, or where it is always hidden; unknown counts as plane."""
+    """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
     found = _grainless(agreement < _NOT_PLANE)
     return filled(closed(found, round(_GAPS * max(agreement.shape))), agreement)
 
 
 def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark what is so far inside that shadows beside the object do not reach it."""
+    """Find what is so far inside that shadows beside the object do not reach it."""
     return margin > _DEEP * max(margin.shape)
 
 
@@ -119,13 +119,13 @@ def is_inmost(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height wid
 def not_seen_through(
     object_px: Float[Tensor, "point 2"], agreement: Float[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
-    """Mark what the object's points surround, where the plane is not seen."""
+    """Find what the object's points surround, where the plane is not seen."""
     height, width = agreement.shape
     return convex_hull_of(object_px, (width, height)) & ~_shows_plane(agreement)
 
 
 def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark what is so bright or dark that light cannot make it so on the plane."""
+    """Find what is so bright or dark that light cannot make it so on the plane."""
     return _grainless(agreement == -1)
 
 
@@ -140,7 +140,7 @@ def filled(
 def exposed_fraction(
     cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"] | None
 ) -> Float[Tensor, ""]:
-    """Give the fraction of a cut that shows a background for certain; 0 where none is known."""
+    """Return the fraction of a cut that shows a background for certain; 0 where none is known."""
     if agreement is None:
         return torch.zeros((), dtype=torch.float64)
     return (cut & _surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
@@ -149,7 +149,7 @@ def exposed_fraction(
 def held_fraction(
     cut: Bool[Tensor, "height width"], object_px: Float[Tensor, "point 2"]
 ) -> Float[Tensor, ""]:
-    """Give the fraction of the object's points that a cut holds; 1 where too few are known."""
+    """Return the fraction of the object's points that a cut holds; 1 where too few are known."""
     if len(object_px) < MIN_POINTS:
         return torch.ones((), dtype=torch.float64)
     column, row = object_px.floor().long().unbind(dim=1)
@@ -158,13 +158,13 @@ def held_fraction(
 
 
 def _surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark the plane, but not what is next to something else: the object's foot agrees, too."""
+    """Find the plane, but not what is next to something else: the object's foot agrees, too."""
     sure = _grainless(agreement > _ON_PLANE)
     return signed_distance(sure) > _FOOT * max(agreement.shape)
 
 
 def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark what some window that agrees with the plane holds."""
+    """Find what some window that agrees with the plane holds."""
     return signed_distance(_grainless(agreement > _ON_PLANE)) > -_HALF_WINDOW * max(agreement.shape)
 
 

@@ -66,13 +66,10 @@ def contour_points(
     the surface is tangent there, so that this matters little across it.
 
     Args:
-        rays: Of the silhouettes.
-        cameras: Of all views.
         hull: Of the same silhouettes.
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
             any, positions are in the centre of what is in the hull.
         normals_world: Theirs, unit, outward.
-        config: Settings.
 
     Returns:
         At most one place a ray. A ray has none where it does not meet the hull, and where
@@ -137,7 +134,7 @@ class _SignedDistance:
 def _depths_in_box(
     hull: Hull, centers: Float[Tensor, "ray 3"], rays: Float[Tensor, "ray 3"]
 ) -> tuple[Float[Tensor, "ray 1"], Float[Tensor, "ray 1"]]:
-    """Give the depths at which rays enter and leave the ball round the hull's grid."""
+    """Return the depths at which rays enter and leave the ball round the hull's grid."""
     corners = hull.corners_world.to(rays)
     centre, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
     square = rays.square().sum(dim=1, keepdim=True)
@@ -154,7 +151,7 @@ def _costs(
     tolerance: Float[Tensor, " ray"],
     surface: _SignedDistance | None,
 ) -> Float[Tensor, "ray step"]:
-    """Give the signed distance to the surface along the rays; infinite outside the hull.
+    """Return the signed distance to the surface along the rays; infinite outside the hull.
 
     Without a surface it is the distance to the centre of what is in the hull.
     """
@@ -172,7 +169,7 @@ def _costs(
 def ambiguous(
     cost: Float[Tensor, "ray step"], tolerance: Float[Tensor, " ray"]
 ) -> Bool[Tensor, " ray"]:
-    """Tell rays that come equally near to two surfaces, one behind the other.
+    """Report rays that come equally near to two surfaces, one behind the other.
 
     Args:
         cost: Signed distance to the surface along the rays; infinite where they cannot

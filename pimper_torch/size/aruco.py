@@ -61,6 +61,6 @@ def find_squares(picture: UInt8[Tensor, "height width"]) -> list[Square]:
 
 
 def cells_of(code: int) -> Bool[Tensor, "8 8"]:
-    """Give the cells of a marker, true where they are black."""
+    """Return the cells of a marker, true where they are black."""
     family = cv2.aruco.getPredefinedDictionary(_FAMILY)
     return torch.from_numpy(cv2.aruco.generateImageMarker(family, code, CELLS) < 128)

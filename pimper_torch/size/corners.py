@@ -98,7 +98,7 @@ def _crossing(
     c: Float[Tensor, "*batch 2"],
     d: Float[Tensor, "*batch 2"],
 ) -> Float[Tensor, "*batch 2"]:
-    """Give where the line through two points crosses that through two others."""
+    """Return where the line through two points crosses that through two others."""
     one, other = b - a, d - c
 
     def cross(first: Tensor, second: Tensor) -> Tensor:

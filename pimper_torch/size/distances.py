@@ -14,7 +14,6 @@ def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit =
     """Find the scale of a result from places that are known distances apart.
 
     Args:
-        result: Of a run.
         bars: One at least.
         unit: Of their lengths.
 
@@ -38,7 +37,6 @@ def scale_of_cameras(
     """Find the scale of a result from cameras that are known distances apart.
 
     Args:
-        result: Of a run.
         distances: One at least.
         unit: Of their lengths.
 

@@ -28,9 +28,7 @@ def find_scale(
     Where another one differs by more than 2 %, a warning says so.
 
     Args:
-        result: Of a run.
         bars: Places that are known distances apart.
-        camera_distances: Cameras that are.
         markers: Whether markers of ``pimper markers`` are looked for, and the length of their
             sides in millimetres, if it is not what their numbers say.
         unit: Of lengths that are given, and wanted.

@@ -126,7 +126,6 @@ def number_of(name: str, names: Sequence[str]) -> int:
     """Find the photograph of a name, with its suffix or without.
 
     Args:
-        name: Wanted.
         names: Of all photographs, different from one another.
 
     Raises:

@@ -62,7 +62,6 @@ def scale_of_markers(
         scene: Photographs and their cameras.
         side_mm: Of the black squares; unless given, as long as their sheet says, see
             :func:`~pimper_torch.size.sheet.side_of`.
-        unit: Wanted.
 
     Returns:
         ``None`` where no marker counts.
@@ -169,7 +168,7 @@ def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> M
 def _widest(
     rays: Float[Tensor, "view 4 3"], used: Bool[Tensor, "trial view"]
 ) -> Float[Tensor, " trial"]:
-    """Give the widest angle between rays to one corner, by two photographs a trial."""
+    """Return the widest angle between rays to one corner, by two photographs a trial."""
     cosines = torch.einsum("vki,wki->vwk", rays, rays).mean(dim=-1).clamp(-1, 1)
     either = used[:, :, None] & used[:, None, :]
     return torch.where(either, cosines, 1.0).flatten(1).amin(dim=1).acos()
@@ -178,7 +177,7 @@ def _widest(
 def _triangulated(
     rays: Float[Tensor, "view 4 3"], cameras: Cameras, used: Bool[Tensor, "trial view"]
 ) -> Float[Tensor, "trial 4 3"]:
-    """Give the points nearest to the rays of some photographs in the least-squares sense."""
+    """Return the points nearest to the rays of some photographs in the least-squares sense."""
     across = torch.eye(3).to(rays) - rays[..., :, None] * rays[..., None, :]
     towards = (across @ cameras.centers_world[:, None, :, None])[..., 0]
     weight = used.to(rays)
@@ -189,7 +188,7 @@ def _triangulated(
 def _near(
     corners_world: Float[Tensor, "trial 4 3"], cameras: Cameras, pixels: Float[Tensor, "view 4 2"]
 ) -> Bool[Tensor, "trial view"]:
-    """Tell which photographs show a marker where each trial has it."""
+    """Find which photographs show a marker where each trial has it."""
     found, depth = project(corners_world[:, None], cameras.cam_from_world, cameras.intrinsics)
     off = (found - pixels).norm(dim=-1).amax(dim=-1)
     within = (_OFF * cameras.sizes_px.amax(dim=1)).clamp_min(_OFF_PX)

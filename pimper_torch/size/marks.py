@@ -40,7 +40,6 @@ def view_of(name: str, scene: SparseScene) -> int:
 
     Args:
         name: With its suffix or without.
-        scene: With the cameras.
 
     Raises:
         InputError: It has no camera, or there is none of that name, or several.
@@ -63,7 +62,6 @@ def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
 
     Args:
         mark: Pixels of the photographs as they were loaded: the right way up, before undistortion.
-        result: Of a run.
 
     Raises:
         InputError: Names the pixel, what is wrong with it and what to do.
@@ -79,7 +77,7 @@ def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
 
 
 def _ray(pointer: Pointer, view: int, scene: SparseScene) -> Float[Tensor, "3"]:
-    """Give the direction behind a pixel, as long as it goes while its depth grows by 1."""
+    """Return the direction behind a pixel, as long as it goes while its depth grows by 1."""
     lens = scene.lenses[view]
     width, height = pointer.size_px or (lens.width, lens.height)
     require_inside(pointer, width, height)
@@ -185,7 +183,7 @@ def _beside(
     eye: Float[Tensor, "3"],
     ray: Float[Tensor, "3"],
 ) -> Float[Tensor, "3"] | None:
-    """Give the point of a ray beside the nearest vertex, if the surface is close to the pixel."""
+    """Return the point of a ray beside the nearest vertex, if the surface is close to the pixel."""
     cameras = result.cameras.detach().to("cpu", torch.float64)
     pose, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
     pixels, depth = project(mesh.vertices_world, pose, intrinsics)
@@ -210,7 +208,7 @@ def _beside(
 
 
 def ground(scene: SparseScene, silhouettes: Silhouettes) -> Plane | None:
-    """Give the plane that the object stands on: the silhouettes', else that of the cloud."""
+    """Return the plane that the object stands on: the silhouettes', else that of the cloud."""
     if len(silhouettes.planes_world):
         found = silhouettes.planes_world[0].detach().cpu()  # of the first series, whose up is up
         length = found[:3].norm()

@@ -43,7 +43,7 @@ class Scale(Record):
     count: int
 
     def report(self) -> dict[str, object]:
-        """Give what ``summary.json`` tells of it as ``scale``."""
+        """Return what ``summary.json`` tells of it as ``scale``."""
         return {
             "factor": self.factor,
             "unit": self.unit,

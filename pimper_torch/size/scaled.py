@@ -50,7 +50,7 @@ _FIGURES = ("mismatch", "mismatch_before")
 
 
 def scaled(record: AnyRecord, factor: float) -> AnyRecord:
-    """Give a result, or a part of one, in another unit: every length times a factor.
+    """Return a result, or a part of one, in another unit: every length times a factor.
 
     Vertices, expected errors, cameras, cloud, templates and their heights, covariances and inverse
     variances, the plane that the object stands on, and ``offset_world``. Photographs, normals,

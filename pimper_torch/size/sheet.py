@@ -37,7 +37,7 @@ class PrintedMarker:
 
 
 def side_of(code: int) -> int | None:
-    """Give the side of a sheet's marker in millimetres; ``None`` for one that is on no sheet.
+    """Return the side of a sheet's marker in millimetres; ``None`` for one that is on no sheet.
 
     >>> side_of(0), side_of(16 * 20 + 3), side_of(586)
     (10, 30, None)

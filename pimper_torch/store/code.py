@@ -39,7 +39,7 @@ def code_of(module: str) -> str | None:
 
 
 def _imported(file: Path) -> Iterator[Path]:
-    """Give the files of this package that a file imports, inside functions too."""
+    """Return the files of this package that a file imports, inside functions too."""
     for source, names, whole in _IMPORT.findall(file.read_bytes()):
         module = (source or whole).decode()
         yield from _files(module)
@@ -48,7 +48,7 @@ def _imported(file: Path) -> Iterator[Path]:
 
 
 def _files(module: str) -> Iterator[Path]:
-    """Give a module's file, if it is one of this package."""
+    """Return a module's file, if it is one of this package."""
     first, *parts = module.split(".")
     path = _PACKAGE.joinpath(*parts)
     if first == _PACKAGE.name and parts:

@@ -68,7 +68,7 @@ def _described(value: object) -> object:
 
 
 def _held(module: nn.Module) -> dict[str, object]:
-    """Give what a module is made with, without what every module has."""
+    """Return what a module is made with, without what every module has."""
     own = {
         name: value
         for name, value in vars(module).items()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def user_cache() -> Path:
-    """Give the folder for caches of this package: ``pimper_torch`` in ``$XDG_CACHE_HOME``.
+    """Return the folder for caches of this package: ``pimper_torch`` in ``$XDG_CACHE_HOME``.
 
     Where that is not set, in ``~/.cache``. Source: XDG Base Directory Specification 0.8.
     """

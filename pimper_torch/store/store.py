@@ -61,7 +61,6 @@ class Store:
 
         Args:
             key: As it was kept under.
-            cls: The record's class.
         """
         if self.fresh:
             return None
@@ -109,7 +108,7 @@ class Store:
         return self._bounded(key)
 
     def sizes(self) -> dict[str, int]:
-        """Give the bytes that every key takes, in the order they were last used in."""
+        """Return the bytes that every key takes, in the order they were last used in."""
         used: dict[str, tuple[float, int]] = {}
         for path in Path(self.folder).glob(f"*{_RECORD}"):
             with suppress(OSError):  # another run deleted it

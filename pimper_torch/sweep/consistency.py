@@ -20,7 +20,7 @@ def inconsistency(
     scale: Float[Tensor, " sample"],
     iterations: int = ALBEDO_ITERATIONS,
 ) -> Float[Tensor, "sample hypothesis"]:
-    r"""Give the robust cost of every hypothesis.
+    r"""Return the robust cost of every hypothesis.
 
     .. math:: C = \sum_g \tfrac12 \log(1 + (x_g - \rho s_g)^2 / c^2)
 

@@ -24,15 +24,12 @@ def compiled_costs(
     min_views: int,
     min_facing: float,
 ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
-    """Give the robust cost of every height, and 1 where a sample is swept, else 0.
+    """Return the robust cost of every height, and 1 where a sample is swept, else 0.
 
     Args:
-        templates: The bucket.
         registered: Which views have which samples.
         photometry: Normals and lights.
         transferred: Normals that samples are swept along.
-        cameras: Of all views.
-        sources: Photographs.
         ladder: Heights that are tried, in samples.
         scale: Of the robust cost, in units of radiance.
         num_views: Largest number of views that a sample is compared in.

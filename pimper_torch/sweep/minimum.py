@@ -38,7 +38,7 @@ def posterior_variance(
     position: Float[Tensor, "*batch"],
     curvature: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    r"""Give the variance of the minimum's position, in squared steps.
+    r"""Return the variance of the minimum's position, in squared steps.
 
     Costs are taken for negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
     that of the parabola at the minimum, :math:`1 / C''`, and by how much the variance over all
@@ -62,7 +62,7 @@ def posterior_variance(
 
 
 def _variance(cost: Float[Tensor, "*batch hypothesis"]) -> Float[Tensor, "*batch"]:
-    """Give the variance of the hypotheses' index under their likelihoods."""
+    """Return the variance of the hypotheses' index under their likelihoods."""
     steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
     likelihood = torch.softmax(-cost, dim=-1)
     mean = (likelihood * steps).sum(dim=-1, keepdim=True)

@@ -141,9 +141,6 @@ class Sweep(Stage):
         """Sweep all patches, or those of some buckets.
 
         Args:
-            views: Photographs.
-            cameras: Of all views.
-            seen: Views on templates.
             photometric: Light and normals of the same buckets.
             sources: The photographs as ``Warp`` prepares them; made here where not given.
         """
@@ -257,7 +254,7 @@ class Sweep(Stage):
         )
 
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
-        """Give the residuals of each patch that count as large."""
+        """Return the residuals of each patch that count as large."""
         return _LOSS_SCALE * photometry.convergence.residual.clamp_min(MIN_SPREAD)
 
     def _costs(
@@ -269,7 +266,7 @@ class Sweep(Stage):
         cameras: Cameras,
         sources: Sources,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
-        """Give the cost of every height, and 1 where a sample is swept, else 0."""
+        """Return the cost of every height, and 1 where a sample is swept, else 0."""
         config = self.config
         rows = self._rows(templates, registered, photometry, transferred, cameras)
         step = _STEP * templates.spacing
@@ -327,7 +324,7 @@ class Sweep(Stage):
         spacing: Float[Tensor, " sample"],
         cameras: Cameras,
     ) -> Float[Tensor, "sample view"]:
-        """Give the pixels that a sample would span in each view if it faced it."""
+        """Return the pixels that a sample would span in each view if it faced it."""
         focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
         axes = cameras.cam_from_world[:, 2]
         depth = points @ axes[:, :3].mT + axes[:, 3]

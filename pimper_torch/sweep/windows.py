@@ -38,7 +38,7 @@ def window_mean(
 
 
 def window_size(radius: float) -> float:
-    """Give how many samples the window averages: as many as one of equal weights with its noise.
+    """Return how many samples the window averages: as many as one of equal weights with its noise.
 
     >>> round(window_size(2.0))
     50
@@ -52,7 +52,7 @@ def level_weight(
     spacing: Float[Tensor, " patch"],
     max_slope: float,
 ) -> Float[Tensor, "patch height width"]:
-    """Give the weight of every sample in windows: none on a cliff.
+    """Return the weight of every sample in windows: none on a cliff.
 
     A window would otherwise mix the two sides of a depth edge.
 

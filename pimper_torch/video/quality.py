@@ -17,7 +17,7 @@ _SHORT, _LONG = 1, 4
 
 
 def sharpness(luma: UInt8[Tensor, "height width"]) -> float:
-    """Tell how much neighbours differ, as a fraction of what pixels a little apart differ.
+    """Find how much neighbours differ, as a fraction of what pixels a little apart differ.
 
     It is that of rows or of columns, whichever is less: motion blurs along one of them. Brightness
     and contrast cancel. It compares frames of one video; 0 where nothing differs.
@@ -44,7 +44,7 @@ def thumbnail(luma: UInt8[Tensor, "height width"]) -> UInt8[np.ndarray, "height 
 def motion(
     before: UInt8[np.ndarray, "height width"], after: UInt8[np.ndarray, "height width"]
 ) -> float:
-    """Tell how far what moves most has moved between thumbnails, as a fraction of their width.
+    """Find how far what moves most has moved between thumbnails, as a fraction of their width.
 
     Source: Kroeger, Timofte, Dai, Van Gool, Fast optical flow using dense inverse search,
     ECCV 2016, for the flow.

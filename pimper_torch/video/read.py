@@ -40,7 +40,6 @@ def frame_pictures(
     """Read frames in colour, turned and mirrored as the video says.
 
     Args:
-        path: The video.
         numbers: Of frames, from 0, ascending.
 
     Raises:

@@ -22,7 +22,6 @@ def draw_calibration(
         expected: Errors of the bins.
         root_mean_square: Of their true errors.
         robust: The same, blind to outliers.
-        unit: Of all errors.
         path: PNG file.
     """
     # Local, so that importing the package does not load matplotlib; Figure without pyplot

@@ -142,7 +142,6 @@ def surface_picture(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None =
     Args:
         mesh: Any; points without faces give a white picture.
         cameras: Its world.
-        view: One of them.
         hits: Of the view's rays on the mesh, if they are known already.
     """
     if not len(mesh.faces):
@@ -159,7 +158,7 @@ def photograph_picture(radiance: Float[Tensor, "channel height width"]) -> Pictu
 
 
 def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
-    """Give the rows and columns that hold all true pixels, with a little room.
+    """Return the rows and columns that hold all true pixels, with a little room.
 
     Everything where none is true.
     """
@@ -189,7 +188,6 @@ def draw_heatmap(
         scale: Colours and their unit.
         path: Ends in ``.png``.
         shading: The surface in that view, see :func:`shading_in_view`.
-        title: Above it.
     """
     path = Path(path)
     picture = error_picture(error, scale, shading=shading)
@@ -212,7 +210,6 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
 
     Args:
         rows: At least one; a method that is missing in one leaves its place empty there.
-        scale: One for all.
         path: Ends in ``.png``.
 
     Raises:
@@ -249,7 +246,7 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
 
 
 def _columns(row: SceneRow, names: Sequence[str]) -> list[MethodPanels]:
-    """Give a scene's pictures column by column: the truth, then every method of the sheet."""
+    """Return a scene's pictures column by column: the truth, then every method of the sheet."""
     truth = MethodPanels(method="truth", surface=row.photograph, error=row.truth)
     of_method = {panels.method: panels for panels in row.methods}
     return [truth, *(of_method.get(name, MethodPanels(method=name)) for name in names)]

@@ -44,9 +44,7 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     autograd.
 
     Args:
-        mesh: Any.
         cameras: Its world.
-        view: One of them.
         hits: Of the view's rays on the mesh, if they are known already.
     """
     hits = hits or cast_view(mesh, cameras, view)

@@ -58,7 +58,6 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = 560)
     view is not trusted.
 
     Args:
-        result: Of a run.
         path: Ends in ``.png``.
         panel_px: Longer side of a rendered picture.
     """
@@ -193,7 +192,7 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
 
 
 def headline(result: Reconstruction) -> str:
-    """Say in a line what went in and what came out."""
+    """State in a line what went in and what came out."""
     taken = result.scene.views.num_views
     given = taken + len(result.scene.unregistered)
     seconds = sum(report.seconds for report in result.report)

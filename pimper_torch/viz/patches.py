@@ -67,11 +67,8 @@ def plot_in_view(
     """Draw a number for each facet where a view shows it.
 
     Args:
-        coarse: The facets.
         cameras: That see them.
-        view: One of them.
         values: One a facet, such as residuals or numbers of views; see :func:`by_facet`.
-        title: Of the figure.
 
     Raises:
         InputError: There is not one value for each facet.
@@ -120,7 +117,7 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
 
 
 def _panels(patch: AnyPatch) -> list[tuple[str, Tensor]]:
-    """Give titles and rasters, in colour or not."""
+    """Return titles and rasters, in colour or not."""
     if isinstance(patch, PatchSet):
         (templates,) = patch.buckets
         return [("template's depth", templates.depth[0]), ("inside", templates.inside[0])]

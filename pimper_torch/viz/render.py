@@ -29,8 +29,6 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     Faces seen from behind are bluish. A constant to autograd.
 
     Args:
-        mesh: Any.
-        camera: One view.
         flat: Every face has one tone; else the faces' normals are averaged round vertices.
 
     Returns:
@@ -67,7 +65,6 @@ def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: floa
     """Walk round a point, about the vertical of the picture.
 
     Args:
-        camera: One view.
         center_world: Stays where it is in the picture, and as far away.
         angle_deg: Positive walks to the right and shows the object's right side.
     """
@@ -85,7 +82,6 @@ def frame(
     """Crop and scale a camera's picture to the bounding box of some points.
 
     Args:
-        camera: One view.
         points_world: At least one of them before the camera.
         longer_side_px: Of the new picture.
         margin: Round the box, as a fraction of its longer side.
@@ -99,7 +95,6 @@ def crop(
     """Crop and scale a camera's picture to a rectangle.
 
     Args:
-        camera: One view.
         low: Upper left corner, pixels; may lie outside the picture, as all of it may.
         high: Lower right corner.
         longer_side_px: Of the new picture.
@@ -118,7 +113,7 @@ def crop(
 def bounding_box(
     camera: Cameras, points_world: Float[Tensor, "point 3"], margin: float
 ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
-    """Give the corners (top left, bottom right) of the pixels that some points cover."""
+    """Return the corners (top left, bottom right) of the pixels that some points cover."""
     pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])
     pixels = pixels[depth > 0]
     low, high = pixels.amin(dim=0), pixels.amax(dim=0)
@@ -127,7 +122,7 @@ def bounding_box(
 
 
 def _towards(camera: Cameras) -> Float[Tensor, "height width 3"]:
-    """Give the viewing ray of every pixel, camera frame."""
+    """Return the viewing ray of every pixel, camera frame."""
     width, height = (int(side) for side in camera.sizes_px[0])
     pixels = pixel_centers(width, height, like=camera.intrinsics).reshape(-1, 2)
     standing = torch.eye(4).to(camera.intrinsics)

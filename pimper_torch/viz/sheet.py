@@ -30,7 +30,6 @@ def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -
     whether the printer scaled the page. The same arguments give the same bytes.
 
     Args:
-        path: Of the file.
         side_mm: Of the black squares, 10 to 36; their numbers tell it.
         paper: Upright.
 
@@ -75,7 +74,7 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
 
 
 def is_sheet(path: Path | str) -> bool:
-    """Tell whether a file is a sheet that was written here."""
+    """Return whether a file is a sheet that was written here."""
     path = Path(path)
     try:
         return path.stat().st_size < _MAX_BYTES and TITLE.encode() in path.read_bytes()

@@ -43,6 +43,6 @@ def thumbnails(
 
 
 def border(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mark pixels of the mask next to others; the picture's edge is no border."""
+    """Find pixels of the mask next to others; the picture's edge is no border."""
     beside = max_pool2d((~mask)[None].float(), kernel_size=3, stride=1, padding=1)[0] > 0
     return mask & beside

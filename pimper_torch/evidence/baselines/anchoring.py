@@ -110,7 +110,7 @@ def bas_relief_through(
 def apply_bas_relief(
     bas_relief: Float[Tensor, " 4"], template: Template, relief: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width"]:
-    """Give ``mu x + nu y + lambda z + c`` on the whole raster."""
+    """Return ``mu x + nu y + lambda z + c`` on the whole raster."""
     return template.points(relief) @ bas_relief[:3] + bas_relief[3]
 
 

@@ -220,7 +220,7 @@ def _run(program: Path, folder: Path, deadline: Deadline, threads: int, step: St
 
 
 def _explained(step: str, error: ReconstructionError) -> ReconstructionError:
-    """Give the usual cause of a failing step."""
+    """Return the usual cause of a failing step."""
     lines = f"colmap {step}: {error}"
     if "requires CUDA" in str(error) or "CUDA error" in str(error):
         lines = (

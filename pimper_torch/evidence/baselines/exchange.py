@@ -67,7 +67,6 @@ def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path
     left out.
 
     Args:
-        scene: Any.
         names: Of the written photographs, one a view.
         folder: Gets ``cameras.txt``, ``images.txt`` and ``points3D.txt``.
 
@@ -102,7 +101,7 @@ def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path
 
 
 def _observations(scene: SparseScene) -> tuple[list[str], list[str]]:
-    """Give the line of observations of every view, and the line of every observed point."""
+    """Return the line of observations of every view, and the line of every observed point."""
     points = scene.points_world.detach().cpu().double()
     cameras = scene.cameras
     pixels, _ = project(
@@ -157,7 +156,7 @@ def read_surface(path: Path, program: str, printed: str) -> Mesh:
 
 
 def estimate_of(mesh: Mesh, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
-    """Give the estimate of a surface in the scene's frame, with the scene's cameras."""
+    """Return the estimate of a surface in the scene's frame, with the scene's cameras."""
     like = scene.points_world
     return Estimate(
         mesh=mesh.replace(

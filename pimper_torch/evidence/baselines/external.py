@@ -97,7 +97,7 @@ class Deadline:
 
 @contextmanager
 def workspace(method: str, keep_in: Path | None) -> Iterator[Path]:
-    """Give an empty folder to exchange files in; it is removed at the end, come what may.
+    """Return an empty folder to exchange files in; it is removed at the end, come what may.
 
     Args:
         method: Begins the folder's name.

@@ -238,8 +238,6 @@ def fix_ambiguity(matrix: Matrix, whole: Whole, min_views: int) -> Whole:
     that fit them best.
 
     Args:
-        matrix: With the normals.
-        whole: Its factors.
         min_views: Samples that fewer views see are ignored.
     """
     often = matrix.seen.sum(dim=0) >= min_views
@@ -312,7 +310,7 @@ def _well_seen(matrix: Matrix, min_views: int, number: int) -> Matrix:
 
 
 def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tensor, "4 sample"]:
-    """Give shading vectors with the matrix's normals and the albedo that fits them best."""
+    """Return shading vectors with the matrix's normals and the albedo that fits them best."""
     parts = []
     for part in chunks(matrix.seen.shape[1]):
         some = matrix.columns(part)
@@ -324,7 +322,7 @@ def _best_shading(matrix: Matrix, lights: Float[Tensor, "view 4"]) -> Float[Tens
 
 
 def last_step(matrix: Matrix, whole: Whole, min_views: int) -> WholePhotometry:
-    """Give every sample's minimum, and the inverse variance of its normal."""
+    """Return every sample's minimum, and the inverse variance of its normal."""
     lit = matrix.seen.sum(dim=0) >= min_views
     none = torch.zeros(1, dtype=torch.long, device=lit.device)
     convergence = Convergence(iterations=none, residual=none.to(whole.lights), cause=none)

@@ -223,7 +223,7 @@ def relief_from(
 
 
 def edges_of(points: Float[Tensor, "point 3"]) -> Float[Tensor, "span 2 3"]:
-    """Give the ends of the edges of a triangulation of the points' x and y."""
+    """Return the ends of the edges of a triangulation of the points' x and y."""
     edges, _ = face_edges(delaunay(points[:, :2]))
     return points[edges]
 
@@ -252,7 +252,7 @@ def spans_between(
 
 
 def bas_relief_matrix(bas_relief: Float[Tensor, " 4"]) -> Float[Tensor, "3 3"]:
-    """Give what ``z' = mu x + nu y + lambda z`` does to albedo times normal."""
+    """Return what ``z' = mu x + nu y + lambda z`` does to albedo times normal."""
     mu, nu, scale, _ = bas_relief.tolist()
     return bas_relief.new_tensor([[scale, 0, -mu], [0, scale, -nu], [0, 0, 1]])
 
@@ -284,7 +284,7 @@ def thinned(template: Template) -> Mesh:
 def relief_normals(
     depth: Float[Tensor, "height width"], template: Template
 ) -> Float[Tensor, "height width 3"]:
-    """Give the viewer-facing normals of a height field by central differences."""
+    """Return the viewer-facing normals of a height field by central differences."""
     down, right = torch.gradient(depth, spacing=float(template.spacing))
     return normalize(torch.stack([right, down, -torch.ones_like(depth)], dim=-1), dim=-1)
 

@@ -53,7 +53,7 @@ def chunks(num_samples: int) -> list[slice]:
 def as_problem(
     matrix: Matrix, lights: Float[Tensor, "view 4"], shading: Float[Tensor, "4 sample"]
 ) -> Bilinear:
-    """Give the published problem, without priors and robust weights, as a batch of one patch."""
+    """Return the published problem, without priors and robust weights, as a batch of one patch."""
     views = lights.new_zeros(1, len(lights))
     return Bilinear(
         radiance=matrix.radiance[None],

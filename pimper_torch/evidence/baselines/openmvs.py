@@ -152,7 +152,7 @@ class _Run:
         return path, printed
 
     def _names_points(self) -> bool:
-        """Tell whether the dense points are passed to the program beside the scene."""
+        """Return whether the dense points are passed to the program beside the scene."""
         try:
             help_text = run_program(
                 [self._found[RECONSTRUCT], "--help"], self._folder, self._deadline, threads=1

@@ -145,7 +145,7 @@ def write_cameras(cameras: Cameras, folder: Path, level: int) -> None:
 
 
 def projections(cameras: Cameras, level: int) -> Float[Tensor, "view 3 4"]:
-    r"""Give the matrices that map homogeneous world points to PMVS2's pixels, in float64.
+    r"""Return the matrices that map homogeneous world points to PMVS2's pixels, in float64.
 
     PMVS2 counts pixels from the centre of the top-left one. Climbing its pyramid it halves
     coordinates, as if centres stayed centres, while it averages pixels :math:`2x-1` to

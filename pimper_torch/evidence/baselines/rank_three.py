@@ -41,7 +41,7 @@ class Rank3(Record):
     vectors: Float[Tensor, "3 sample"]
 
     def moved(self, matrix: Float[Tensor, "3 3"]) -> "Rank3":
-        """Give ``L A^-1`` and ``A B``, whose product is the same."""
+        """Return ``L A^-1`` and ``A B``, whose product is the same."""
         move = matrix.double()
         return Rank3(
             lights=(self.lights.double() @ torch.linalg.inv(move)).to(self.lights),
@@ -55,7 +55,7 @@ def factorize_rank_three(
     alternations: int,
     tolerance: float = 1e-5,
 ) -> Float[Tensor, "view 3"]:
-    """Give the lights of the masked rank-three factorization.
+    """Return the lights of the masked rank-three factorization.
 
     Missing entries are filled with a sample's brightness times a view's, then with the
     rank-three part of the filled matrix in turn; weighted alternation follows until the
@@ -155,7 +155,7 @@ def ambiguity_between_points(
 def matrix_between_lights(
     lights: Float[Tensor, "view 3"], known: Float[Tensor, "view 3"]
 ) -> Float[Tensor, "3 3"]:
-    """Give the matrix that aligns a factorization with known lights.
+    """Return the matrix that aligns a factorization with known lights.
 
     Lights, not normals: those of a coarse surface are smoother than the true ones, and what
     turns the vectors along them may have no rank. Each light counts with its own size.
@@ -199,7 +199,7 @@ def _residual(
     step: Float[Tensor, "span 3"],
     known: Bool[Tensor, " span"],
 ) -> tuple[Float[Tensor, " span"], Float[Tensor, "span 9"]]:
-    """Give the residuals of the points' depths, and their derivative by A."""
+    """Return the residuals of the points' depths, and their derivative by A."""
     rotated = b @ matrix.mT
     # A sample without a vector has no slope; its share is 0, but it must stay finite.
     steepest = -(rotated.norm(dim=-1) / STEEPEST).clamp_min(1e-12)

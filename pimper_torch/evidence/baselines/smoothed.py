@@ -108,11 +108,10 @@ class Smoothed(Stage):
 def thin_plate(
     subdivision: Subdivision, mesh: Mesh, weights: Float[Tensor, " corner"]
 ) -> Float[Tensor, "vertex 3"]:
-    """Give the positions of the subdivided mesh's vertices on the surface of least bending.
+    """Return the positions of the subdivided mesh's vertices on the surface of least bending.
 
     Args:
         subdivision: Of the coarse mesh.
-        mesh: The coarse mesh.
         weights: ``w`` of its vertices; one at least, in every piece, above 0.
 
     Raises:
@@ -153,7 +152,7 @@ def thin_plate(
 def _gram(
     entries: Entries, num_rows: int, num_columns: int
 ) -> tuple[Int[Tensor, " product"], Int[Tensor, " product"], Float[Tensor, " product"]]:
-    """Give ``B^T B`` of a sparse matrix; duplicate entries add up."""
+    """Return ``B^T B`` of a sparse matrix; duplicate entries add up."""
     rows, cols, values = (part.cpu().numpy() for part in entries)
     matrix = coo_array((values, (rows, cols)), shape=(num_rows, num_columns)).tocsr()
     gram = (matrix.T @ matrix).tocoo()
@@ -166,7 +165,7 @@ def _gram(
 
 
 def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entries:
-    """Give the second differences along the border, in the plate's units."""
+    """Return the second differences along the border, in the plate's units."""
     ends = _rim_edges(subdivision.faces)
     count = len(subdivision.points)
     # Every vertex of the rim with one edge in and one out has a second difference.

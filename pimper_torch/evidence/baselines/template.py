@@ -57,7 +57,7 @@ class Template(Record):
     inside: Bool[Tensor, "height width"]
 
     def points(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
-        """Give the samples' positions at some depth, template frame."""
+        """Return the samples' positions at some depth, template frame."""
         height, width = depth.shape
         xy = self.origin + self.spacing * (pixel_centers(width, height, like=depth) - 0.5)
         return torch.cat([xy, depth[..., None]], dim=-1)
@@ -75,7 +75,6 @@ def lay_template(
 
     Args:
         mesh: Its own vertex normals are blended if it has some.
-        cameras: Of all views.
         reference: The one that the raster faces.
         samples_per_pixel: Samples per pixel of the reference view, at the median depth of
             the mesh.
@@ -158,9 +157,6 @@ def register(
     """Resample all views on the template, one at a time.
 
     Args:
-        template: Where.
-        views: Photographs.
-        cameras: Theirs.
         occluder: What may hide samples from a view; the template's mesh, or a coarser one.
         config: Which samples a view may contribute; the tilt is that of the mesh's normals.
 
@@ -188,7 +184,7 @@ def register(
 def registered_views(
     template: Template, views: Views, cameras: Cameras, occluder: Mesh, config: WarpConfig
 ) -> Iterator[tuple[Float[Tensor, "channel sample"], Bool[Tensor, " sample"]]]:
-    """Give the radiance of the template's samples in every view in turn, and which are seen."""
+    """Return the radiance of the template's samples in every view in turn, and which are seen."""
     # The raster's plane is independent of the tilt of the surface.
     warp = Warp(dataclasses.replace(config, max_tilt_deg=89.9))
     tiles = _tiles(template)
@@ -221,7 +217,6 @@ def fit_colours(
 
     Args:
         seen: See :func:`registered_views`; one view is in memory at a time.
-        lights: One a view.
         basis: What the lights are linear in, ``(1, n)`` or ``n``; shading below zero is none.
     """
     product: Tensor | None = None
@@ -262,7 +257,6 @@ def surface_of(
         depth: Template frame.
         normals: Unit, template frame, of the samples inside.
         albedo: Of the samples inside.
-        confidence: The same.
 
     Raises:
         ReconstructionError: No triangle is left.
@@ -292,7 +286,6 @@ def raster_faces(
 
     Args:
         inside: Samples that are vertices; a triangle needs three.
-        depth: Of the samples.
         cliff: Greatest difference of depth between two corners.
 
     Returns:

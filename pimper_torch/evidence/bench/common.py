@@ -26,7 +26,6 @@ def with_common(
     """Add figures over the pixels that all methods cover to the rows of a scene.
 
     Args:
-        rows: One a method.
         covered: True where rays of the view meet truth and method; ``None`` for methods
             without a surface, which limit no other.
         meshes: The surfaces as files, in the frame of the truth.

@@ -48,7 +48,6 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
 
     Args:
         name: Of a rendered scene, or a folder with ``truth`` in it.
-        config: Of the bench.
         workspace: Where a rendering goes.
 
     Raises:
@@ -65,7 +64,6 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
 
     Args:
         folder: Of the scene.
-        config: Of the bench.
         cache: Folder where models are kept; the seconds of one from there are those that it
             took to find.
 

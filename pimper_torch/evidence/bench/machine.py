@@ -37,7 +37,7 @@ class Machine(Record):
 
     @property
     def summary(self) -> str:
-        """Give a summary in a line.
+        """Return a summary in a line.
 
         >>> this_machine().summary  # doctest: +SKIP
         'AMD EPYC 7763, 2 cores, 23 GB; Linux; Python 3.11.7; pimper_torch 0.1.0, torch 2.13.0'

@@ -36,8 +36,6 @@ def method_panels(
         mesh: In the frame of the truth.
         met: Where the rays of the reference view meet it; ``None`` if none does.
         inputs: What it was made from.
-        scene: Name.
-        method: Name.
         heatmap: Where the errors are drawn, as PNG.
     """
     truth = inputs.maps
@@ -55,7 +53,7 @@ def method_panels(
 
 
 def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
-    """Give a scene's row: photograph, truth, and the panels of all methods."""
+    """Return a scene's row: photograph, truth, and the panels of all methods."""
     maps = inputs.maps
     assert maps.cameras is not None
     assert maps.truth.normals_world is not None
@@ -70,7 +68,7 @@ def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> 
 
 
 def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
-    """Give the distance of a surface from the truth along the rays of a view.
+    """Return the distance of a surface from the truth along the rays of a view.
 
     Args:
         met: The surface and the truth.

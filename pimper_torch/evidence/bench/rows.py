@@ -92,8 +92,6 @@ def row_of_failure(scene: str, method: str, error: Exception, **known: int | flo
     """Make the row of a method that gave no surface.
 
     Args:
-        scene: Name.
-        method: Name.
         error: What stopped it; a missing program is no failure.
         known: Fields that are known all the same, such as ``minutes``.
     """

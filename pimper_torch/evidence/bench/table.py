@@ -79,7 +79,7 @@ _SURFACE = (
 
 
 def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
-    """Give the columns that some row has a figure for, by what they are about."""
+    """Return the columns that some row has a figure for, by what they are about."""
 
     def known(columns: Sequence[Column]) -> tuple[Column, ...]:
         return tuple(
@@ -154,7 +154,7 @@ def _line(words: Sequence[str], widths: Sequence[int], right: Sequence[bool]) ->
 
 
 def terminal(table: Table) -> Group:
-    """Give tables no wider than the terminal, then why figures are missing.
+    """Return tables no wider than the terminal, then why figures are missing.
 
     A row without any figure of a table's kind is left out of that table.
     """
@@ -211,7 +211,7 @@ def legend(table: Table) -> list[str]:
 
 
 def short_note(row: Row) -> str:
-    """Give the first line of a note, cut to a cell's width; the JSON file has the whole."""
+    """Return the first line of a note, cut to a cell's width; the JSON file has the whole."""
     lines = row.note.strip().splitlines()
     first = lines[0] if lines else ""
     return first if len(first) <= _NOTE_LENGTH else first[: _NOTE_LENGTH - 1].rstrip() + "…"

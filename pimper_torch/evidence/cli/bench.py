@@ -77,7 +77,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def _inputs(job: _Job) -> dict[str, Path | None]:
-    """Give what the bench reads, by what it is called."""
+    """Return what the bench reads, by what it is called."""
     names = (*job.config.scenes, *(job.config.methods or ()))
     paths = {name: Path(name) for name in names}
     return {"--cache": job.cache, **{name: path for name, path in paths.items() if path.exists()}}

@@ -256,7 +256,7 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
 
 
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
-    """Give points of the true surface, at most a hundred thousand, or ``None``."""
+    """Return points of the true surface, at most a hundred thousand, or ``None``."""
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
     if points is None or len(points) <= _MAX_POINTS:
         return points
@@ -265,7 +265,7 @@ def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
 
 
 def describe(capture: Capture, job: Job) -> str:
-    """Tell what was read and where it is now."""
+    """Report what was read and where it is now."""
     sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
     count, positions, lights = (

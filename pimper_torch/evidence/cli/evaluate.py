@@ -83,7 +83,7 @@ class EvaluateOptions:
     icp_distance: Literal["plane", "point"] = "plane"
 
     def config(self) -> EvaluateConfig:
-        """Give the settings of the evaluation.
+        """Return the settings of the evaluation.
 
         Raises:
             ConfigError: An impossible value.

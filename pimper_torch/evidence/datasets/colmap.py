@@ -95,7 +95,6 @@ def write_colmap(
 
     Args:
         views: Undistorted.
-        cameras: One a view.
         folder: Made if it is not there.
         points_world: A cloud to put in the model, without tracks and black.
 

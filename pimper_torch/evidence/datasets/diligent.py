@@ -89,7 +89,6 @@ def read_diligent(
     ``bearPNG`` are known to be faulty; leave them out by ``lights=range(21, 97)``.
 
     Args:
-        folder: Of one object.
         lights: Read these lights only, from 1.
         light_seed: Read one light, chosen by this seed; ``None`` reads all.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
@@ -150,9 +149,6 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     unknown) are optional. On the five DiLiGenT objects the turned normals agree with those of
     the true depth to 0.8 to 3.9 degrees in the mean, and with no other choice of signs to
     better than 38. ``K`` counts pixel centres from 0.
-
-    Args:
-        folder: Of one object.
 
     Raises:
         InputError: Another layout; names what was expected and what was found.
@@ -237,7 +233,7 @@ def decoded_normals(path: Path, kind: str) -> Float[Tensor, "height width 3"]:
 def directed_lights(
     directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4"]:
-    """Give the first-order light of distant point lights without any ambient light."""
+    """Return the first-order light of distant point lights without any ambient light."""
     directed = strength[:, None] * directions_world
     return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
 

@@ -55,7 +55,6 @@ def read_diligent_mv(
     where they do with the files' own product. ``KK`` counts pixel centres from 0.
 
     Args:
-        folder: Of one object.
         positions: Read these views only, from 1.
         lights: Read these lights only, from 1.
         light_seed: Read one light a view, chosen by this seed; ``None`` reads all, 20 x 96

@@ -28,9 +28,6 @@ def dtu_capture(
     """Read photographs and give each the camera of its position.
 
     Args:
-        paths: Of the photographs.
-        positions: Of each.
-        point_lights: Of each.
         cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
             the different positions in ascending order.
         truth: Of the scene.

@@ -45,7 +45,6 @@ def read_idr(
     0, so half a pixel is added.
 
     Args:
-        folder: Of the set.
         camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
             ``cameras_large.npz``.
         options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. A mesh has the
@@ -80,7 +79,6 @@ def read_scale_mats(
     """Read ``scale_mat_i``: ``world_from_unit``, from the unit sphere to the world.
 
     Args:
-        folder: Of the set.
         camera_file: As for :func:`read_idr`.
 
     Raises:
@@ -104,7 +102,6 @@ def write_idr(
 
     Args:
         views: Undistorted.
-        cameras: One a view.
         folder: Made if it is not there.
         points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
             them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
@@ -136,7 +133,7 @@ def unit_sphere(
     points_world: Float[Tensor, "point 3"] | None = None,
     masks: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "4 4"]:
-    """Give ``world_from_unit`` of a sphere that holds the object.
+    """Return ``world_from_unit`` of a sphere that holds the object.
 
     With points it is centred on their bounding box, and nine tenths of its radius reach the
     farthest. Without, it is centred where the optical axes come nearest to one another (in
@@ -194,7 +191,7 @@ def _reach(
     masks: Bool[Tensor, "view height width"] | None,
     view: int,
 ) -> float:
-    """Tell how far a view's mask, or image, reaches from a point, at the depth of the point."""
+    """Find how far a view's mask, or image, reaches from a point, at the depth of the point."""
     pose = cameras.cam_from_world[view].detach().cpu().double()
     K = cameras.intrinsics[view].detach().cpu().double()
     width, height = (float(side) for side in cameras.sizes_px[view])

@@ -17,7 +17,6 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
     """Read numeric arrays of a MATLAB file (up to version 7).
 
     Args:
-        path: The file.
         names: Of the variables wanted.
         kind: The data set, for messages.
 
@@ -74,7 +73,6 @@ def read_toolbox_projections(
 
     Args:
         path: ``Calib_Results.mat``.
-        numbers: Of the views.
         kind: The data set, for messages.
 
     Returns:

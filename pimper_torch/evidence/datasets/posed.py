@@ -156,7 +156,6 @@ def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cam
 
     Args:
         views: Any; padding stays zero.
-        cameras: One a view.
         max_size_px: The longest side; 0 leaves all as they are.
     """
     full = views.sizes_px.tolist()
@@ -223,7 +222,7 @@ def image_files(folder: Path, kind: str) -> list[Path]:
 
 
 def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]:
-    """Give a function that finds the mask of a photograph in a folder.
+    """Return a function that finds the mask of a photograph in a folder.
 
     A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
     or begins with that name and goes on with ``-``, ``_`` or a dot (``17-mask.png``).
@@ -286,7 +285,7 @@ def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
 
 
 def _read_mask(path: Path) -> Float[Tensor, "height width"]:
-    """Give 1 on the object: where a mask is opaque, or at least half as bright as it gets."""
+    """Return 1 on the object: where a mask is opaque, or at least half as bright as it gets."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; needed: the mask of a photograph.")
     decoded = decode(path)

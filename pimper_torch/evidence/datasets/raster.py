@@ -94,7 +94,7 @@ def _read_masks(
 
 
 def there(path: Path) -> Path:
-    """Give the path of a file that a data set should hold, or refuse."""
+    """Return the path of a file that a data set should hold, or refuse."""
     if not path.is_file():
         raise InputError(
             f"{path}: there is no such file, though the data set should hold it. Unpack the data "

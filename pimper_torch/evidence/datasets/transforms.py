@@ -78,7 +78,6 @@ def write_transforms(
 
     Args:
         views: Undistorted.
-        cameras: One a view.
         folder: Made if it is not there.
         points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
 

@@ -69,7 +69,6 @@ def align_estimate(
             there (from the identity, if there are not two pairs of cameras) and fits the
             surfaces, see :func:`pimper_torch.evidence.metrics.icp.trimmed_icp`. ``auto`` is
             ``cameras`` where there are at least two pairs of cameras, else ``none``.
-        icp: Its settings.
         generator: On the CPU; draws the samples of ``icp``.
 
     Raises:
@@ -109,7 +108,7 @@ def align_estimate(
 
 
 def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Cameras] | None:
-    """Give the cameras of the views that both have, turned alike; ``None`` if there are none."""
+    """Return the cameras of the views that both have, turned alike; ``None`` if there are none."""
     if estimate.cameras is None or capture.cameras is None:
         return None
     try:

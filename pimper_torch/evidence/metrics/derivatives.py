@@ -188,7 +188,7 @@ def _differences(
 
 
 def _rounding(values: Tensor, step: float) -> Tensor:
-    """Give what is left of a difference of equal values over a step."""
+    """Return what is left of a difference of equal values over a step."""
     return _ROUNDINGS * torch.finfo(values.dtype).eps * values.abs().max() / step
 
 

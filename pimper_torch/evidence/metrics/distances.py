@@ -114,8 +114,6 @@ class TrueSurface:
         capture: With the true mesh or points, and its cameras for what is seen.
         seen_from: How many positions of the camera must see a true point that is counted as
             seen; see :func:`pimper_torch.evidence.metrics.visible.count_seeing`.
-        samples: On each surface.
-        seed: Of their positions.
 
     Raises:
         InputError: There is no true surface, or it has no extent.
@@ -181,7 +179,7 @@ class TrueSurface:
 
 
 def true_surface(capture: Capture) -> Mesh:
-    """Give the true mesh of the object, or its points as a mesh without faces.
+    """Return the true mesh of the object, or its points as a mesh without faces.
 
     Raises:
         InputError: There is neither.
@@ -195,7 +193,7 @@ def true_surface(capture: Capture) -> Mesh:
 
 
 def bounding_diagonal(mesh: Mesh) -> float:
-    """Give the diagonal of the box, along the axes of the world, round what a mesh shows.
+    """Return the diagonal of the box, along the axes of the world, round what a mesh shows.
 
     Vertices without a face count only where there are no faces at all.
     """

@@ -67,7 +67,6 @@ def dtu_figures(
     Args:
         mesh: In the frame of the set, millimetres.
         scan: The set's own points, thinned already.
-        protocol: Of the scan.
         generator: On the CPU; the published code draws without a seed.
 
     Raises:
@@ -106,7 +105,7 @@ def dtu_figures(
 
 
 def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Tensor, " point"]:
-    """Tell which points lie in a voxel of the observability mask."""
+    """Find which points lie in a voxel of the observability mask."""
     mask = protocol.obs_mask.cpu()
     lower = protocol.bounding_box[0].to(points)
     # Halves round up, as in Matlab; torch's own rounding takes them to even numbers.
@@ -118,7 +117,7 @@ def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Te
 
 
 def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
-    """Give the vertices, and a subdivided mesh on each face about ``distance`` apart.
+    """Return the vertices, and a subdivided mesh on each face about ``distance`` apart.
 
     The subdivided mesh is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
     ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
@@ -159,7 +158,7 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
 def _near(
     points: Float[Tensor, "point 3"], others: Float[Tensor, "other 3"], protocol: DtuProtocol
 ) -> Float[Tensor, " near"]:
-    """Give distances to the nearest of the others, of the points that count."""
+    """Return distances to the nearest of the others, of the points that count."""
     lower, upper = protocol.bounding_box.to(points)
     reach = lower + _CELL_MM * (((upper - lower) / _CELL_MM).floor() + 1)
     asked = points[((points >= lower) & (points < reach)).all(dim=1)]

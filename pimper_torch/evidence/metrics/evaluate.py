@@ -109,7 +109,6 @@ def evaluate(
     Args:
         estimate: In a frame of its own.
         capture: The truth; its views may be a part of those the estimate was made from.
-        config: Settings.
         surface: That of ``capture``, where many estimates are measured against it; see
             :func:`prepared_surface`.
         maps: The same data set with the maps of the views to compare in, where ``capture``
@@ -153,7 +152,7 @@ def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | 
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
-    """Give the indices of the views to compare in.
+    """Return the indices of the views to compare in.
 
     Raises:
         InputError: A view that was asked for is not in the truth.

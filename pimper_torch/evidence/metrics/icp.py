@@ -89,10 +89,8 @@ def trimmed_icp(
     look at the scale that is reported.
 
     Args:
-        mesh: The estimate.
         truth: Surface or point cloud; with its surroundings, if the estimate may have them.
         start: ``truth_from_world`` to begin with.
-        config: Settings.
         generator: On the CPU.
 
     Source: Chetverikov, Stepanov & Krsek, IVC 23(3), 2005, for trimming; Chen & Medioni,

@@ -147,7 +147,7 @@ def figures_of(
 
 
 def true_maps(capture: Capture, view: int) -> TrueMaps | None:
-    """Give depth and normals of a view, from the truth's maps or by casting its mesh."""
+    """Return depth and normals of a view, from the truth's maps or by casting its mesh."""
     truth, cameras = capture.truth, capture.cameras
     where = None
     if truth.foreground is not None:

@@ -19,7 +19,7 @@ def mean_angular_error_deg(
     normals_true: Float[Tensor, "height width 3"],
     mask: Bool[Tensor, "height width"],
 ) -> float:
-    """Give DiLiGenT's MAE: the mean angle between normals over all pixels of the mask.
+    """Return DiLiGenT's MAE: the mean angle between normals over all pixels of the mask.
 
     Both maps are in one frame. A pixel of the mask that the estimate leaves without a normal
     (zero or not finite) counts as 90 degrees off, so that no method gains by silence.
@@ -50,7 +50,7 @@ def mean_absolute_depth_error(
     alignment: DepthAlignment,
     mask: Bool[Tensor, "height width"] | None = None,
 ) -> float:
-    """Give MADE, the mean absolute error of integrated depth, in units of the true depth.
+    """Return MADE, the mean absolute error of integrated depth, in units of the true depth.
 
     Integration leaves one number open, which the alignment fixes by a median, as it is
     published: of the ratios ``true / estimated`` under perspective projection
@@ -59,8 +59,6 @@ def mean_absolute_depth_error(
 
     Args:
         depth: Of the estimate; NaN or infinite where there is none.
-        depth_true: The same.
-        alignment: Of the two.
         mask: Where to compare; wherever both are known, if not given.
 
     Raises:

@@ -16,7 +16,7 @@ _ACROSS, _SOUND_DEG, _EXCESS_DEG = 21, 3.0, 5.0
 def pitted_percent(
     angle_deg: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
 ) -> float:
-    """Give the fraction of known pixels that are 5 degrees further off than those around them.
+    """Return the fraction of known pixels that are 5 degrees further off than those around them.
 
     Those around, 21 x 21 pixels, must be less than 3 degrees off in the mean.
 

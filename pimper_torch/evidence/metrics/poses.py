@@ -116,7 +116,7 @@ def compare_cameras(
 def _positions(
     ours: Cameras, truth: Cameras, points_true: Float[Tensor, "point 3"]
 ) -> tuple[Float[Tensor, "position 3"], Float[Tensor, "position 3"]]:
-    """Give where our cameras put points that the true ones have in their images, and these."""
+    """Return where our cameras put points that the true ones have in their images, and these."""
     pixels, depth = project(
         points_true, truth.cam_from_world.double().cpu(), truth.intrinsics.double().cpu()
     )
@@ -134,6 +134,6 @@ def _positions(
 
 
 def _focal(cameras: Cameras) -> Float[Tensor, " view"]:
-    """Give the mean focal length in units of the image's longer side."""
+    """Return the mean focal length in units of the image's longer side."""
     both = cameras.intrinsics.double().cpu().diagonal(dim1=-2, dim2=-1)[:, :2]
     return both.mean(dim=1) / cameras.sizes_px.cpu().amax(dim=1)

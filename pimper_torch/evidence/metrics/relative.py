@@ -19,7 +19,7 @@ from pimper_torch.records import Cameras, Mesh, Record
 def relative_error(
     points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
 ) -> Float[Tensor, ""]:
-    r"""Give the error of points as a percentage of the true points' spread.
+    r"""Return the error of points as a percentage of the true points' spread.
 
     .. math:: 100 \lVert S - \hat S \rVert_F / \lVert S - \bar S \rVert_F
 
@@ -73,7 +73,6 @@ def compare_in_view(
         mesh: The result. Its own vertex normals are compared if it has some.
         truth_from_world: Similarity; see :mod:`pimper_torch.evidence.metrics.similarity`.
         cameras_true: World frame and scene units of the truth.
-        view: One of them.
         depth_true: Along that camera's z; infinite where there is nothing.
         normals_true: Unit, outward, frame of the truth.
         where: Restricts the comparison, to the object without its table for instance.
@@ -157,10 +156,8 @@ def meet_in_view(
     """Cast the rays of a true camera on a mesh put in the frame of the truth.
 
     Args:
-        mesh: The result.
         truth_from_world: Similarity.
         cameras_true: World frame and scene units of the truth.
-        view: One of them.
         depth_true: Along that camera's z; infinite where there is nothing.
         where: Restricts the comparison.
 
@@ -212,7 +209,7 @@ def _padded(hits: Hits, rows: int, columns: int) -> Hits:
 def angles_deg(
     normals: Float[Tensor, "*batch 3"], normals_true: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Give the angles between vectors, accurate also where they nearly agree."""
+    """Return the angles between vectors, accurate also where they nearly agree."""
     sine = torch.linalg.cross(normals, normals_true).norm(dim=-1)
     cosine = (normals * normals_true).sum(dim=-1)
     return torch.rad2deg(torch.atan2(sine, cosine))

@@ -32,7 +32,7 @@ class Row:
 
 
 def report(evaluation: Evaluation) -> dict[str, object]:
-    """Give all figures as plain mappings, lists and numbers; what is not finite is ``None``.
+    """Return all figures as plain mappings, lists and numbers; what is not finite is ``None``.
 
     Names are those of the records; those that end in ``_percent``, ``_deg`` are in these
     units, the other lengths in scene units of the truth, and those of ``dtu`` in millimetres.
@@ -43,7 +43,7 @@ def report(evaluation: Evaluation) -> dict[str, object]:
 
 
 def rows(evaluation: Evaluation) -> list[tuple[str, list[Row]]]:
-    """Give the figures as a table: its sections with their rows, none of them empty."""
+    """Return the figures as a table: its sections with their rows, none of them empty."""
     sections: list[tuple[str, Iterator[Row]]] = [("alignment", _alignment_rows(evaluation))]
     if evaluation.surface is not None:
         sections.append(("surface", _surface_rows(evaluation.surface)))

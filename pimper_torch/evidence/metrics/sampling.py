@@ -43,7 +43,6 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
 
     Args:
         mesh: A cloud gives its points, all of them if they are no more than ``count``.
-        count: How many points.
         generator: On the CPU.
 
     Raises:

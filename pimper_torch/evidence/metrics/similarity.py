@@ -51,7 +51,7 @@ def pair_views(
 
 
 def _stems(names: Sequence[str]) -> dict[str, int]:
-    """Give the index of every stem that one name alone has."""
+    """Return the index of every stem that one name alone has."""
     stems = [PurePath(name).stem for name in names]
     counts = Counter(stems)
     return {stem: index for index, stem in enumerate(stems) if counts[stem] == 1}
@@ -60,7 +60,7 @@ def _stems(names: Sequence[str]) -> dict[str, int]:
 def similarity_between_points(
     points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
 ) -> Float[Tensor, "4 4"]:
-    """Give the similarity that carries points nearest to true ones, in least squares.
+    """Return the similarity that carries points nearest to true ones, in least squares.
 
     Solved in float64. Three points not on a line determine it; fewer leave a rotation open.
 
@@ -74,7 +74,7 @@ def similarity_between_points(
 
 
 def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "4 4"]:
-    """Give the similarity that carries our cameras nearest to the true ones.
+    """Return the similarity that carries our cameras nearest to the true ones.
 
     Scale and translation are Umeyama's on the cameras' centres. Centres on a line leave a
     rotation about it open, and an arc nearly does; so the rotation is fitted to the centres
@@ -115,7 +115,7 @@ def camera_correlation(
 
 
 def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Give the rotation ``R`` with the greatest ``trace(R^T matrix)``; never a reflection."""
+    """Return the rotation ``R`` with the greatest ``trace(R^T matrix)``; never a reflection."""
     U, _, Vh = torch.linalg.svd(matrix)
     mirror = torch.ones(3).to(U)
     mirror[2] = torch.linalg.det(U @ Vh).sign()
@@ -125,14 +125,14 @@ def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 def split_similarity(
     target_from_source: Float[Tensor, "4 4"],
 ) -> tuple[float, Float[Tensor, "3 3"]]:
-    """Give the scale and the rotation of a similarity."""
+    """Return the scale and the rotation of a similarity."""
     linear = target_from_source[:3, :3]
     scale = float(torch.linalg.det(linear)) ** (1 / 3)
     return scale, linear / scale
 
 
 def rotation_angles_deg(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Give the angle of rotations, accurate for the smallest too."""
+    """Return the angle of rotations, accurate for the smallest too."""
     skew = rotation - rotation.mT
     sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1)
     cosine = rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1

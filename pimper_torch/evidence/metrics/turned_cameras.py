@@ -45,7 +45,7 @@ def standing_as(ours: Cameras, truth: Cameras) -> Cameras:
 
 
 def _quarters(ours: Cameras, truth: Cameras, rotation: Float[Tensor, "3 3"]) -> list[int]:
-    """Give the clockwise quarters that bring each camera nearest to the true one."""
+    """Return the clockwise quarters that bring each camera nearest to the true one."""
     axes = ours.cam_from_world[:, :3, :3].double() @ rotation.mT
     between = truth.cam_from_world[:, :3, :3].double() @ axes.mT
     angle = torch.atan2(between[:, 1, 0] - between[:, 0, 1], between[:, 0, 0] + between[:, 1, 1])

@@ -25,7 +25,6 @@ def count_seeing(
     once, however many lights they were taken under.
 
     Args:
-        samples: Of the truth.
         capture: Cameras, and what hides.
         diagonal: Of the object's bounding box, scene units.
 

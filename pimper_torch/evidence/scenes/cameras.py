@@ -23,7 +23,7 @@ def look_at(
     target_world: Float[Tensor, " 3"],
     up_world: Float[Tensor, " 3"],
 ) -> Float[Tensor, "view 4 4"]:
-    """Give ``cam_from_world`` of cameras that look at one point and are held upright."""
+    """Return ``cam_from_world`` of cameras that look at one point and are held upright."""
     forward = normalize(target_world - eyes_world, dim=-1)
     right = normalize(torch.linalg.cross(forward, up_world.expand_as(forward)), dim=-1)
     down = torch.linalg.cross(forward, right)
@@ -34,7 +34,7 @@ def look_at(
 def pinholes(
     cam_from_world: Float[Tensor, "view 4 4"], focal_px: float, width: int, height: int
 ) -> Cameras:
-    """Give cameras of one focal length whose axis meets the centre of the image."""
+    """Return cameras of one focal length whose axis meets the centre of the image."""
     K = cam_from_world.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     num_views = len(cam_from_world)
     return Cameras(
@@ -48,7 +48,6 @@ def panned(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
     """Turn cameras about their centres, so that what was at the principal point is beside it.
 
     Args:
-        cameras: Any.
         shift_px: Where that is then, from the principal point. Without roll.
     """
     focal_px = cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
@@ -93,7 +92,6 @@ def arc_cameras(
     The defaults face the flat shapes of :mod:`pimper_torch.evidence.scenes.shapes` from above.
 
     Args:
-        num_views: How many photographs.
         width: Pixels.
         height: Pixels.
         focal_px: Pixels.
@@ -128,7 +126,7 @@ def arc_directions(
     front: tuple[float, float, float] = FRONT,
     up: tuple[float, float, float] = UP,
 ) -> Float[Tensor, "view 3"]:
-    """Give the unit directions from the target to the cameras of :func:`arc_cameras`."""
+    """Return the unit directions from the target to the cameras of :func:`arc_cameras`."""
     along = torch.linspace(-0.5, 0.5, num_views, dtype=torch.float64)
     azimuth = torch.deg2rad(span_deg * along)
     elevation = torch.deg2rad(elevation_deg + sway_deg * torch.sin(4 * torch.pi * along))
@@ -153,7 +151,6 @@ def handheld_directions(
     Args:
         num_views: Shared out between the rounds: the first third goes at the middle height,
             then higher, then lower.
-        generator: Of the irregularities.
         elevation_deg: Of the middle round; the others are 18 degrees higher and 14
             lower, none below 8 and above 75.
     """
@@ -180,7 +177,6 @@ def distance_to_fit(
 
     Args:
         toward_world: Unit, from the target to the cameras, which look at it.
-        points_world: The object.
         target_world: What the cameras look at.
         focal_px: Pixels.
         width: Pixels.
@@ -209,7 +205,6 @@ def aim_to_fit(
 
     Args:
         toward_world: Unit, from the target to the cameras.
-        points_world: The object.
         focal_px: Pixels.
         width: Pixels.
         height: Pixels.

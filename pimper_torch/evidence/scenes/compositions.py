@@ -34,7 +34,6 @@ def potato_on_table(
         num_views: On an arc at about 35 degrees over the table.
         width: Pixels.
         height: Pixels.
-        span_deg: Of the arc.
         flash: Irradiance of a point light on the camera itself.
         gloss: Fraction of light that the potato mirrors; 0.04 is varnish.
         contrast: Of the texture; see :func:`random_speckle`.

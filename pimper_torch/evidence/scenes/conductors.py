@@ -23,7 +23,7 @@ class Conductor:
     extinction: tuple[float, float, float]
 
     def reflectance(self, cosine: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch channel"]:
-        """Give the fraction of unpolarized light that is mirrored.
+        """Return the fraction of unpolarized light that is mirrored.
 
         Args:
             cosine: Between the light and what it falls on, 0 to 1.

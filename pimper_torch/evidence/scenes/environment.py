@@ -35,7 +35,7 @@ class Environment:
     scale: float = 1.0
 
     def __call__(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the radiance that arrives from unit directions of the world."""
+        """Return the radiance that arrives from unit directions of the world."""
         own = directions @ self.own_from_world.to(directions).mT
         placed = torch.einsum("wij,...j->...wi", self.windows.to(own), own)
         ahead, across, upward = placed.unbind(dim=-1)

@@ -62,12 +62,8 @@ def render_frame(
     rays over its area instead.
 
     Args:
-        stage: The objects.
-        cameras: All of them.
-        lights: All of them.
         view: Which to take.
         generator: Of the sensor's noise.
-        sensor: Its faults.
         interreflection: Light that comes by way of other surfaces.
     """
     look = _Look(stage, cameras, lights, view, sensor.exposure, interreflection)
@@ -151,7 +147,7 @@ class _Look:
 
 
 def _uneven(radiance: Float[Tensor, "height width channel"]) -> Bool[Tensor, " pixel"]:
-    """Mark pixels that differ from one beside, above or below them; one row an image."""
+    """Find pixels that differ from one beside, above or below them; one row an image."""
     level = radiance.clamp(0, 1).sqrt()
     marked = torch.zeros(radiance.shape[:2], dtype=torch.bool)
     across = (level[:, 1:] - level[:, :-1]).abs().amax(dim=-1) > _UNEVEN

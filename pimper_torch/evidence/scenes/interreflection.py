@@ -40,7 +40,7 @@ class Interreflection:
         self._faces = stage.mesh.faces
 
     def light(self, stage: Stage, point_light: PointLight) -> Float[Tensor, "vertex channel"]:
-        """Give what every vertex receives from other surfaces under a point light."""
+        """Return what every vertex receives from other surfaces under a point light."""
         sent = self._albedo * _direct(stage, point_light)[:, None]
         total = torch.zeros(self._fraction.shape[0], self._albedo.shape[1])
         for _ in range(self.bounces):
@@ -51,7 +51,7 @@ class Interreflection:
 
 
 def transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
-    """Give the fraction of each vertex' light that comes from each face, ``vertex face``.
+    """Return the fraction of each vertex' light that comes from each face, ``vertex face``.
 
     Where all faces have radiance 1, a row's sum is the irradiance of its vertex.
     """
@@ -73,7 +73,7 @@ def transfer(stage: Stage, num_rays: int, seed: int) -> csr_array:
 
 
 def _direct(stage: Stage, point_light: PointLight) -> Float[Tensor, " face"]:
-    """Give the irradiance of every face's centre by the point light alone."""
+    """Return the irradiance of every face's centre by the point light alone."""
     faces = stage.mesh.faces
     points = stage.mesh.vertices_world.float()[faces].mean(dim=1)
     normals = normalize(stage.vertex_normals[faces].mean(dim=1), dim=-1)

@@ -85,7 +85,7 @@ def rounded_cylinder(
     high: float,
     rounding: float,
 ) -> Float[Tensor, " point"]:
-    """Give the signed distance to an upright cylinder about the z axis with round edges.
+    """Return the signed distance to an upright cylinder about the z axis with round edges.
 
     Args:
         points: World.

@@ -26,7 +26,7 @@ class PointLight(Record):
     environment: Environment | None = None
 
     def surroundings(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Give the radiance that arrives from where there is no object; 0 without environment."""
+        """Return the radiance that arrives from where there is no object; 0 without environment."""
         if self.environment is None:
             return torch.zeros_like(directions)
         return self.ambient * self.environment(directions)
@@ -34,11 +34,10 @@ class PointLight(Record):
     def arriving(
         self, points: Float[Tensor, "*batch 3"], position: Float[Tensor, " 3"], irradiance: float
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-        """Give the direction to a light, and the irradiance across it, at points.
+        """Return the direction to a light, and the irradiance across it, at points.
 
         Args:
             points: World.
-            position: Of the light.
             irradiance: Of the light at the target.
         """
         toward = position - points
@@ -87,7 +86,7 @@ class Lights(Record):
     def harmonics_world(
         self, eyes_world: Float[Tensor, "view 3"] | None = None
     ) -> Float[Tensor, "view 4"]:
-        """Give the first-order light ``l`` at the target: radiance is albedo * l . (1, n).
+        """Return the first-order light ``l`` at the target: radiance is albedo * l . (1, n).
 
         Args:
             eyes_world: The cameras' centres, needed for the flash only.
@@ -116,15 +115,12 @@ def wandering_lights(
     """Carry a point light to another position for every photograph; float64.
 
     Args:
-        num_views: How many photographs.
         generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         spread_deg: Greatest angle from ``toward``.
         min_tilt_deg: Smallest angle from ``toward``.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        ambient: The same.
         flash: The same for every view.
-        target: What is lit.
         toward: Axis of the cone the point light moves in.
     """
     axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
@@ -167,9 +163,7 @@ def lights_round(
             point light's sweep in each photograph.
         generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
-        target: What is lit.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        ambient: The same.
         flash: The same for every view.
         far: The point light is so far away that its light comes from one direction and does not
             fall off.

@@ -35,11 +35,7 @@ def write_maps(frame: Frame, path: Path) -> None:
 
 
 def unpack_maps(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    """Give the maps that :func:`write_maps` wrote, normals unit again, masks as booleans.
-
-    Args:
-        arrays: Of the file.
-    """
+    """Return the maps that :func:`write_maps` wrote, normals unit again, masks as booleans."""
     width = int(arrays["size"][0])
     maps = {
         name: torch.from_numpy(

@@ -15,7 +15,7 @@ from pimper_torch.records import Mesh
 
 
 def icosphere(subdivisions: int) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Give a unit sphere of ``20 * 4**subdivisions`` nearly equal faces."""
+    """Return a unit sphere of ``20 * 4**subdivisions`` nearly equal faces."""
     sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices = torch.tensor(sphere.vertices, dtype=torch.float64)
     return vertices, torch.tensor(sphere.faces, dtype=torch.int64)
@@ -129,7 +129,7 @@ class _Solid:
         self._upward = face_normals(mesh.vertices_world, mesh.faces)[:, 2] > 0
 
     def holds(self, points: Float[Tensor, "point 3"]) -> bool:
-        """Tell whether any of the points is inside."""
+        """Return whether any of the points is inside."""
         low, high = self.points.amin(dim=0), self.points.amax(dim=0)
         near = points[((points > low) & (points < high)).all(dim=1)]
         face = self._caster.cast(near, near.new_tensor([0.0, 0.0, 1.0]).expand_as(near)).face

@@ -94,7 +94,7 @@ class Speckle:
     tint: tuple[float, ...] = (1.0,)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the albedo at points."""
+        """Return the albedo at points."""
         rows = points.reshape(-1, 3)
         side = self.subdivisions.shape[-1] - 1
         channels = self.subdivisions.shape[1]

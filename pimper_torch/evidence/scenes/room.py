@@ -23,7 +23,7 @@ _THICKNESS, _HALF_SIDE, _BEHIND = 0.12, 9.0, 4.5
 def rotated_about(
     axis_world: Float[Tensor, " 3"], azimuths: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4 4"]:
-    """Give ``world_from_room``, where the object and not the camera turns.
+    """Return ``world_from_room``, where the object and not the camera turns.
 
     Args:
         axis_world: A point of the turntable's axis, which is upright.
@@ -38,7 +38,7 @@ def rotated_about(
 
 
 def upside_down(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "4 4"]:
-    """Give ``room_from_world`` that turns an object over about the x axis, onto the same table.
+    """Return ``room_from_world`` that turns an object over about the x axis, onto the same table.
 
     Args:
         points_world: Of the object, which stands on z = 0. The centre of their box stays, when the
@@ -55,7 +55,6 @@ def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) 
 
     Args:
         light_room: One point light; its target is on the axis.
-        world_from_room: One a photograph.
     """
     count = len(world_from_room)
     positions = light_room.positions_world.expand(count, 3)

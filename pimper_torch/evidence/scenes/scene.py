@@ -78,7 +78,7 @@ class Scene:
     world_from_room: Float[Tensor, "view 4 4"]
 
     def objects_in(self, view: int) -> tuple[SceneObject, ...]:
-        """Give all objects where one photograph has them."""
+        """Return all objects where one photograph has them."""
         return (
             *self.objects,
             *(transferred(item, self.world_from_room[view]) for item in self.fixed),
@@ -101,12 +101,12 @@ class Scene:
         return _dressed(around) if around else None
 
     def noise(self, view: int) -> torch.Generator:
-        """Give the random numbers of one photograph, whoever renders it."""
+        """Return the random numbers of one photograph, whoever renders it."""
         return _generator(self.config.seed, view)
 
 
 def _generator(seed: int, number: int) -> torch.Generator:
-    """Give random numbers of their own to each part of a scene."""
+    """Assign random numbers of their own to each part of a scene."""
     state = np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
@@ -279,7 +279,7 @@ def _environments(
 def _surroundings(
     config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
 ) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
-    """Give what turns with the object, in the world, and what is fixed, in the room."""
+    """Return what turns with the object, in the world, and what is fixed, in the room."""
     table = TABLES[config.table](generator)
     if not (config.fixed_room or config.fixed_table):
         return (table,), ()

@@ -65,7 +65,7 @@ class MovedTexture:
     own_from_world: Float[Tensor, "4 4"]
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the albedo at points of the world."""
+        """Return the albedo at points of the world."""
         return self.texture(transform(self.own_from_world.to(points), points))
 
 
@@ -82,7 +82,7 @@ def transferred(item: SceneObject, world_from_own: Float[Tensor, "4 4"]) -> Scen
 
 
 def normals_at_vertices(item: SceneObject) -> Float[Tensor, "vertex 3"]:
-    """Give the normals of an object's mesh, its own or averaged from its faces; float32."""
+    """Return the normals of an object's mesh, its own or averaged from its faces; float32."""
     if item.mesh.normals_world is not None:
         return item.mesh.normals_world.float()
     return vertex_normals(item.mesh.vertices_world, item.mesh.faces).float()

@@ -41,8 +41,6 @@ def expose(
 
     Args:
         radiance: Already multiplied by the exposure; without limit.
-        generator: Of the noise.
-        sensor: Its faults.
     """
     spread = (sensor.read_noise**2 + sensor.shot_noise * radiance).sqrt()
     noise = torch.randn(radiance.shape, generator=generator, dtype=radiance.dtype)

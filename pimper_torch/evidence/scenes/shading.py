@@ -22,7 +22,7 @@ _MIN_SPECULAR = 0.02
 def fresnel(
     cosine: Float[Tensor, "*batch"], specular: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Give the fraction of light that is mirrored.
+    """Return the fraction of light that is mirrored.
 
     Args:
         cosine: Between the light and what it falls on.
@@ -35,7 +35,7 @@ def fresnel(
 def facet_density(
     cosine: Float[Tensor, "*batch"], alpha: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
-    """Give GGX's density of facets per solid angle.
+    """Return GGX's density of facets per solid angle.
 
     Normalized so that the facets' area seen from above is that of the surface.
 
@@ -52,7 +52,7 @@ def masking(
     to_eye: Float[Tensor, "*batch"],
     alpha: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    """Give Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
+    """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
 
     Args:
         to_light: Cosine between light and normal, more than 0.

@@ -19,10 +19,10 @@ class Shape(Protocol):
     def intersect(
         self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
-        """Give the distance to the first hit in lengths of the direction; infinite if none."""
+        """Return the distance to the first hit in lengths of the direction; infinite if none."""
 
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Give the outward unit normals at points of the surface."""
+        """Return the outward unit normals at points of the surface."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

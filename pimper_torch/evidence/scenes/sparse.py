@@ -30,7 +30,6 @@ def sparse_scene(
     their errors are along the rays as in real clouds.
 
     Args:
-        scene: With the truth.
         num_points: Wanted; fewer come out if too few are seen in ``min_views`` views.
         generator: Decides which points, and the noise.
         min_views: Shortest track.

@@ -107,7 +107,7 @@ class Stage:
         normals: Float[Tensor, "ray 3"],
         position: Float[Tensor, " 3"],
     ) -> Bool[Tensor, " ray"]:
-        """Tell where a point light is above a surface's horizon and no object is in between."""
+        """Find where a point light is above a surface's horizon and no object is in between."""
         start = points + self.clearance * normals
         toward = position - start
         (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
@@ -126,12 +126,10 @@ class Stage:
         flash: Float[Tensor, " 3"] | None = None,
         bounces: int = _MIRRORS,
     ) -> Shaded:
-        """Give the radiance that reaches the eye.
+        """Return the radiance that reaches the eye.
 
         Args:
-            spots: What it sees.
             eye: Where it is, or where each ray comes from.
-            point_light: The light.
             indirect: What other surfaces send to each vertex, as irradiance.
             flash: Where the flash is, and casts shadows from; by default at the eye, which sees
                 none of them.
@@ -184,7 +182,7 @@ class Stage:
         flash: Float[Tensor, " 3"],
         bounces: int,
     ) -> Float[Tensor, "metal channel"]:
-        """Give what smooth conductors show of other objects and of the environment."""
+        """Return what smooth conductors show of other objects and of the environment."""
         normals = spots.normals[metal]
         cosine = (normals * to_eye).sum(dim=-1, keepdim=True)
         along = normalize(2 * cosine * normals - to_eye, dim=-1)
@@ -198,7 +196,7 @@ class Stage:
     def _tint(
         self, object_index: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
     ) -> Float[Tensor, "ray 3"]:
-        """Give Fresnel's factor of conductors, 1 of all others."""
+        """Return Fresnel's factor of conductors, 1 of all others."""
         tint = cosine.new_ones(len(cosine), 3)
         for index, one in enumerate(self.objects):
             if one.conductor is not None:

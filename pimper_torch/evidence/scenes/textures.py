@@ -24,7 +24,7 @@ class CylinderRegion:
     azimuths_deg: tuple[float, float] = (-180.0, 180.0)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Tell which points are inside."""
+        """Find which points are inside."""
         x, y, height = points.unbind(dim=-1)
         radius = (x**2 + y**2).sqrt()
         azimuth = torch.rad2deg(torch.atan2(x, -y))
@@ -49,7 +49,7 @@ class Uniform:
     albedo: tuple[float, ...]
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the albedo at points."""
+        """Return the albedo at points."""
         return points.new_tensor(self.albedo).expand(*points.shape[:-1], -1)
 
 
@@ -68,7 +68,7 @@ class Painted:
     where: CylinderRegion
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the albedo at points."""
+        """Return the albedo at points."""
         return torch.where(self.where(points)[..., None], self.paint(points), self.base(points))
 
 
@@ -85,5 +85,5 @@ class Marked:
     marks: Texture
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Give the albedo at points."""
+        """Return the albedo at points."""
         return self.base(points) * self.marks(points)

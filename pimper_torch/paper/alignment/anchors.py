@@ -119,7 +119,6 @@ def _members(
 
     Args:
         in_order: Facets of all anchors, ascending.
-        templates: The bucket.
     """
     start = torch.searchsorted(in_order, templates.facet)
     counts = torch.searchsorted(in_order, templates.facet, right=True) - start

@@ -20,7 +20,7 @@ _MET_ENOUGH = 0.25
 def common_distance(
     distance: Float[Tensor, "*sample"], met: Bool[Tensor, "*sample"]
 ) -> Float[Tensor, ""]:
-    """Give the distance that half of all samples stay below, at least ``SAME_PLACE``."""
+    """Return the distance that half of all samples stay below, at least ``SAME_PLACE``."""
     return distance[met].median().clamp_min(SAME_PLACE)
 
 
@@ -40,14 +40,14 @@ def trust_by_distance(
 
 
 def overlapping_seams(met: Bool[Tensor, "seam ray"]) -> Bool[Tensor, " seam"]:
-    """Mark the seams whose two height fields lie over each other for enough of their length."""
+    """Find the seams whose two height fields lie over each other for enough of their length."""
     return met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
 
 
 def reliable_seams(
     reliability: Float[Tensor, "seam ray"], met: Bool[Tensor, "seam ray"]
 ) -> Bool[Tensor, " seam"]:
-    """Mark the overlapping seams whose two height fields lie in the same place."""
+    """Find the overlapping seams whose two height fields lie in the same place."""
     mean = (reliability * met).sum(dim=1) / met.sum(dim=1).clamp_min(1)
     return overlapping_seams(met) & (mean >= _RELIABLE)
 
@@ -58,7 +58,7 @@ def judge_patches(
     reliable: Bool[Tensor, " seam"],
     count: int,
 ) -> Int[Tensor, " face"]:
-    """Give every patch its :class:`~pimper_torch.records.AlignStatus`.
+    """Assign every patch its :class:`~pimper_torch.records.AlignStatus`.
 
     Args:
         facets: The two patches of each seam.

@@ -64,7 +64,7 @@ class Pulls(Record):
 
 
 def mismatches(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, "seam ray 3"]:
-    r"""Give :math:`P_\mu + N_\mu h_\mu^T S_\mu - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'}`."""
+    r"""Return :math:`P_\mu + N_\mu h_\mu^T S_\mu - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'}`."""
     heights = torch.einsum("perc,pec->per", pulls.samples, transforms[pulls.facets])
     lifted = heights[..., None] * pulls.normals[:, :, None]
     return pulls.gap + lifted[:, 0] - lifted[:, 1]
@@ -75,7 +75,7 @@ def curvature_along(
     met: Bool[Tensor, "seam row column"],
     edge_lengths: Float[Tensor, " seam"],
 ) -> Float[Tensor, "seam 2"]:
-    r"""Give the mean square of a height field's curvature along the edge, times its length.
+    r"""Return the mean square of a height field's curvature along the edge, times its length.
 
     :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
     quarter of the edge :math:`\ell`, for normals' noise lives at shorter distances. An arc
@@ -100,7 +100,7 @@ def seam_stiffness(
     scales: Float[Tensor, "seam 2"],
     floor: float,
 ) -> Float[Tensor, " seam"]:
-    r"""Give the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, guarded.
+    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, guarded.
 
     Args:
         curvature: ``C`` before any transform.

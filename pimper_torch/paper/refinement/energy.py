@@ -36,7 +36,7 @@ _TREND_FRACTION = 0.5
 
 
 def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    r"""Give G: where a facet is a seam and where it is its centre.
+    r"""Return G: where a facet is a seam and where it is its centre.
 
     :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
 
@@ -133,7 +133,7 @@ def plane_regularization(
     trends: Float[Tensor, "facet 3 3"],
     fitted: Bool[Tensor, " facet"],
 ) -> Float[Tensor, "vertex 3"]:
-    r"""Give the right-hand side that keeps S from sliding along itself.
+    r"""Return the right-hand side that keeps S from sliding along itself.
 
     The energy is that of a membrane: taken literally it draws an open rim inward by about
     the smoothing radius, and pulls the surface along itself wherever G changes, both on

@@ -73,7 +73,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def advice(found: GammaEstimate) -> str:
-    """Give the option of `pimper reconstruct` for the response; empty if it is not determined."""
+    """Return the option of `pimper reconstruct` for the response; empty if it is not determined."""
     if not found.determined:
         return ""
     response = f"{found.gamma:.2f}"

@@ -32,15 +32,15 @@ class Ambiguity(Record):
     matrix: Float[Tensor, "*batch 4 4"]
 
     def on_shading(self, shading: Float[Tensor, "*batch 4 sample"]) -> Float[Tensor, "..."]:
-        """Give ``A N``."""
+        """Return ``A N``."""
         return self.matrix @ shading
 
     def on_lights(self, lights: Float[Tensor, "*batch view 4"]) -> Float[Tensor, "..."]:
-        """Give ``L A^-1``, so that the product with :meth:`on_shading` stays the data."""
+        """Return ``L A^-1``, so that the product with :meth:`on_shading` stays the data."""
         return lights @ self.inverse().matrix
 
     def inverse(self) -> "Ambiguity":
-        """Give the transformation that undoes this one: ``eta A^T eta / s^2``."""
+        """Return the transformation that undoes this one: ``eta A^T eta / s^2``."""
         eta = minkowski(self.matrix)
         return Ambiguity(matrix=eta @ self.matrix.mT @ eta / self.scale[..., None, None] ** 2)
 
@@ -51,12 +51,12 @@ class Ambiguity(Record):
 
 
 def minkowski(like: Float[Tensor, "..."]) -> Float[Tensor, "4 4"]:
-    """Give ``diag(1, -1, -1, -1)``; ``s^T eta s = 0`` is the equation of the cone."""
+    """Return ``diag(1, -1, -1, -1)``; ``s^T eta s = 0`` is the equation of the cone."""
     return torch.diag(like.new_tensor([1.0, -1.0, -1.0, -1.0]))
 
 
 def lorentz(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-    """Give the proper Lorentz transformation of a generator by the matrix exponential.
+    """Return the proper Lorentz transformation of a generator by the matrix exponential.
 
     Args:
         generator: Three rapidities of the boost along x, y, z, then a rotation vector.

@@ -47,19 +47,19 @@ class BasRelief(Record):
         return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
     def on_shading(self, shading: Float[Tensor, "*batch 3 sample"]) -> Float[Tensor, "..."]:
-        """Give ``G B``."""
+        """Return ``G B``."""
         return self.matrix @ shading
 
     def on_lights(self, lights: Float[Tensor, "*batch view 3"]) -> Float[Tensor, "..."]:
-        """Give ``L G^-1``, so that the product with :meth:`on_shading` stays the data."""
+        """Return ``L G^-1``, so that the product with :meth:`on_shading` stays the data."""
         return lights @ self.inverse().matrix
 
     def inverse(self) -> "BasRelief":
-        """Give the transformation that undoes this one."""
+        """Return the transformation that undoes this one."""
         return BasRelief(mu=-self.mu / self.lam, nu=-self.nu / self.lam, lam=1 / self.lam)
 
     def after(self, first: "BasRelief") -> "BasRelief":
-        """Give this transformation after another: they form a group."""
+        """Return this transformation after another: they form a group."""
         return BasRelief(
             mu=self.lam * first.mu + self.mu,
             nu=self.lam * first.nu + self.nu,

@@ -59,7 +59,6 @@ def solve_in_colour(
         radiance: In colour; zero where missing.
         solve: One of the solvers.
         max_iterations: Steps at most in each iteration.
-        tolerance: The solver's.
         iterations: Alternations of factors and chroma; more are needed where the light's colour
             changes between views.
 

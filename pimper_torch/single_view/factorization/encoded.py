@@ -75,7 +75,6 @@ def fit_encoded(
     Constant to autograd.
 
     Args:
-        problem: The values.
         response: Through which they are seen; ``f``.
         start: Fit of a similar response; ``None`` starts from the values.
         iterations: After the first.
@@ -140,7 +139,7 @@ def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
 
 
 def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
-    """Give the residuals' robust standard deviation, corrected for the degrees of freedom."""
+    """Return the residuals' robust standard deviation, corrected for the degrees of freedom."""
     residual = (problem.encoded - fit.predicted)[problem.used]
     size = float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
     free = max(freedom(problem.used, problem.rank), 1)

@@ -93,7 +93,7 @@ class GammaEstimate(Record):
     entries: int
 
     def __str__(self) -> str:
-        """Give the estimate in a sentence."""
+        """Return the estimate in a sentence."""
         found = (
             f"gamma {self.gamma:.3f} +- {self.standard_error:.3f}; residual "
             f"{100 * self.residual:.2f} % of full scale, {100 * self.residual_linear:.2f} % if "
@@ -283,7 +283,7 @@ def _chosen_by_fit(
 
 
 def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
-    """Give the best exponent of a coarse grid, and its fit."""
+    """Return the best exponent of a coarse grid, and its fit."""
     trials = torch.logspace(
         math.log10(MIN_GAMMA), math.log10(MAX_GAMMA), _TRIALS, dtype=torch.float64
     )
@@ -349,7 +349,7 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
 
 
 def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
-    r"""Give gamma's sandwich standard error over samples, or over views if that is larger.
+    r"""Return gamma's sandwich standard error over samples, or over views if that is larger.
 
     With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
     second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`; it needs no model
@@ -368,7 +368,7 @@ def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> fl
 
 
 def _estimate_of(found: _Minimum) -> GammaEstimate:
-    """Give the estimate, with residuals under the linear and the sRGB response."""
+    """Return the estimate, with residuals under the linear and the sRGB response."""
     problem = found.problem
     residual = residual_spread(problem, found.fit)
     linear = fit_encoded(problem, Linear(), found.fit, 2 * ITERATIONS)

@@ -14,7 +14,7 @@ def low_rank_problem(
     weight: Float[Tensor, "batch row column"],
     start: Float[Tensor, "batch row rank"],
 ) -> Bilinear:
-    r"""Give the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
+    r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
     Rows are the problem's views, columns its samples: ``L`` becomes ``lights``, ``N``
     ``shading``. They are unique at best up to one invertible matrix between them.

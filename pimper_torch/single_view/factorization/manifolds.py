@@ -42,11 +42,11 @@ class Free:
     flat: ClassVar[bool] = True
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Give the nearest vector of the manifold: the vector itself."""
+        """Return the nearest vector of the manifold: the vector itself."""
         return shading
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Give the end of the step: the manifold is linear."""
+        """Return the end of the step: the manifold is linear."""
         return shading
 
     def curvature(
@@ -54,7 +54,7 @@ class Free:
         shading: Float[Tensor, "*batch rank sample"],
         slope: Float[Tensor, "*batch rank sample"],
     ) -> Float[Tensor, "*batch sample rank rank"]:
-        """Give the manifold's part of second derivatives: flat, it has none."""
+        """Return the manifold's part of second derivatives: flat, it has none."""
         return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
@@ -68,7 +68,7 @@ class Free:
     def split(
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Give albedo and unit normal of vectors of rank three."""
+        """Return albedo and unit normal of vectors of rank three."""
         self._only_three()
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]
@@ -76,14 +76,14 @@ class Free:
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch 3"]:
-        """Give the vectors of albedo and normal."""
+        """Return the vectors of albedo and normal."""
         self._only_three()
         return albedo[..., None] * normals
 
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 6 sample"]:
-        r"""Give the penalty :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
+        r"""Return the penalty :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
         self._only_three()
         one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
         unit = torch.stack([one, zero, zero, one, zero, one], dim=-2)
@@ -108,7 +108,7 @@ class SecondOrder:
     flat: ClassVar[bool] = False
 
     def project(self, shading: Float[Tensor, "*batch 9"]) -> Float[Tensor, "*batch 9"]:
-        r"""Give the nearest vector of the manifold.
+        r"""Return the nearest vector of the manifold.
 
         The normal maximises :math:`b \cdot n + n^\top Q n` on the sphere, with ``b`` and ``Q``
         the vector's first and second degree: the largest root of a secular equation, found by
@@ -158,7 +158,7 @@ class SecondOrder:
     def curvature(
         self, shading: Float[Tensor, "*batch 9 sample"], slope: Float[Tensor, "*batch 9 sample"]
     ) -> Float[Tensor, "*batch sample 3 3"]:
-        r"""Give the manifold's part of the second derivatives; see :meth:`Cone.curvature`."""
+        r"""Return the manifold's part of the second derivatives; see :meth:`Cone.curvature`."""
         albedo, normal = self.split(shading.mT)
         g = slope.mT
         rotations = tangents(normal)
@@ -182,19 +182,19 @@ class SecondOrder:
     def split(
         self, shading: Float[Tensor, "*batch 9"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Give albedo and unit normal of the vectors."""
+        """Return albedo and unit normal of the vectors."""
         return split_shading(shading[..., :4])
 
     def join(
         self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
     ) -> Float[Tensor, "*batch 9"]:
-        """Give the vectors of albedo and normal."""
+        """Return the vectors of albedo and normal."""
         return albedo[..., None] * second_order(normals)
 
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 45 sample"]:
-        r"""Give the penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
+        r"""Return penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
         small = Cone().normal_prior(normals)
         wide = small.new_zeros(*small.shape[:-2], 45, small.shape[-1])
         # Row i of the packed triangle of nine begins after 9 + 8 + ...; of four, 4 + 3 + ...
@@ -214,7 +214,7 @@ class SecondOrder:
 
 
 def second_order(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
-    """Give the nine harmonics up to the second order; see :class:`SecondOrder`.
+    """Return the nine harmonics up to the second order; see :class:`SecondOrder`.
 
     >>> second_order(torch.tensor([0.0, 0.0, -1.0]))
     tensor([ 1.,  0.,  0., -1.,  0., -0., -0.,  0.,  1.])
@@ -229,7 +229,7 @@ def second_order(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"
 
 
 def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]:
-    """Give ``Q`` with ``n^T Q n`` the sum of the second degree's harmonics, unit n."""
+    """Return ``Q`` with ``n^T Q n`` the sum of the second degree's harmonics, unit n."""
     xy, xz, yz, difference, square = degree.unbind(dim=-1)
     half, root = math.sqrt(3) / 2, math.sqrt(3) / 2
     rows = [
@@ -243,7 +243,7 @@ def _quadratic(degree: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]
 def _differential(
     normals: Float[Tensor, "*batch 3"], rotation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 5"]:
-    """Give the derivative of the second degree when normals move along ``rotation``."""
+    """Return the derivative of the second degree when normals move along ``rotation``."""
     x, y, z = normals.unbind(dim=-1)
     a, b, c = rotation.unbind(dim=-1)
     root = math.sqrt(3)

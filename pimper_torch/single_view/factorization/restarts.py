@@ -49,12 +49,10 @@ def factorize_from_many(
     Args:
         matrix: Entries without weight are ignored.
         weight: 0 where missing.
-        rank: Of the factors.
         generator: On the CPU.
         repeats: How many starts must end in the best minimum.
         max_starts: Starts at most.
         closeness: Residuals that differ by less than this fraction are of the same minimum.
-        max_iterations: Of each start.
         tolerance: See
             :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.
 

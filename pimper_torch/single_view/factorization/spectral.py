@@ -34,7 +34,7 @@ class Upgraded(Record):
 def factorize_rank_four(
     radiance: Float[Tensor, "patch view sample"], weight: Float[Tensor, "patch view sample"]
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    """Give the rank-four factors that minimize the weighted residual, the cone ignored.
+    """Return the rank-four factors that minimize the weighted residual, the cone ignored.
 
     Missing entries are imputed by a sample's albedo times a view's brightness, then
     iteratively by the rank-four part of the imputed matrix (eigenvectors of the small

@@ -19,7 +19,7 @@ _MIN_AGREEMENT = 1.5
 def camera_moved(
     encoded: Float[Tensor, "view channel height width"], where: Bool[Tensor, "height width"]
 ) -> bool:
-    """Tell whether details of the photographs lie at other pixels in every one.
+    """Return whether details of the photographs lie at other pixels in every one.
 
     Details are those of the logarithm of the values, between pixel noise and shading, so that
     light hardly changes them. False where the photographs have none.

@@ -108,9 +108,7 @@ def find_discontinuities(
     Args:
         steps: Predicted by the normals.
         weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
-        weight_down: Likewise.
         anchor: Of pixels whose unknown is given.
-        heights: The given ones.
         config: When a step is rejected.
         method: Of the linear systems.
 
@@ -183,7 +181,7 @@ def _solved(
 
 
 def _residuals(steps: Steps, found: Float[Tensor, "height width"]) -> Pair:
-    """Give the residuals of the steps, in widths of a pixel."""
+    """Return the residuals of the steps, in widths of a pixel."""
     right, down = differences(found)
     return right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
 
@@ -195,7 +193,7 @@ def _robust_weight(
     scale: float,
     tie: float,
 ) -> Float[Tensor, "row column"]:
-    """Give each step's robust weight."""
+    """Return each step's robust weight."""
     geman_mcclure = (1 + (residual / scale).square()) ** -2
     return torch.where(tested, geman_mcclure, 0).clamp_min(tie) * inside
 

@@ -21,11 +21,10 @@ def integrate_fourier(
     pixel_width: float = 1.0,
     pixel_height: float = 1.0,
 ) -> Float[Tensor, "*batch height width"]:
-    """Give the heights, of mean zero, whose slopes are nearest to those given.
+    """Return the heights, of mean zero, whose slopes are nearest to those given.
 
     Args:
         slope_right: At every pixel.
-        slope_down: Likewise.
         pixel_width: Distance of neighbouring pixels in a row.
         pixel_height: Distance of rows.
 

@@ -178,7 +178,7 @@ Box = tuple[slice, slice]
 
 
 def _box(mask: Bool[Tensor, "height width"]) -> Box:
-    """Give the bounding rows and columns of the mask, to save time and memory."""
+    """Return the bounding rows and columns of the mask, to save time and memory."""
     rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
@@ -206,7 +206,7 @@ def _usable(
     mask: Bool[Tensor, "height width"],
     weight: Float[Tensor, "height width"] | None,
 ) -> Float[Tensor, "height width 3"]:
-    """Give unit normals, NaN where there is none."""
+    """Return unit normals, NaN where there is none."""
     length = normals.norm(dim=-1)
     usable = mask & (length > 0) & length.isfinite()
     if weight is not None:
@@ -216,7 +216,7 @@ def _usable(
 
 
 def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tuple[Tensor, Tensor]:
-    """Give the weights of squared differences of the unknown, zero outside the mask."""
+    """Return the weights of squared differences of the unknown, zero outside the mask."""
     inside = steps.inside
     reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
     parts = []
@@ -238,7 +238,7 @@ def _known(
     steps: Steps,
     intrinsics: Float[Tensor, "3 3"] | None,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Give anchors and the unknowns there."""
+    """Return anchors and the unknowns there."""
     if depth is None:
         return None, None
     given = depth.isfinite() & mask
@@ -299,7 +299,7 @@ def _refuse_convention(
 def _curl(
     normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"], sign: float
 ) -> float:
-    """Give the median absolute curl of the slopes, around squares of four blocks.
+    """Return the median absolute curl of the slopes, around squares of four blocks.
 
     Slopes are averaged over blocks, which reduces noise.
     """

@@ -112,7 +112,7 @@ class RasterSystem:
         down: Float[Tensor, "steps_down width"],
         heights: Float[Tensor, "height width"] | None = None,
     ) -> Float[Tensor, "height width"]:
-        """Give the heights whose steps and anchored pixels are nearest to those given.
+        """Return the heights whose steps and anchored pixels are nearest to those given.
 
         Args:
             right: Target steps to the right; ignored, NaN included, without weight.
@@ -164,8 +164,6 @@ class RasterSystem:
 
         Args:
             weight_right: As for a new system.
-            weight_down: Likewise.
-            anchor: Likewise.
             keep: Keep the coarse levels whatever the weights. The solution is the same, but may
                 take many more cycles.
         """

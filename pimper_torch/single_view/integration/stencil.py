@@ -49,7 +49,7 @@ class Stencil:
         return found.view(-1)
 
     def matrix(self) -> csr_array:
-        """Give the compressed rows, without the entries that are zero."""
+        """Return the compressed rows, without the entries that are zero."""
         height, width = self.diagonal.shape
         values = np.zeros((height, width, 5))
         values[1:, :, 0] = values[:-1, :, 4] = -self.down.cpu().numpy()
@@ -82,7 +82,6 @@ class CholeskyRaster:
     """A sparse factor, on the CPU.
 
     Args:
-        stencil: What to factor.
         what: Names the system in errors.
     """
 
@@ -186,7 +185,7 @@ class MultigridRaster:
 
 
 def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
-    """Tell whether a hierarchy of ``old`` entries preconditions ``new`` ones."""
+    """Return whether a hierarchy of ``old`` entries preconditions ``new`` ones."""
     ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
     same_signs = bool((new.sign() == old.sign()).all())
     return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())

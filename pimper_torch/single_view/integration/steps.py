@@ -81,7 +81,7 @@ def orthographic_steps(
     mask: Bool[Tensor, "height width"],
     spacing: tuple[float, float] = (1.0, 1.0),
 ) -> Steps:
-    """Give the steps of depth under parallel rays.
+    """Return the steps of depth under parallel rays.
 
     Args:
         normals: Unit, ``n_z < 0``; where they are not finite or face away, inside the mask,
@@ -103,7 +103,7 @@ def perspective_steps(
     mask: Bool[Tensor, "height width"],
     intrinsics: Float[Tensor, "3 3"],
 ) -> Steps:
-    r"""Give the steps of the logarithm of depth under rays through a pinhole.
+    r"""Return the steps of the logarithm of depth under rays through a pinhole.
 
     On a step the tangent planes of both pixels meet at the ray half-way, which is exact for
     planes:
@@ -219,7 +219,7 @@ def _curved(
 def _excess(
     change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
 ) -> Float[Tensor, "line step"]:
-    """Give the excess of a slope's change over its neighbours'; no gradient."""
+    """Return the excess of a slope's change over its neighbours'; no gradient."""
     before, after = _beside(change.detach(), known)
     beside = torch.maximum(before.abs(), after.abs())
     return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
@@ -228,7 +228,7 @@ def _excess(
 def _beside(
     change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
 ) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
-    """Give the changes on the steps before and after each; 0 where those are not reliable."""
+    """Return the changes on the steps before and after each; 0 where those are not reliable."""
     wide = pad(torch.where(known, change, 0), (1, 1))
     return wide[:, :-2], wide[:, 2:]
 

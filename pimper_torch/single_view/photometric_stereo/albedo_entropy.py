@@ -95,7 +95,7 @@ def albedo_entropy(
     candidates: Float[Tensor, "candidate 3"],
     width: float,
 ) -> Float[Tensor, " candidate"]:
-    """Give the entropy of log-albedo within groups after each transformation.
+    """Return the entropy of log-albedo within groups after each transformation.
 
     Args:
         shading: Albedo times normal.

@@ -200,7 +200,7 @@ def _offsets(
 
 
 def _resolved(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> BasRelief:
-    """Give the better of the minima from the linear solution and from the identity."""
+    """Return the better of the minima from the linear solution and from the identity."""
     one, none = torch.ones_like(b[0, 0]), torch.zeros_like(b[0, 0])
     starts = [BasRelief(mu=none, nu=none, lam=one)]
     linear = _linear(b, labels)
@@ -278,7 +278,7 @@ def _log_albedo(b: Float[Tensor, "3 pixel"], relief: BasRelief) -> Float[Tensor,
 def _residual(
     b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], relief: BasRelief
 ) -> Float[Tensor, " pixel"]:
-    """Give log-albedo less the group's median."""
+    """Return log-albedo less the group's median."""
     log = _log_albedo(b, relief)
     median = torch.stack([log[labels == label].median() for label in range(int(labels.max()) + 1)])
     return log - median[labels]
@@ -290,7 +290,7 @@ def _slope(
     relief: BasRelief,
     weight: Float[Tensor, " pixel"],
 ) -> Float[Tensor, "pixel 3"]:
-    """Give the residual's derivative by mu, nu and log lambda, group means by weight removed."""
+    """Return the residual's derivative by mu, nu and log lambda, group means by weight removed."""
     x, y, z = relief.on_shading(b)
     square = (x * x + y * y + z * z).clamp_min(torch.finfo(b.dtype).tiny)
     lam = relief.lam

@@ -137,7 +137,6 @@ def find_maxima(
         mask: The whole square must lie inside.
         shading: Of the pixels inside the mask. Deviations are angles in its frame, so it should
             be about Euclidean.
-        radius: Of the square.
     """
     found = [_local_maxima(image.sum(dim=0), mask, radius) for image in images]
     counts = torch.tensor([len(tops) for tops in found], device=mask.device)
@@ -239,7 +238,7 @@ def _refined(
 def _equations(
     b: Float[Tensor, "3 maximum"], light: Float[Tensor, "3 maximum"]
 ) -> Float[Tensor, "maximum 3 4"]:
-    """Give ``l x M b = 0`` by the metric's entries, both vectors made unit."""
+    """Return ``l x M b = 0`` by the metric's entries, both vectors made unit."""
     x, y, z = b / b.norm(dim=0).clamp_min(1e-30)
     l1, l2, l3 = light / light.norm(dim=0).clamp_min(1e-30)
     zero = torch.zeros_like(x)
@@ -255,7 +254,7 @@ def _equations(
 def _angles(
     relief: BasRelief, b: Float[Tensor, "3 maximum"], light: Float[Tensor, "3 maximum"]
 ) -> Float[Tensor, "*batch maximum"]:
-    """Give the angle between each normal and its light after the transformation."""
+    """Return the angle between each normal and its light after the transformation."""
     normal, point_light = relief.matrix @ b, relief.inverse().matrix.mT @ light
     cross = torch.linalg.cross(normal, point_light, dim=-2).norm(dim=-2)
     return torch.atan2(cross, (normal * point_light).sum(dim=-2))

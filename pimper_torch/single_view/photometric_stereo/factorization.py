@@ -159,5 +159,5 @@ def _filled(
 
 
 def evenly(count: int, most: int) -> Int[Tensor, " chosen"]:
-    """Give indices spaced evenly over ``range(count)``."""
+    """Return indices spaced evenly over ``range(count)``."""
     return torch.linspace(0, count - 1, min(count, most)).round().long()

@@ -9,7 +9,7 @@ from pimper_torch.single_view.photometric_stereo.relief_metric import standard_r
 
 
 def usable_pixels(shading: Float[Tensor, "3 pixel"]) -> Bool[Tensor, " pixel"]:
-    """Tell which vectors are finite and not zero."""
+    """Find which vectors are finite and not zero."""
     return shading.isfinite().all(dim=0) & (shading != 0).any(dim=0)
 
 
@@ -33,7 +33,7 @@ def require_matching(
 
 
 def require_standard(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
-    """Give the transformation to the standard form, in float64.
+    """Return the transformation to the standard form, in float64.
 
     Raises:
         InputError: All vectors are parallel, or there are none.

@@ -74,7 +74,7 @@ class Integrable(Record):
 def wedge(
     one: Float[Tensor, "*batch size"], other: Float[Tensor, "*batch size"]
 ) -> Float[Tensor, "*batch pair"]:
-    """Give the bivector of two vectors: ``u_i v_j - u_j v_i`` for i < j."""
+    """Return the bivector of two vectors: ``u_i v_j - u_j v_i`` for i < j."""
     first, second = _pairs(one.shape[-1])
     return one[..., first] * other[..., second] - one[..., second] * other[..., first]
 
@@ -218,7 +218,7 @@ def rotation_to_surface(
 
 
 def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor, "both both"]]:
-    """Give the quadratic forms of the equations' residuals, and of their terms."""
+    """Return the quadratic forms of the equations' residuals, and of their terms."""
     both = torch.cat([equations.across, equations.down], dim=1)
     full = (equations.weight[:, None] * both).mT @ both
     terms = full.clone()
@@ -229,7 +229,7 @@ def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor,
 
 
 def both_ways(noise: Float[Tensor, "pair pair"]) -> Float[Tensor, "both both"]:
-    """Give the joint covariance of ``across`` and ``down``, which are uncorrelated."""
+    """Return the joint covariance of ``across`` and ``down``, which are uncorrelated."""
     return torch.kron(torch.eye(2).to(noise), noise)
 
 
@@ -279,7 +279,7 @@ def _pairs(size: int) -> tuple[list[int], list[int]]:
 
 
 def _vector(bivector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Give the vector dual to a bivector of space."""
+    """Return the vector dual to a bivector of space."""
     xy, xz, yz = bivector
     return torch.stack([yz, -xz, xy])
 

@@ -61,14 +61,14 @@ def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
 def _reliable(
     given: Problem, found: Surfaced
 ) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
-    """Give the photographs, and the reliable pixels."""
+    """Return the photographs, and the reliable pixels."""
     mask = torch.zeros_like(given.mask)
     mask[given.mask] = found.reliability > 0
     return _without_holes(given), mask
 
 
 def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]:
-    """Give the photographs with missing samples black."""
+    """Return the photographs with missing samples black."""
     images = torch.zeros_like(given.images, dtype=torch.float64)
     images[:, :, given.mask] = given.radiance
     return images
@@ -193,7 +193,7 @@ def _by_harmonics(
 
 
 def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
-    """Give normals and the albedo of each colour from shading and point lights."""
+    """Return normals and the albedo of each colour from shading and point lights."""
     size = found.shading.norm(dim=0)
     normals = found.shading / torch.where(size > 0, size, 1)
     shade = (found.lights @ normals).clamp_min(0)
@@ -220,7 +220,7 @@ def _scaled(found: Solution) -> Solution:
 def _reliability(
     weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
 ) -> Float[Tensor, " pixel"]:
-    """Give each pixel's weight, from those of its samples; 0 where it is underdetermined."""
+    """Return each pixel's weight, from those of its samples; 0 where it is underdetermined."""
     enough, spanned = determined(weight, lights)
     total = weight.sum(dim=0)
     return torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)

@@ -102,7 +102,7 @@ def integrability_equations(
     along_y: Float[Tensor, "3 pixel"],
     rays: Float[Tensor, "3 pixel"],
 ) -> Float[Tensor, "pixel 9"]:
-    """Give the coefficients of the integrability constraint by the entries of P, row by row.
+    """Return the coefficients of the integrability constraint by the entries of P, row by row.
 
     Args:
         vectors: Along normals, up to an invertible matrix.
@@ -227,7 +227,7 @@ def _least(
 def _noise_of_crosses(
     b: Float[Tensor, "3 pixel"], size: Float[Tensor, " pixel"], covariance: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "pixel 3 3"]:
-    """Give the covariance of the cross product of each vector with noise.
+    """Return the covariance of the cross product of each vector with noise.
 
     Noise of the factors is white; after whitening it has the given covariance, and normalization
     divides it by the vectors' length.
@@ -248,7 +248,7 @@ def _noise_of_crosses(
 def _by_derivatives(
     rays: Float[Tensor, "3 pixel"], intrinsics: Float[Tensor, "3 3"]
 ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Give the coefficients of noise of b_u and of b_v, for each row of P."""
+    """Return the coefficients of noise of b_u and of b_v, for each row of P."""
     (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
     x, y, _ = rays
     by_u = torch.stack([fx + 0 * x, skew + 0 * x, -x * fx - y * skew], dim=1)

@@ -65,7 +65,6 @@ def regress(
         shadows: Of a light from behind: ``attached``, radiance is 0; ``none``, it is linear in
             the light, and negative.
         base: Whether radiance has a part that is the same in all views, such as ambient light.
-        iterations: Of reweighting.
 
     Returns:
         In float64. An underdetermined pixel has one of its minima; see :func:`determined`.
@@ -102,7 +101,6 @@ def reweigh(
 
     Args:
         radiance: Observed.
-        weight: Given.
         predicted: By a fit; below zero for lights from behind.
         widen: Multiple of the scale.
         shadows: Of lights from behind; see :func:`regress`.
@@ -121,7 +119,7 @@ def reweigh(
 def brightness(
     radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"], base: bool = False
 ) -> Float[Tensor, "view pixel"]:
-    """Give weights proportional to brightness, up to the median of the pixel."""
+    """Return weights proportional to brightness, up to the median of the pixel."""
     x = torch.where(seen, radiance, torch.nan)
     if base:
         x = x - x.nan_to_num(nan=torch.inf).amin(dim=0)
@@ -136,7 +134,7 @@ def determined(
     lights: Float[Tensor, "view unknown"],
     least: float = 1e-4,
 ) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
-    """Tell which pixels have as many samples as unknowns, and lights that span them.
+    """Find which pixels have as many samples as unknowns, and lights that span them.
 
     Args:
         weight: Of the samples, after a regression.

@@ -12,7 +12,7 @@ def rounded_relief(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> BasRelief:
-    r"""Give the transformation that makes a surface upright on average, and as deep as a ball.
+    r"""Return the transformation that makes a surface upright on average, and as deep as a ball.
 
     :math:`\sum w b_x b_z = \sum w b_y b_z = 0` and
     :math:`\sum w (b_x^2 + b_y^2) = \sum w b_z^2`, as on the image of a sphere of even albedo; of
@@ -62,7 +62,7 @@ def bulge(
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> Float[Tensor, ""]:
-    """Tell whether normals point outwards on average (1) or inwards (-1).
+    """Return whether normals point outwards on average (1) or inwards (-1).
 
     Args:
         sideways: The parts of shading along x and y, uncorrelated with z.

@@ -24,13 +24,13 @@ _FLAT = 1e-12
 
 
 def metric_row(shading: Float[Tensor, "3 pixel"]) -> Float[Tensor, "pixel 4"]:
-    """Give the coefficients of the square of albedo, ``b^T M b``, by the entries of ``M``."""
+    """Return the coefficients of the square of albedo, ``b^T M b``, by the entries of ``M``."""
     x, y, z = shading
     return torch.stack([x * x + y * y, 2 * x * z, 2 * y * z, z * z], dim=-1)
 
 
 def relief_of_metric(metric: Float[Tensor, "*batch 4"]) -> BasRelief:
-    """Give the transformation, with lambda above zero, that a metric belongs to.
+    """Return the transformation, with lambda above zero, that a metric belongs to.
 
     Entries may have any common factor; where they are no metric, the result is NaN.
     """

@@ -136,10 +136,6 @@ def nine_harmonic_stereo(
 
     Args:
         radiance: As in :func:`four_harmonic_stereo`.
-        weight: The same.
-        mask: The same.
-        generator: The same.
-        robust: The same.
 
     Returns:
         ``lights`` have nine columns, in the order of :func:`nine_harmonics`.
@@ -243,9 +239,7 @@ def _surface(
     """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched.
 
     Args:
-        equations: Of integrability.
         mean: Of the shading vectors.
-        generator: Of the starts.
     """
     drawn = torch.randn(_STARTS, 6, generator=generator, dtype=torch.float64)
     drawn[:, :3] *= _RAPIDITY
@@ -271,7 +265,7 @@ def _surface(
 
 
 def _rest_frame_boost(vector: Float[Tensor, " 4"]) -> Float[Tensor, "4 4"]:
-    """Give the boost to a vector's rest frame; the identity for vectors outside the cone."""
+    """Return the boost to a vector's rest frame; the identity for vectors outside the cone."""
     length = vector[1:].norm()
     if not bool((length > 0) & (length < vector[0])):
         return torch.eye(4).to(vector)
@@ -315,7 +309,7 @@ def _residual(
     metric: Float[Tensor, "both both"],
     mean: Float[Tensor, " 4"],
 ) -> Float[Tensor, "*batch row"]:
-    """Give the equations' residuals in units of noise, with a penalty on boosts."""
+    """Return the equations' residuals in units of noise, with a penalty on boosts."""
     both = _bivectors(matrix)
     noise = ((both @ metric) * both).sum(dim=-1, keepdim=True)
     moved = matrix @ mean

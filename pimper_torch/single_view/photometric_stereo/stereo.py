@@ -94,7 +94,6 @@ def photometric_stereo(
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
         mask: True on the object; of the size of the images.
-        method: See the table.
         resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
             ``equal_strength``; others have nothing to resolve.
         lights: For ``calibrated``, one a view: direction to the point light times its irradiance,

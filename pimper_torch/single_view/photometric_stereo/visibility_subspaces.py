@@ -54,7 +54,7 @@ def visibility_subspaces(
     *,
     noise: float = 0.01,
 ) -> Bool[Tensor, "view pixel"]:
-    """Tell which views light each pixel; see :func:`find_subspaces`."""
+    """Find which views light each pixel; see :func:`find_subspaces`."""
     return find_subspaces(images, mask, generator, noise=noise).lit
 
 
@@ -182,7 +182,7 @@ def _largest(
     triples: Int[Tensor, "triple 3"],
     deviation: float,
 ) -> tuple[Float[Tensor, "view 3"], Bool[Tensor, " pixel"]] | None:
-    """Give the triple's subspace with the most inliers among free pixels, refitted to them."""
+    """Return the triple's subspace with the most inliers among free pixels, refitted to them."""
     if len(triples) == 0:
         return None
     views = len(values)
@@ -237,7 +237,7 @@ def _explained(
     start: Bool[Tensor, "view pixel"],
     deviation: float,
 ) -> tuple[Bool[Tensor, "view pixel"], Float[Tensor, "view 3"]]:
-    """Give the inliers of each pixel's fit, updating the lights in turn.
+    """Return the inliers of each pixel's fit, updating the lights in turn.
 
     Views that no subspace covers have no lights; there values that are not dark count as lit.
     """

@@ -99,7 +99,7 @@ def chromatic_albedo(
 def _shared(
     inner: Float[Tensor, "pixel 3 3"], found: Float[Tensor, "channel 3 pixel"]
 ) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "channel pixel"]]:
-    """Give each pixel the least-squares normal over all colours, and the albedos under it."""
+    """Assign each pixel the least-squares normal over all colours, and the albedos under it."""
     vectors = found.permute(2, 1, 0)  # pixel, 3, channel
     scale = inner.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(torch.finfo(inner.dtype).tiny)
     eye = torch.eye(3).to(inner)
