@@ -28,7 +28,8 @@ RUNS = {
         "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
-        "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 --extract.max_expected_error 9 "
+        "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
+        "--extract.max_expected_error 9 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm"
     ],
     "demo": [
