@@ -11,7 +11,8 @@ from typing import Any
 
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.report.sections import section_entries
-from pimper_torch.report.views import Prediction, up_world, view_entries
+from pimper_torch.report.views import Prediction, view_entries
+from pimper_torch.viz.turn import up_world
 
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")

@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from pimper_torch.records import Cameras, Silhouettes, SparseScene
+from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
 
 Json = dict[str, object]
@@ -77,14 +75,3 @@ def _prediction(predicted: Prediction, longest: int) -> Json:
 
 def _three(values: Float[Tensor, " channel"]) -> list[float]:
     return values.detach().cpu().double().expand(3).tolist()
-
-
-def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
-    """Return the direction that a page calls up: y, unless photographs were held otherwise.
-
-    The frame has y up where a plane or level cameras told it; where they did not, up is that of
-    the photographs on average.
-    """
-    upward = -cameras.cam_from_world[:, 1, :3]
-    mean = normalize(upward.mean(dim=0), dim=0)
-    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean

@@ -50,15 +50,32 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     faces_cam = rotate(fine.cam_from_world[0], per_face[hits.face.clamp_min(0)])
     from_behind = (faces_cam * _towards(fine)).sum(dim=-1) > 0
     normals_cam = torch.where(from_behind[..., None], -normals_cam, normals_cam)
-    light = torch.full_like(normals_cam[..., 0], _AMBIENT)
-    for strength, direction in _POINT_LIGHTS_CAM:
-        point_light = normalize(normals_cam.new_tensor(direction), dim=0)
-        light = light + strength * (normals_cam @ point_light).clamp_min(0)
+    light = lambertian(normals_cam)
     tint = torch.where(from_behind[..., None], light.new_tensor(_INSIDE), 1.0)
     radiance = torch.where(seen[..., None], light[..., None] * tint, 1.0)
     radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
-    # Well short of a display's curve: steeper tones show more height field.
+    return tone(radiance)
+
+
+def tone(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Encode the radiance of matte surfaces for a display, in [0, 1].
+
+    Well short of a display's curve: steeper tones show more of the shape.
+    """
     return radiance.clamp(0, 1) ** (1 / 1.3)
+
+
+def lambertian(normals_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """Return the radiance of white matte surfaces under the lights of all pictures.
+
+    Args:
+        normals_cam: Unit, camera frame.
+    """
+    light = torch.full_like(normals_cam[..., 0], _AMBIENT)
+    for strength, direction in _POINT_LIGHTS_CAM:
+        towards = normalize(normals_cam.new_tensor(direction), dim=0)
+        light = light + strength * (normals_cam @ towards).clamp_min(0)
+    return light
 
 
 def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
