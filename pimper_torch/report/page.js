@@ -36,6 +36,14 @@
     }
     return box;
   };
+  // Leave of a box what is inside the silhouette.
+  const clip = (box, view) => {
+    if (!view.outline) return;
+    const path = find("inside").firstElementChild;
+    path.setAttribute("d", view.outline);
+    path.setAttribute("transform", `scale(${1 / view.width} ${1 / view.height})`);
+    box.style.clipPath = "url(#inside)";
+  };
   const thumbnails = data.views.map((view, index) => {
     const title = view.figure ? `${view.name}: ${view.figure}` : view.name;
     const button = make("button", { type: "button", title, "aria-pressed": "false",
@@ -61,6 +69,7 @@
         const both = picture(view.photo, view, false);
         both.append(make("img", { src: view.prediction, alt: "" }));
         find("difference").replaceChildren(both);
+        clip(both, view);
       }
       thumbnails[selected].scrollIntoView({ block: "nearest", inline: "nearest" });
     }
@@ -194,16 +203,16 @@
     }
 
     makeMarkers() {
-      const size = 0.1 * this.radius;
       const lines = [];
       this.bulbs = [];
       for (const view of data.views) {
         view.worldFromCamera = new THREE.Matrix4().set(...view.pose).invert();
+        view.place = new THREE.Vector3().applyMatrix4(view.worldFromCamera);
+        const size = 0.08 * view.place.distanceTo(this.center);
         const [fx, fy] = view.focal, [cx, cy] = view.centre;
         const corners = [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]].map(
           ([x, y]) => new THREE.Vector3((x - cx) / fx, (y - cy) / fy, 1).multiplyScalar(size)
             .applyMatrix4(view.worldFromCamera));
-        view.place = new THREE.Vector3().applyMatrix4(view.worldFromCamera);
         corners.forEach((corner, at) => lines.push(view.place, corner, corner, corners[(at + 1) % 4]));
         if (view.light) {
           view.bulb = vector(view.light.direction).multiplyScalar(1.8 * this.radius).add(this.center);
@@ -212,7 +221,7 @@
       }
       const of = (points) => new THREE.BufferGeometry().setFromPoints(points);
       this.markers.add(new THREE.LineSegments(of(lines), new THREE.LineBasicMaterial({ color: 0x8fd3ff })));
-      this.lamps.add(new THREE.Points(of(this.bulbs), new THREE.PointsMaterial({ color: 0xffd24a, size: 9,
+      this.lamps.add(new THREE.Points(of(this.bulbs), new THREE.PointsMaterial({ color: 0xffd24a, size: 6,
         sizeAttenuation: false })));
       this.ray = new THREE.LineSegments(of([this.center, this.center]),
         new THREE.LineBasicMaterial({ color: 0xffd24a }));
@@ -295,7 +304,10 @@
 
     // Stand behind the camera of a photograph, under its light; or leave it.
     stand(view) {
-      if (!view) return this.leave(true);
+      if (!view) {
+        this.lamp.fitted = null;
+        return this.leave(true);
+      }
       this.behind = view;
       this.camera.matrixWorld.multiplyMatrices(view.worldFromCamera, OPENGL);
       this.camera.matrixWorld.decompose(this.camera.position, this.camera.quaternion, this.camera.scale);

@@ -75,7 +75,12 @@ def _stages(summary: Summary) -> Json:
 def _figures(stage: Mapping[str, Any]) -> str:
     aside = ("name", "seconds", "peak_memory_mb", "kept")
     told = {name: value for name, value in stage.items() if name not in aside and value is not None}
-    return ", ".join(f"{name.replace('_', ' ')} {value:,.6g}" for name, value in told.items())
+    return ", ".join(
+        f"{name.replace('_', ' ')} {value:,}"
+        if isinstance(value, int)
+        else f"{name.replace('_', ' ')} {value:.4g}"
+        for name, value in told.items()
+    )
 
 
 def _left_out(summary: Summary) -> Json | None:
