@@ -168,8 +168,11 @@ class RayCaster:
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
 
 
-def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
+def cast_view(mesh: Mesh, cameras: Cameras, view: int, caster: RayCaster | None = None) -> Hits:
     """Cast a ray through every pixel of a view.
+
+    Args:
+        caster: The mesh prepared, where it is.
 
     Returns:
         Hits of shape ``height width``; ``distance`` is depth along the camera's z.
@@ -179,7 +182,7 @@ def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
     rays = rays_through(
         pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
     ).reshape(height, width, 3)
-    caster = RayCaster(mesh.vertices_world, mesh.faces)
+    caster = caster or RayCaster(mesh.vertices_world, mesh.faces)
     return caster.cast(cameras.centers_world[view], rays)
 
 
