@@ -51,6 +51,7 @@ ROOMS = [
     "reporting",
     "chains",
     "viz",
+    "relighting",
     "report",
     "outputs",
     "io",

@@ -22,7 +22,7 @@ from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.records.faults import beyond, not_finite
-from pimper_torch.viz.maps import albedo_scale
+from pimper_torch.viz.maps import base_color
 
 # One number a vertex, written and read under the names of the record's fields.
 _ERRORS = ("confidence", "expected_error")
@@ -348,9 +348,7 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def _colors(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
-    assert mesh.albedo is not None
-    scaled = mesh.albedo.detach() * albedo_scale(mesh)
-    return scaled.nan_to_num(0).clamp(0, 1).expand(-1, 3)
+    return base_color(mesh).expand(-1, 3)
 
 
 def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:

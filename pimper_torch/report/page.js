@@ -106,6 +106,7 @@
 
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
   const [NEAR, FAR, FOV_DEG] = [0.01, 100, 30]; // planes in units of the scene's radius
+  const REMOTE = 1e-3; // the surface's radius over the distance of a light that is far
   const OPENGL = new THREE.Matrix4().makeScale(1, -1, -1); // from x right, y down, z forward
 
   class Surface {
@@ -119,13 +120,16 @@
       this.object.position.set(0, 0, 0); // cameras are in the frame without the offset
       object.geometry.computeBoundingSphere();
       ({ center: this.center, radius: this.radius } = object.geometry.boundingSphere);
+      object.geometry.computeBoundingBox();
+      const box = object.geometry.boundingBox; // the lights' distances are in its half diagonals
+      this.middle = { center: box.getCenter(new THREE.Vector3()), radius: box.min.distanceTo(box.max) / 2 };
       this.up = vector(data.up);
-      this.light = new THREE.DirectionalLight();
+      this.light = new THREE.PointLight();
       this.ambient = new THREE.AmbientLight();
       this.markers = new THREE.Group();
       this.lamps = new THREE.Group();
       this.markers.visible = this.lamps.visible = false;
-      this.world.add(object, this.light, this.light.target, this.ambient, this.markers, this.lamps);
+      this.world.add(object, this.light, this.ambient, this.markers, this.lamps);
       this.lamp = { view: new THREE.Vector3(-0.45, 0.55, 0.7).normalize(), fitted: null };
       this.behind = null; // the photograph whose camera is stood behind
       this.layers = this.makeLayers();
@@ -378,19 +382,20 @@
       this.camera.updateMatrixWorld();
       const towards = this.direction();
       const { fitted } = this.lamp;
-      this.light.target.position.copy(this.center);
+      const distance = this.middle.radius / Math.max(fitted?.closeness ?? 0, REMOTE);
       this.light.position.copy(towards).transformDirection(this.camera.matrixWorld)
-        .multiplyScalar(4 * this.radius).add(this.center);
-      // Radiance is albedo times light here; the renderer divides it by pi.
+        .multiplyScalar(distance).add(this.middle.center);
+      // Radiance is albedo times light here; the renderer divides it by pi, and by the distance's
+      // square.
+      this.light.intensity = Math.PI * distance ** 2;
       if (fitted) {
         this.light.color.setRGB(...fitted.directed);
         this.ambient.color.setRGB(...fitted.ambient);
-        this.light.intensity = this.ambient.intensity = Math.PI;
+        this.ambient.intensity = Math.PI;
       } else {
         const ambient = Number(find("ambient").value);
         this.light.color.set(0xffffff);
         this.ambient.color.set(0xffffff);
-        this.light.intensity = Math.PI;
         this.ambient.intensity = Math.PI * ambient;
       }
       const bulb = find("lamp").querySelector(".bulb");

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.report.predictions import Prediction
 from pimper_torch.report.sections import section_entries
-from pimper_torch.report.views import Prediction, view_entries
+from pimper_torch.report.views import view_entries
 from pimper_torch.viz.turn import up_world
 
 # Places of the template that its parts go into.

@@ -1,34 +1,16 @@
 """What a page says of every photograph: its camera, its picture, its light."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.relighting.lights import ViewLights
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
+from pimper_torch.report.predictions import Prediction
 
 Json = dict[str, object]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
-    """A photograph as the surface explains it.
-
-    Attributes:
-        radiance: Linear, under the photograph's fitted light; zero off the surface.
-        direction: Towards the light, unit, world frame.
-        directed: Radiance that the light adds to albedo 1 facing it, a channel.
-        ambient: The same of light from all around.
-        figure: What the prediction is worth, in a few words.
-    """
-
-    radiance: Float[Tensor, "channel height width"]
-    direction: Float[Tensor, " 3"]
-    directed: Float[Tensor, " channel"]
-    ambient: Float[Tensor, " channel"]
-    figure: str
 
 
 def view_entries(
@@ -64,14 +46,18 @@ def view_entries(
 
 
 def _prediction(predicted: Prediction, longest: int) -> Json:
-    light = {
-        "direction": predicted.direction.tolist(),
-        "directed": _three(predicted.directed),
-        "ambient": _three(predicted.ambient),
-    }
     picture = jpeg(shrunk(predicted.radiance, longest))
-    return {"light": light, "prediction": picture, "figure": predicted.figure}
+    return {"light": _light(predicted.light), "prediction": picture, "figure": predicted.figure}
+
+
+def _light(light: ViewLights) -> Json:
+    return {
+        "direction": light.direction_world[0].tolist(),
+        "closeness": float(light.closeness[0]),
+        "directed": _three(light.directed[0]),
+        "ambient": _three(light.ambient[0]),
+    }
 
 
 def _three(values: Float[Tensor, " channel"]) -> list[float]:
-    return values.detach().cpu().double().expand(3).tolist()
+    return values.expand(3).tolist()

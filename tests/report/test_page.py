@@ -11,10 +11,12 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.relighting.lights import ViewLights
 from pimper_torch.report.page import Layer, write_page
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
+from pimper_torch.report.predictions import Prediction, predictions
 from pimper_torch.report.sections import section_entries
-from pimper_torch.report.views import Prediction, view_entries
+from pimper_torch.report.views import view_entries
 
 SUMMARY = {
     "doubt": None,
@@ -106,13 +108,13 @@ def test_pinholes_are_those_of_the_run(reconstruction):
 
 
 def test_a_prediction_comes_with_its_light(reconstruction):
-    told = Prediction(
-        radiance=torch.full((1, 40, 60), 0.2),
-        direction=torch.tensor([0.0, 0.6, 0.8]),
-        directed=torch.tensor([0.5]),
-        ambient=torch.tensor([0.1]),
-        figure="30.0 dB",
+    light = ViewLights(
+        direction_world=torch.tensor([[0.0, 0.6, 0.8]]),
+        closeness=torch.tensor([0.2]),
+        ambient=torch.tensor([[0.1]]),
+        directed=torch.tensor([[0.5]]),
     )
+    told = Prediction(radiance=torch.full((1, 40, 60), 0.2), light=light, figure="30.0 dB")
     first, second, _ = view_entries(
         reconstruction.scene, reconstruction.silhouettes, [None, told, None]
     )
@@ -122,6 +124,23 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     assert second["light"]["direction"] == pytest.approx([0.0, 0.6, 0.8])
     picture = decoded(second["prediction"])
     assert abs(picture.mean() - 255 * float(srgb_from_linear(torch.tensor(0.2)))) < 1.5
+
+
+def test_predictions_are_of_every_photograph(reconstruction):
+    scene = reconstruction.scene
+    lights = ViewLights(
+        direction_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3),
+        closeness=torch.zeros(3),
+        ambient=torch.tensor([[0.1], [0.2], [0.4]]),
+        directed=torch.zeros(3, 1),
+    )
+    found = predictions(reconstruction.mesh, scene, lights, None, ["a", "b", "c"])
+    assert [one.figure for one in found] == ["a", "b", "c"]
+    first, second, third = (one.radiance.sum() for one in found)
+    assert first > 0
+    assert second > 1.5 * first
+    assert third > 1.5 * second
+    assert found[0].radiance.shape[1:] == (40, 60)
 
 
 def decoded(address):
