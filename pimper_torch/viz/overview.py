@@ -96,7 +96,7 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PAN
     with warnings.catch_warnings():
         # Names in scripts that the font lacks are drawn as boxes; the files have them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(path, dpi=_DPI, facecolor="white")
+        figure.savefig(path, dpi=_DPI, facecolor="white", pil_kwargs={"compress_level": 3})
 
 
 def _boxes(shown: list[Panel]) -> tuple[list[Box], tuple[float, float]]:
