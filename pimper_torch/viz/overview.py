@@ -1,11 +1,13 @@
 """The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
 
-import warnings
 from dataclasses import dataclass
+from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
@@ -14,7 +16,7 @@ from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.render import bounding_box, crop, rotation, shade
-from pimper_torch.viz.silhouettes import RELIABLE, thumbnails
+from pimper_torch.viz.silhouettes import RELIABLE, border, thumbnails
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 Box = tuple[float, float, float, float]  # left, bottom, width, height, fractions of the sheet
@@ -26,6 +28,8 @@ _ACROSS = 4
 # Inches of the sheet: width of a panel, room round it, heights of its title and of the sheet's.
 _PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
 _DPI = 100
+_HEADLINE_PX, _TITLE_PX = 18, 15  # sizes of letters
+_LINES = tuple(round(255 * part) for part in RELIABLE)
 _PANEL_PX = round(_PANEL_IN * _DPI)
 _THUMBNAILS_ACROSS = 8
 _MAX_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
@@ -62,41 +66,51 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PAN
         path: Ends in ``.png``.
         panel_px: Width of a rendered picture.
     """
-    # Local, so that importing the package does not load matplotlib; Figure without pyplot
-    # leaves no global state behind.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import PolyCollection
-    from matplotlib.figure import Figure
-
     shown = panels(result, panel_px)
     boxes, size = _boxes(shown)
     below = _all_views(result)
     if below is not None:
         shown = [*shown, below]
         boxes, size = _with_band(boxes, size, below)
-    figure = Figure(figsize=size)
-    FigureCanvasAgg(figure)
-    figure.suptitle(headline(result), fontsize=13, y=1 - 0.25 * _HEADLINE_IN / size[1])
-    for panel, box in zip(shown, boxes, strict=True):
-        axes = figure.add_axes(box)
-        height, width = panel.picture.shape[:2]
-        axes.imshow(panel.picture, extent=(0, width, height, 0), interpolation="antialiased")
-        if panel.inside is not None and _has_border(panel.inside):
-            at = np.arange(width) + 0.5, np.arange(height) + 0.5
-            axes.contour(*at, panel.inside, levels=[0.5], colors=[RELIABLE], linewidths=0.8)
-        if panel.lines is not None:
-            axes.add_collection(
-                PolyCollection(
-                    list(panel.lines), facecolors="none", edgecolors="#ffd24a", linewidths=0.6
-                )
-            )
-        axes.set_title(panel.title, fontsize=11)
-        axes.set_axis_off()
-        axes.set_anchor("N")
-    with warnings.catch_warnings():
-        # Names in scripts that the font lacks are drawn as boxes; the files have them.
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(path, dpi=_DPI, facecolor="white", pil_kwargs={"compress_level": 3})
+    width, height = (round(_DPI * side) for side in size)
+    sheet = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(sheet)
+    at = width / 2, _DPI * _HEADLINE_IN / 2
+    pen.text(at, headline(result), "black", _font(_HEADLINE_PX), anchor="mm")
+    for panel, (left, bottom, wide, tall) in zip(shown, boxes, strict=True):
+        drawn = _drawn(panel, width * wide, height * tall)
+        middle, top = width * (left + wide / 2), height * (1 - bottom - tall)
+        sheet.paste(drawn, (round(middle - drawn.width / 2), round(top)))
+        pen.text((middle, top - _TITLE_PX / 2), panel.title, "black", _font(_TITLE_PX), anchor="ms")
+    sheet.save(path, compress_level=3)  # of 9: a tenth larger, in half the time
+
+
+def _font(size_px: int) -> ImageFont.FreeTypeFont:
+    """Return the font that comes with matplotlib, which has more scripts than Pillow's own.
+
+    Matplotlib itself takes a quarter of a second to load.
+    """
+    file = distribution("matplotlib").locate_file("matplotlib/mpl-data/fonts/ttf/DejaVuSans.ttf")
+    return ImageFont.truetype(str(file), size_px)
+
+
+def _drawn(panel: Panel, most_wide: float, most_tall: float) -> Image.Image:
+    """Draw a panel as large as its box allows."""
+    height, width = panel.picture.shape[:2]
+    scale = min(most_wide / width, most_tall / height)
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    drawn = Image.fromarray((255 * panel.picture).round().astype(np.uint8)).resize(size)
+    if panel.inside is not None:
+        inside = np.asarray(Image.fromarray(panel.inside).resize(size)) > 0.5
+        line = border(torch.from_numpy(inside)).numpy()
+        drawn.paste(_LINES, mask=Image.fromarray(line))
+    if panel.lines is not None:
+        fine = Image.new("L", (2 * drawn.width, 2 * drawn.height))
+        pen = ImageDraw.Draw(fine)
+        for corners in 2 * scale * panel.lines:
+            pen.polygon(corners.flatten().tolist(), outline=255, width=2)
+        drawn.paste(_LINES, mask=fine.reduce(2))
+    return drawn
 
 
 def _boxes(shown: list[Panel]) -> tuple[list[Box], tuple[float, float]]:
@@ -149,10 +163,6 @@ def _all_views(result: Reconstruction) -> Panel | None:
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
     reliable = f"{int(silhouettes.reliable.sum())} of {len(silhouettes.reliable)} views trusted"
     return Panel(title=f"{origin}, {reliable}", picture=_array(tiles))
-
-
-def _has_border(inside: Picture) -> bool:
-    return bool(inside.min() < 0.5 < inside.max())
 
 
 def panels(result: Reconstruction, panel_px: int) -> list[Panel]:

@@ -96,8 +96,7 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
     assert yellow.sum() > 1.5 * red.sum()  # two views are trusted, one is not
 
 
-def test_an_silhouette_without_border_is_not_drawn(reconstruction, tmp_path):
-    """Matplotlib would warn of a contour that is not there."""
+def test_a_silhouette_without_border_is_not_drawn(reconstruction, tmp_path):
     silhouettes = Silhouettes(
         inside=torch.ones(3, 40, 60), reliable=torch.ones(3, dtype=torch.bool), source="masks"
     )
