@@ -11,6 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from pimper_torch.asset.bake import Textured
+from pimper_torch.asset.make import textured
+from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.finish import Finished, MeshFiles, finished
@@ -31,6 +34,11 @@ RESULT_NAMES = (
     "mesh.glb",
     "mesh.stl",
     "mesh.obj",
+    "asset.glb",
+    "asset.obj",
+    "asset.mtl",
+    "asset_albedo.png",
+    "asset_normal.png",
     "sparse",
     "masks",
     "normals.png",
@@ -41,7 +49,7 @@ RESULT_NAMES = (
     "summary.json",
     "overview.png",
 )
-_PARTS = 4  # of the bar: simplification, meshes and cameras, maps, contact sheet
+_PARTS = 5  # of the bar: simplification, meshes and cameras, asset, maps, contact sheet
 
 
 def write_result(
@@ -63,6 +71,11 @@ def write_result(
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
     `mesh.stl`       if asked for: triangles alone
     `mesh.obj`       if asked for: normals, albedo as sRGB colour
+    `asset.glb`      50,000 faces at most, without caps: albedo and normals as textures, baked
+                     from every vertex; ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence) of its
+                     vertices
+    `asset.obj`      if an OBJ is asked for: the same, with `asset.mtl`, `asset_albedo.png` and
+                     `asset_normal.png`
     `sparse/`        COLMAP model, in the mesh's frame
     `masks/`         the object's silhouette in every photograph as it was undistorted, PNG of its
                      name; none where everything is the object
@@ -108,10 +121,17 @@ def write_result(
         found, whole = whole, whole.replace(mesh=ready.mesh)
         with part(1, _PARTS):
             _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
+        with part(2, _PARTS):
+            asset = textured(found.mesh, ready.mesh)
+            _write_asset(asset, files or MeshFiles(), whole.scene.offset_world, staging)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
-        summary = {**summary_report(found, about or {}), **ready.summary}
+        summary = {
+            **summary_report(found, about or {}),
+            **ready.summary,
+            "asset": asset.summary,
+        }
         _write_json(summary, staging / "summary.json", indent=2)
 
 
@@ -127,15 +147,21 @@ def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Pat
         write_obj(mesh, folder / "mesh.obj", offset, measured)
 
 
+def _write_asset(asset: Textured, files: MeshFiles, offset: Offset, folder: Path) -> None:
+    write_asset(asset, folder / "asset.glb", offset)
+    if "obj" in files.formats:
+        write_asset_obj(asset, folder / "asset.obj", offset)
+
+
 def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
-    with part(2, _PARTS):
+    with part(3, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(3, _PARTS):
+    with part(4, _PARTS):
         draw_overview(result, folder / "overview.png")
 
 
