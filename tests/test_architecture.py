@@ -51,6 +51,7 @@ ROOMS = [
     "reporting",
     "chains",
     "viz",
+    "asset",
     "relighting",
     "report",
     "outputs",
@@ -66,6 +67,7 @@ ROOMS = [
 SOLE_IMPORTERS = {
     "pycolmap": {"sfm/binding.py"},
     "embreex": {"geometry/visibility.py"},
+    "xatlas": {"asset/charts.py"},
     "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py", "io/tiff.py"},
     "tifffile": {"io/tiff.py"},

@@ -42,6 +42,7 @@ class CommonOptions:
         watertight: Close the mesh; caps are marked as not measured.
         stl: Write the mesh as STL, too.
         obj: Write the mesh as OBJ, too.
+        no_report: Leave out report.html.
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
         max_kept: Size it may reach, such as 2GB.
@@ -56,6 +57,7 @@ class CommonOptions:
     watertight: Flag = False
     stl: Flag = False
     obj: Flag = False
+    no_report: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
@@ -123,7 +125,10 @@ class Job:
 
 
 # What few people need: `--help-all` tells of it.
-_RARE = (*("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),)
+_RARE = (
+    *("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
+    "--no-report",
+)
 
 # The skull's cranium and face both show in this photograph.
 SKULL = CommonOptions(reference="37")

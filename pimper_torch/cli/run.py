@@ -138,6 +138,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequ
         overwrite=job.common.overwrite,
         about=about,
         files=job.common.files,
+        report=not job.common.no_report,
     )
 
 
@@ -157,7 +158,8 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
         output.warning(result.scene.doubt)
     if left_out := closing_line(result.left_out):
         output.remark(left_out)
-    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.")
+    shown = job.out / ("overview.png" if job.common.no_report else "report.html")
+    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {shown} shows it.")
     paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
     figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))
     output.result({"folder": job.out, **paths}, figures=figures)

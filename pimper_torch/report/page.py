@@ -4,12 +4,16 @@ import base64
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from pimper_torch.asset.bake import Textured
+from pimper_torch.asset.write import write_asset
 from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.report.layers import Layer
 from pimper_torch.report.predictions import Prediction
 from pimper_torch.report.sections import section_entries
 from pimper_torch.report.views import view_entries
@@ -18,26 +22,8 @@ from pimper_torch.viz.turn import up_world
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layer:
-    """One number a vertex, shown in colours from ``low`` to ``high``.
-
-    Attributes:
-        attribute: Of the asset's vertices, in small letters.
-        title: On the button.
-        about: Longer, shown when the button is pointed at.
-        low_text: Under the lowest colour.
-        high_text: Under the highest.
-    """
-
-    attribute: str
-    title: str
-    about: str
-    low: float
-    high: float
-    low_text: str
-    high_text: str
+# Of a page of 15 MB, whose pictures take up to 4 MB; text takes a third more than bytes.
+_MAX_ASSET_BYTES = 7_500_000
 
 
 def write_page(
@@ -85,6 +71,20 @@ def write_page(
         return parts[name] if name in parts else _read(name)
 
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
+
+
+def asset_within(asset: Textured, path: Path) -> bytes:
+    """Read an asset's file, or make one with coarser textures where it is too large for a page.
+
+    Args:
+        path: Of the asset's GLB.
+    """
+    if path.stat().st_size <= _MAX_ASSET_BYTES or min(asset.base_color.shape[:2]) < 2:
+        return path.read_bytes()
+    with TemporaryDirectory(prefix="pimper_page_") as folder:
+        smaller, coarser = Path(folder) / path.name, asset.halved()
+        write_asset(coarser, smaller)
+        return asset_within(coarser, smaller)
 
 
 def _read(name: str) -> str:

@@ -80,7 +80,7 @@ def fitted(picture: Picture, room_px: int) -> Picture:
     if size == (width, height):
         return picture
     resized = _image(picture).resize(size, Image.Resampling.LANCZOS)
-    return np.asarray(resized, dtype=np.float32) / 255
+    return _picture(resized)
 
 
 def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: str) -> Picture:
@@ -94,7 +94,7 @@ def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: 
     draw = ImageDraw.Draw(large)
     for triangle in (_SMOOTH * corners).tolist():
         draw.line([tuple(corner) for corner in (*triangle, triangle[0])], color)
-    return np.asarray(large.reduce(_SMOOTH), dtype=np.float32) / 255
+    return _picture(large.reduce(_SMOOTH))
 
 
 def with_color(
@@ -119,6 +119,10 @@ def array(values: Float[Tensor, "*batch"]) -> Picture:
 
 def _image(picture: Picture) -> Image.Image:
     return Image.fromarray((255 * picture.clip(0, 1)).round().astype(np.uint8))
+
+
+def _picture(image: Image.Image) -> Picture:
+    return np.asarray(image, dtype=np.float32) / np.float32(255)
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

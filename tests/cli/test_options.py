@@ -32,7 +32,7 @@ RUNS = {
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
-        "--overwrite --faces 500 --watertight --stl --obj --fresh --cache {out}_kept "
+        "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
         "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip",
     ],
     "render": [

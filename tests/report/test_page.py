@@ -12,7 +12,8 @@ from torch.testing import assert_close
 
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.relighting.lights import ViewLights
-from pimper_torch.report.page import Layer, write_page
+from pimper_torch.report.layers import Layer
+from pimper_torch.report.page import write_page
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
 from pimper_torch.report.predictions import Prediction, predictions
 from pimper_torch.report.sections import section_entries
