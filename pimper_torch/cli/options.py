@@ -210,7 +210,8 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
         return {name for option in every for name in option.names}
 
     written = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
-    for option in sorted(written - options(preset)):
+    named = {argument for argument in written if argument.startswith("--")}
+    for option in sorted(named - options(preset)):
         having = [name for name in presets() if option in options(name)]
         if having:
             raise ConfigError(
