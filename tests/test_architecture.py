@@ -53,6 +53,7 @@ ROOMS = [
     "viz",
     "outputs",
     "io",
+    "exchange",
     "doctor",
     "video",
     "cli",

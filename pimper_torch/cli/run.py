@@ -120,7 +120,7 @@ def _examine(job: Job, views: Views) -> None:
 
 def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
     about: dict[str, object] = {
-        "photographs": str(job.photos),
+        "photographs": str(job.photos.absolute()),
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
         "mesh": _text(job.inputs.mesh),

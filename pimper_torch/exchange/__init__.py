@@ -1,0 +1,5 @@
+"""Folders of results: read back, and written for other programs."""
+
+from pimper_torch.exchange.result import Result, read_result
+
+__all__ = ["Result", "read_result"]
