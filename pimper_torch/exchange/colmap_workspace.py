@@ -11,9 +11,9 @@ from torch import Tensor
 from pimper_torch.exchange.pictures import file_names, refuse_skew, write_mask, write_picture
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.records import Cameras, Views
+from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses, undistort_pixels, write_binary
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.scene import model_of_scene, point_colors
 from pimper_torch.viz.maps import view_maps
 
@@ -70,20 +70,9 @@ def write_workspace(result: Result, folder: Path) -> None:
     Args:
         folder: Made if it is not there.
     """
-    scene, cameras = result.scene, result.cameras
+    scene = result.scene
     files = _write_pictures(result.masked_views, folder)
-    pixels = torch.empty_like(scene.observation_pixels, dtype=torch.float64)
-    for view, (lens, K) in enumerate(zip(scene.lenses, cameras.intrinsics, strict=True)):
-        here = scene.observation_view == view
-        ends = homogeneous(undistort_pixels(lens, scene.observation_pixels[here].double()))
-        pixels[here] = (ends @ K.mT)[:, :2]
-    model = model_of_scene(scene).replace(
-        names=files,
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=cameras.cam_from_world,
-        observation_pixels=pixels,
-    )
-    write_binary(model, point_colors(scene), folder / "sparse")
+    write_pinholes(scene, result.cameras, files, folder / "sparse")
     stereo = folder / "stereo"
     write_stereo_folder(files, stereo)
     for view, file in enumerate(files):
@@ -91,6 +80,36 @@ def write_workspace(result: Result, folder: Path) -> None:
         depths = maps.depth.nan_to_num(0)[..., None]
         for kind, values in zip(_KINDS, (depths, maps.normals_cam), strict=False):
             _write_array(values, stereo / kind / f"{file}.geometric.bin")
+
+
+def write_pinholes(
+    scene: SparseScene, cameras: Cameras, files: Sequence[str], folder: Path
+) -> None:
+    """Write a scene's pinholes, cloud and tracks as a model of its undistorted photographs.
+
+    Points that fewer than two views see are left out: stereo programs take none.
+
+    Args:
+        cameras: Those of the scene, in the frame of ``scene.offset_world``.
+        files: Of the photographs, one a view.
+        folder: Gets the binary files; made if it is not there.
+
+    Raises:
+        OutputError: The model cannot be written.
+    """
+    pixels = torch.empty_like(scene.observation_pixels, dtype=torch.float64)
+    for view, (lens, K) in enumerate(zip(scene.lenses, cameras.intrinsics.double(), strict=True)):
+        here = scene.observation_view == view
+        ends = homogeneous(undistort_pixels(lens, scene.observation_pixels[here].double()))
+        pixels[here] = (ends @ K.mT)[:, :2]
+    model = model_of_scene(scene).replace(
+        names=tuple(files),
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.double(),
+        observation_pixels=pixels,
+    )
+    tied = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
+    write_binary(select_views(model, range(model.num_views)), point_colors(scene)[tied], folder)
 
 
 def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
