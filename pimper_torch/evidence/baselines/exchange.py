@@ -7,15 +7,12 @@ model: all see the very photographs and cameras that our own stages see.
 
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
-
 from pimper_torch.errors import InputError, ReconstructionError
 from pimper_torch.evidence.baselines.external import last_lines
 from pimper_torch.exchange.colmap_workspace import write_pinholes
+from pimper_torch.exchange.pictures import write_mask, write_picture
 from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 
 
@@ -30,15 +27,11 @@ def write_photographs(scene: SparseScene, folder: Path, suffix: str) -> tuple[st
     Returns:
         The files' names, ``00000000.png`` and so on, in the order of the views.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    names = []
-    for index, (image, (width, height)) in enumerate(
-        zip(scene.views.images, scene.cameras.sizes_px.tolist(), strict=True)
-    ):
-        encoded = to_bytes(image[:, :height, :width].detach()).expand(3, -1, -1)
-        names.append(f"{index:08d}{suffix}")
-        Image.fromarray(encoded.movedim(0, -1).cpu().numpy()).save(folder / names[-1])
-    return tuple(names)
+    names = tuple(f"{index:08d}{suffix}" for index in range(scene.views.num_views))
+    colour = scene.views.replace(images=scene.views.images.expand(-1, 3, -1, -1))
+    for index, name in enumerate(names):
+        write_picture(colour, index, folder / name)
+    return names
 
 
 def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
@@ -49,12 +42,8 @@ def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
     """
     if scene.views.masks is None:
         return False
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, (mask, (width, height)) in enumerate(
-        zip(scene.views.masks, scene.cameras.sizes_px.tolist(), strict=True)
-    ):
-        white = 255 * mask[:height, :width].cpu().numpy().astype(np.uint8)
-        Image.fromarray(white).save(folder / f"{index:08d}{suffix}")
+    for index in range(scene.views.num_views):
+        write_mask(scene.views, index, folder / f"{index:08d}{suffix}")
     return True
 
 
