@@ -51,6 +51,7 @@ ROOMS = [
     "reporting",
     "chains",
     "viz",
+    "report",
     "outputs",
     "io",
     "exchange",
