@@ -17,6 +17,8 @@ from .errors import OutputError as OutputError
 from .errors import PimperError as PimperError
 from .errors import PimperWarning as PimperWarning
 from .errors import ReconstructionError as ReconstructionError
+from .exchange.result import Result as Result
+from .exchange.result import read_result as read_result
 from .fusion.fuse import Fuse as Fuse
 from .io.finish import MeshFiles as MeshFiles
 from .io.meshes import read_mesh as read_mesh

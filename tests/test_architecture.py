@@ -56,6 +56,7 @@ ROOMS = [
     "report",
     "outputs",
     "io",
+    "exchange",
     "doctor",
     "video",
     "cli",

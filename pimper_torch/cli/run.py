@@ -119,7 +119,7 @@ def _examine(job: Job, views: Views) -> None:
 
 def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequence[str]) -> None:
     about: dict[str, object] = {
-        "photographs": str(job.photos),
+        "photographs": str(job.photos.absolute()),
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
         "mesh": _text(job.inputs.mesh),

@@ -65,13 +65,13 @@ def read_estimate(path: Path | str) -> Estimate:
     cameras = None
     if (path / "sparse").is_dir():
         names, cameras = read_cameras(path / "sparse")
-    lights = _read_lights(path / "lights.json", names)
+    lights = read_lights(path / "lights.json", names)
     return Estimate(
         mesh=mesh,
         names=names,
         cameras=cameras,
         lights_world=lights,
-        reference=_read_reference(path / "depth.npz"),
+        reference=read_reference(path / "depth.npz"),
     )
 
 
@@ -93,8 +93,16 @@ def read_cameras(folder: Path | str) -> tuple[tuple[str, ...], Cameras]:
     return model.names, cameras
 
 
-def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
-    """Return the light of every named view; NaN where the file has none."""
+def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
+    """Read the light of every named view; NaN where the file has none.
+
+    Returns:
+        ``None`` where there is no such file, no view, or no light.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    path = Path(path)
     if not path.is_file() or not names:
         return None
     try:
@@ -110,7 +118,13 @@ def _read_lights(path: Path, names: tuple[str, ...]) -> Float[Tensor, "view 4"] 
     return lights if bool(lights.isfinite().any()) else None
 
 
-def _read_reference(path: Path) -> str | None:
+def read_reference(path: Path | str) -> str | None:
+    """Read the name of the reference view; ``None`` where there is no such file.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    path = Path(path)
     if not path.is_file():
         return None
     try:

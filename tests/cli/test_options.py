@@ -1,7 +1,9 @@
 """Every option of every command, once, from the command line."""
 
 import dataclasses
+import json
 import re
+import shutil
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -49,6 +51,10 @@ RUNS = {
         "{ball} -o {out} {tiny} --no-constant-light --turned-over --table patterned",
         "{ball} -o {out} {tiny} --no-turned-over",
     ],
+    "export": [
+        "{result} --out {out} --format colmap nerfstudio alicevision maps lights --axes lub "
+        "--photos {photos} --overwrite",
+    ],
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
@@ -95,7 +101,15 @@ def world(tmp_path_factory, dtu):
     true_mesh = read_mesh(scene / "truth" / "mesh.ply")
     told = true_mesh.replace(expected_error=0.01 + 0.01 * true_mesh.vertices_world[:, 2])
     write_ply(told, folder / "told.ply")
+    result = folder / "result"
+    shutil.copytree(scene / "truth" / "sparse", result / "sparse")
+    shutil.copy(scene / "truth" / "mesh.ply", result / "mesh.ply")
+    lights = [{"name": f"view_{index:03d}.png", "light": [1, 0, 0, 1]} for index in range(6)]
+    (result / "lights.json").write_text(json.dumps({"views": lights}))
+    (result / "config.yaml").write_text("photographs: {response: srgb}\n")
+    (result / "summary.json").write_text("{}")
     return {
+        "result": result,
         "ball": folder / "ball.ply",
         "told": folder / "told.ply",
         "preset": folder / "preset.yaml",

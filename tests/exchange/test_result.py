@@ -1,0 +1,142 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets import read_transforms
+from pimper_torch.exchange import read_result
+from pimper_torch.exchange.nerfstudio import write_nerfstudio
+from pimper_torch.geometry.projection import project
+from pimper_torch.io import results
+from pimper_torch.io.estimates import estimate_of, read_estimate
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import Encoding
+
+
+def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
+    found = read_result(folder)
+    scene = run.scene
+    assert found.scene.views.names == scene.views.names == ("a.png", "b.png", "c.png")
+    assert torch.equal(found.scene.views.images, scene.views.images)
+    assert (found.cameras.intrinsics[:, 0, 0] > 91).all()  # the lens was undistorted
+    assert_close(found.scene.cameras.intrinsics, scene.cameras.intrinsics)
+    assert_close(found.scene.cameras.cam_from_world, scene.cameras.cam_from_world)
+    assert_close(found.cameras.intrinsics.float(), scene.cameras.intrinsics)
+    assert found.scene.lenses == scene.lenses
+    assert found.scene.unregistered == scene.unregistered == ("d.png",)
+    assert_close(found.scene.points_world, scene.points_world)
+    order = torch.argsort(scene.observation_point, stable=True)
+    assert_close(found.scene.observation_pixels, scene.observation_pixels[order])
+    assert torch.equal(found.silhouettes.inside, run.silhouettes.inside)
+    assert torch.equal(found.silhouettes.reliable, run.silhouettes.reliable)
+    assert found.silhouettes.source == "found"
+    assert found.reference == "b.png"
+    assert found.summary["registered"] == 3
+    assert found.mesh.vertices_world.dtype == torch.float32
+    assert_close(
+        found.lights_world,
+        estimate_of(run).lights_world.double(),
+        rtol=1e-5,
+        atol=1e-6,
+        equal_nan=True,
+    )
+
+
+def test_both_readers_of_a_folder_agree(folder):
+    found, estimate = read_result(folder), read_estimate(folder)
+    assert_close(found.mesh.vertices_world.double(), estimate.mesh.vertices_world)
+    assert_close(found.lights_world, estimate.lights_world, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(found.cameras.cam_from_world, estimate.cameras.cam_from_world)
+    assert found.reference == estimate.reference
+
+
+def test_photographs_that_moved_are_named(folder, photographs, tmp_path):
+    there = read_result(folder)
+    moved = photographs.rename(tmp_path / "moved")
+    with pytest.raises(
+        InputError, match=rf"a\.png, b\.png, c\.png are not in {photographs}.*--photos"
+    ):
+        read_result(folder)
+    found = read_result(folder, moved)
+    assert torch.equal(found.scene.views.images, there.scene.views.images)
+
+
+def test_other_photographs_are_refused(folder, photographs):
+    Image.fromarray(np.zeros((40, 50, 3), np.uint8) + 9).save(photographs / "b.png")
+    with pytest.raises(InputError, match=r"b\.png: has 50 x 40 pixels, but .* from 60 x 40"):
+        read_result(folder)
+    (photographs / "b.png").unlink()
+    with pytest.raises(InputError, match=r"photographs b\.png are not in"):
+        read_result(folder)
+
+
+def test_a_result_without_silhouettes_takes_everything_for_the_object(folder):
+    for path in (folder / "masks").iterdir():
+        path.unlink()
+    (folder / "masks").rmdir()
+    found = read_result(folder).silhouettes
+    assert found.source == "everything"
+    assert found.masks.all()
+
+
+def test_a_summary_that_names_no_photographs_asks_for_them(folder, photographs):
+    summary = json.loads((folder / "summary.json").read_text())
+    del summary["photographs"]
+    (folder / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match="does not name its photographs"):
+        read_result(folder)
+    assert read_result(folder, photographs).scene.views.num_views == 3
+
+
+def test_what_is_no_result_is_refused(folder, tmp_path):
+    with pytest.raises(InputError, match="is no folder"):
+        read_result(tmp_path / "away")
+    (folder / "config.yaml").unlink()
+    with pytest.raises(InputError, match=r"holds no config\.yaml"):
+        read_result(folder)
+
+
+def test_a_mask_of_another_size_is_refused(folder):
+    Image.fromarray(np.full((40, 50), 255, np.uint8)).save(folder / "masks" / "c.png")
+    with pytest.raises(InputError, match=r"c\.png: has 50 x 40 pixels; needed: 60 x 40"):
+        read_result(folder)
+
+
+def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
+    there = read_result(folder)
+    for path in photographs.iterdir():
+        with Image.open(path) as picture:
+            picture.resize((120, 80), Image.Resampling.NEAREST).save(path)
+    found = read_result(folder)
+    assert torch.equal(found.scene.views.sizes_px, there.scene.views.sizes_px)
+    assert torch.equal(found.cameras.intrinsics, there.cameras.intrinsics)
+
+
+def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: path.write_bytes(b""))
+    far = (500_000.0, -3.0, 0.0)
+    scene = run.scene.replace(offset_world=far)
+    about = {"photographs": str(photographs)}
+    config = CoarseToFineConfig(photographs=Encoding(response="linear"))
+    results.write_result(run.replace(scene=scene), config, tmp_path / "far", about=about)
+    found = read_result(tmp_path / "far")
+    assert abs(found.scene.offset_world[0] - far[0]) < 10
+    seen = [
+        project(
+            one.mesh.vertices_world, one.scene.cameras.cam_from_world, one.scene.cameras.intrinsics
+        )[0]
+        for one in (run, found)
+    ]
+    assert_close(*seen, rtol=0, atol=1e-3)
+    centers = run.scene.cameras.centers_world.double() + torch.tensor(far)
+    assert_close(found.cameras.centers_world, centers, rtol=0, atol=1e-5)
+    write_nerfstudio(found, tmp_path / "splats")
+    splats = read_transforms(tmp_path / "splats").cameras
+    assert_close(splats.centers_world, centers, rtol=0, atol=1e-5)
+    placed = found.mesh.vertices_world.double() + torch.tensor(found.scene.offset_world)
+    assert_close(read_mesh(tmp_path / "splats" / "sparse_pc.ply").vertices_world, placed)
