@@ -63,6 +63,7 @@ from .stage import Given as Given
 from .stage import Stage as Stage
 from .store.folders import user_cache as user_cache
 from .sweep.sweep import Sweep as Sweep
+from .viewer.show import show as show
 from .viz.patches import by_facet as by_facet
 from .viz.patches import plot_in_view as plot_in_view
 from .viz.patches import plot_patch as plot_patch

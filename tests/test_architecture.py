@@ -57,6 +57,7 @@ ROOMS = [
     "outputs",
     "io",
     "exchange",
+    "viewer",
     "doctor",
     "video",
     "cli",
@@ -78,6 +79,7 @@ SOLE_IMPORTERS = {
     "yaml": {"config.py"},
     "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
+    "viser": {"viewer/"},
 }
 
 # Where a distribution's module has another name.

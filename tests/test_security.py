@@ -48,7 +48,8 @@ def test_nothing_is_unpickled():
 
 
 def test_no_network_connection_is_opened():
-    assert not [found for found in imports() if found[1] in NETWORK]
+    found = {path for path, name in imports() if name in NETWORK}
+    assert found == {"viewer/server.py"}  # which looks whether an address is this machine's
 
 
 def test_no_text_is_evaluated_but_the_package_itself():

@@ -99,7 +99,8 @@ class Chain(Stage):
     are constants to autograd.
 
     A function that is assigned to ``preview`` is called with the scene and the coarse surface as
-    soon as they are there.
+    soon as they are there; one that is assigned to ``watch`` with the scene as soon as cameras are
+    known, and with every step that is done.
     """
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
@@ -119,6 +120,7 @@ class Chain(Stage):
         self.kernels: Kernels = kernels
         self.observer = observer or Silent()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
+        self.watch: Callable[[SparseScene | Step], None] | None = None
         self.store = store
 
     @abstractmethod
@@ -167,21 +169,29 @@ class Chain(Stage):
             InputError: Cameras come twice.
         """
         if isinstance(views, Views):
-            return sound(self._with_points(self.reconstruct(views, sparse_model), mesh))
-        if sparse_model is not None:
+            views = self.reconstruct(views, sparse_model)
+        elif sparse_model is not None:
             raise InputError(
                 f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
                 f"{sparse_model}; needed: one of the two."
             )
-        if mesh is None and isinstance(self.reconstruct, Reconstruct):
+        elif mesh is None and isinstance(self.reconstruct, Reconstruct):
             views = self.reconstruct.with_points(views)
-        return sound(self._with_points(views, mesh))
+        scene = sound(self._with_points(views, mesh))
+        self._watched(scene)
+        return scene
 
     def _with_points(self, scene: SparseScene, mesh: Mesh | None) -> SparseScene:
         """Take points of depth maps where features gave hardly any, unless a mesh is given."""
         if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene, FEW_OBSERVED):
             return scene
         return self.kept(depth_points, scene)
+
+    def _watched(self, found: "SparseScene | Step") -> None:
+        """Call ``watch``, if it is set."""
+        if self.watch is not None:
+            with stage("view"):
+                self.watch(found)
 
     def show(self, scene: SparseScene, coarse: CoarseMesh) -> None:
         """Call ``preview`` with cameras and coarse surface, if it is set."""
@@ -241,6 +251,8 @@ class Chain(Stage):
                 recorded(self, self.observer) as reports,
             ):
                 step = next(passes, None)
+                if step is not None:
+                    self._watched(step)
             if step is None:
                 return
             if step.last:

@@ -41,6 +41,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper bench [-o OUT] [options]
        pimper convert DATA -o OUT --source KIND --target KIND [options]
        pimper gamma PHOTOS [options]
+       pimper view OUT [options]
        pimper frames VIDEO -o OUT [options]
        pimper markers -o SHEET [options]
        pimper clean OUT
@@ -59,6 +60,7 @@ albedo and light.
   bench         the table: scenes, presets and baselines
   convert       a data set of another layout, or to one
   gamma         the response of photographs from a fixed camera under several lights
+  view          a result in the browser, to turn and to light
   frames        photographs out of a video: sharp frames, equally far apart on the way
   markers       a sheet to print and to photograph with an object, which tells its size
   clean         what runs into a folder kept to go on from, and what killed runs left
@@ -80,6 +82,7 @@ _COMMANDS = {
     "bench": "pimper_torch.evidence.cli.bench",
     "convert": "pimper_torch.evidence.cli.convert",
     "gamma": "pimper_torch.single_view.cli.gamma",
+    "view": "pimper_torch.cli.view",
     "frames": "pimper_torch.cli.frames",
     "markers": "pimper_torch.cli.markers",
     "clean": "pimper_torch.cli.clean",

@@ -23,6 +23,7 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
 from pimper_torch.size.given import Unit, measured_in, number_of
+from pimper_torch.viewer.server import require_viser
 
 # The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
 MAX_KEPT = "8GB"
@@ -46,6 +47,7 @@ class CommonOptions:
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
         max_kept: Size it may reach, such as 2GB.
+        view: Show cameras and every pass in the browser as soon as they are there.
     """
 
     preset: str = "default"
@@ -61,6 +63,7 @@ class CommonOptions:
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
+    view: Flag = False
 
     def __post_init__(self) -> None:
         bytes_of(self.max_kept, "max_kept")
@@ -228,6 +231,8 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
             photographs, or none of the name of the reference.
     """
     job = parse(command, arguments)
+    if job.common.view:
+        require_viser()
     require_apart(job.out, _inputs(job))
     prepare_output(job.out, "result", job.common.overwrite)
     for folder in (job.photos, job.inputs.masks):

@@ -33,6 +33,7 @@ class Output:
     - ``start``: ``command``, ``arguments``, ``versions``, ``format`` (1).
     - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``. Both and
       ``stage-end``: ``seconds_left`` of a run, an estimate; ``null`` of other commands.
+    - ``view``: ``address`` of the page of the viewer.
     - ``preview``: ``path`` of a picture of the coarse surface, which is there until the run ends.
     - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``,
       whether an earlier run found the record; time and memory are that run's then.

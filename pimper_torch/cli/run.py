@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.size import bars_in_files, sized, told_size
+from pimper_torch.cli.view import tell_place
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.doctor.forecast import Forecast
@@ -30,6 +31,8 @@ from pimper_torch.records import CoarseMesh, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
 from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
+from pimper_torch.viewer.results import COARSE, add_found, add_outcome
+from pimper_torch.viewer.viewer import Viewer, opened
 from pimper_torch.viz.overview import headline
 from pimper_torch.viz.preview import draw_preview
 
@@ -41,8 +44,15 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: Before anything is written.
     """
     job = checked(command, arguments)
+    _check_device(job.common.device)
+    with opened() if job.common.view else nullcontext() as viewer:
+        if viewer is not None:
+            tell_place(viewer, output)
+        _carry_out(job, output, viewer)
+
+
+def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
-    _check_device(common.device)
     imports = reported("import", time.perf_counter() - output.began)
     held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
     with held, output.observer(forecast) as observer, overheard() as messages:
@@ -54,8 +64,11 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, observer, _store(job))
-        chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW)
+        chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
+        chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
+        if viewer is not None:
+            add_outcome(viewer, result)
         result = result.replace(report=(imports, *accounted()))
         with stage("write") as told:
             result, scale = sized(job, bars, result)
@@ -66,6 +79,10 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     if scale is not None:
         output.remark(told_size(scale))
     _conclude(output, job, result)
+    if viewer is not None and not output.as_json:
+        output.say(f"The viewer stays at {viewer.address} until Ctrl-C.")
+        with suppress(KeyboardInterrupt):
+            viewer.wait()
 
 
 def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
@@ -79,8 +96,12 @@ def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
     return planned(megapixels, views.num_views, config.scales, cameras=cameras, masks=masks)
 
 
-def _preview(output: Output, path: Path, scene: SparseScene, coarse: CoarseMesh) -> None:
+def _preview(
+    output: Output, path: Path, viewer: Viewer | None, scene: SparseScene, coarse: CoarseMesh
+) -> None:
     """Draw the coarse surface and say where; a disk that refuses ends no run."""
+    if viewer is not None:
+        viewer.add_pass(COARSE, coarse.mesh)
     with suppress(OSError):
         draw_preview(scene, coarse, path)
         output.event("preview", path=path)

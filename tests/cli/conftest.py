@@ -16,6 +16,17 @@ def photos(tmp_path):
 
 
 @pytest.fixture
+def ctrl_c(monkeypatch):
+    """Let whoever looks at a page have seen enough of it."""
+    from pimper_torch.viewer.viewer import Viewer
+
+    def pressed(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "wait", pressed)
+
+
+@pytest.fixture
 def chain(reconstruction, monkeypatch):
     """Put a chain in the place of the real one that tells what it was given."""
     from pimper_torch.cli import run

@@ -30,12 +30,12 @@ RUNS = {
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
-        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm"
+        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
-        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip",
+        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -80,6 +80,7 @@ RUNS = {
     ],
     "markers": ["--out {out}.pdf --paper letter --side-mm 20 --overwrite"],
     "frames": ["{video} --out {out} --count 3 --overwrite"],
+    "view": ["{told} --port 0 --host 127.0.0.1 --photos {photos}"],
     "clean": ["{scene}"],
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
@@ -132,11 +133,12 @@ def run(command, line, world, tmp_path):
     ("command", "line"),
     [(command, line) for command in RUNS if command != "demo" for line in RUNS[command]],
 )
-@pytest.mark.usefixtures("small_pictures")
+@pytest.mark.usefixtures("small_pictures", "ctrl_c")
 def test_every_option_of_a_command_runs(command, line, world, tmp_path):
     assert run(command, line, world, tmp_path) == 0
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     # Its chain is that of `reconstruct`, whose options run above; its photographs are large.
     (line,) = RUNS["demo"]

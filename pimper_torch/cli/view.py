@@ -1,0 +1,80 @@
+"""``pimper view``: a result in a browser."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.cli.arguments import read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.config import require
+from pimper_torch.errors import InputError
+from pimper_torch.viewer.folder import add_folder
+from pimper_torch.viewer.server import HOST, PORT, require_viser
+from pimper_torch.viewer.viewer import Viewer, opened
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    """Turn and light a result in a browser, until Ctrl-C.
+
+    Attributes:
+        out: Folder that `pimper reconstruct` wrote, or a mesh file; needs pip install
+            "pimper_torch[view]".
+        photos: Folder of its photographs, if they were moved.
+        port: Of the page; where it is taken, the next free one.
+        host: Address of this machine; with others than this one, other machines reach the page.
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    photos: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    port: int = PORT
+    host: str = HOST
+
+    def __post_init__(self) -> None:
+        require(0 <= self.port <= 65_535, "port", self.port, "0 to 65535")
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``view``.
+
+    Raises:
+        PimperError: No surface to show, or no such address.
+    """
+    job = checked(command, arguments)
+    with opened(job.host, job.port) as viewer:
+        tell_place(viewer, output, job.port)
+        with suppress(KeyboardInterrupt):  # which ends the page and no work
+            add_folder(viewer, job.out, job.photos)
+            viewer.wait()
+
+
+def tell_place(viewer: Viewer, output: Output, port: int = PORT) -> None:
+    """Tell where the page is.
+
+    Args:
+        port: That was asked for.
+    """
+    output.event("view", address=viewer.address)
+    taken = f" (port {port} is taken)" if port not in (0, viewer.server.get_port()) else ""
+    output.say(f"The viewer is at {viewer.address}{taken}; Ctrl-C ends it.")
+
+
+def checked(command: str, arguments: Sequence[str]) -> _Job:
+    """Read the arguments, and refuse a result that is not there.
+
+    Raises:
+        PimperError: Wrong arguments, nothing to show, or viser is missing.
+        SystemExit: ``--help`` was answered.
+    """
+    job = read_arguments(_Job, command, arguments)
+    require_viser()
+    if not job.out.exists():
+        raise InputError(
+            f"{job.out}: found nothing; needed: a folder written by `pimper reconstruct`, or a "
+            "mesh file."
+        )
+    return job

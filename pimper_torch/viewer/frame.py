@@ -1,0 +1,77 @@
+"""The frame of the viewer: z up, its origin in the middle, cameras about three units away."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.records import Cameras, Mesh, Record
+
+_DISTANCE = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame(Record):
+    """A rotation, a shift and a scale from the world to the viewer.
+
+    Attributes:
+        rotation: Its rows are the viewer's axes: x towards the reference camera, z up.
+        center_world: Origin of the viewer.
+        unit: Scene units in one of the viewer.
+    """
+
+    rotation: Float[Tensor, "3 3"]
+    center_world: Float[Tensor, " 3"]
+    unit: float
+
+    def points(self, points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Carry points from the world to the viewer, float64 on the CPU."""
+        placed = points_world.detach().cpu().double() - self.center_world
+        return placed @ self.rotation.mT / self.unit
+
+    def directions(self, vectors_world: Float[Tensor, "vector 3"]) -> Float[Tensor, "vector 3"]:
+        """Carry directions from the world to the viewer, float64 on the CPU."""
+        return vectors_world.detach().cpu().double() @ self.rotation.mT
+
+
+def frame_of_cameras(
+    cameras: Cameras, reference: int, points_world: Float[Tensor, "point 3"]
+) -> Frame:
+    """Stand the scene on its feet as the photographs, taken together, show it.
+
+    Args:
+        reference: View that the x axis points to.
+        points_world: Of the object; their median is the origin. Without any, it is where the
+            photographs are directed to.
+    """
+    poses = cameras.cam_from_world.detach().cpu().double()
+    up = normalize(-poses[:, 1, :3].mean(dim=0), dim=0)
+    centers = invert_rigid(poses)[:, :3, 3]
+    if len(points_world):
+        middle = points_world.detach().cpu().double().median(dim=0).values
+    else:
+        forward = poses[:, 2, :3]
+        across = torch.eye(3).double() - forward[:, :, None] * forward[:, None]
+        wanted = (across @ centers[..., None]).reshape(-1, 1)
+        middle = torch.linalg.lstsq(across.reshape(-1, 3), wanted, driver="gelsd").solution[:, 0]
+    away = centers - middle
+    x = away[reference] - (away[reference] @ up) * up
+    x = normalize(x, dim=0)
+    return Frame(
+        rotation=torch.stack([x, torch.linalg.cross(up, x), up]),
+        center_world=middle,
+        unit=float(away.norm(dim=1).median()) / _DISTANCE,
+    )
+
+
+def frame_of_mesh(mesh: Mesh) -> Frame:
+    """Centre a mesh without cameras and keep its axes."""
+    low, high = mesh.vertices_world.detach().cpu().double().aminmax(dim=0)
+    return Frame(
+        rotation=torch.eye(3, dtype=torch.float64),
+        center_world=(low + high) / 2,
+        unit=float((high - low).norm()) / _DISTANCE,
+    )

@@ -1,0 +1,299 @@
+"""The page: what is in the scene, and the controls beside it."""
+
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.records import Cameras, Mesh, Views
+from pimper_torch.viewer.frame import Frame, frame_of_cameras, frame_of_mesh
+from pimper_torch.viewer.glb import glb_of
+from pimper_torch.viewer.layers import LAYERS, layers_of, painted
+from pimper_torch.viewer.photographs import small_pictures
+from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, ViserServer
+
+NO_PHOTOGRAPH = "none"
+# Longer side of photographs in place, units of the viewer: cameras are three away, and two dozen of
+# them on a ring stand 0.8 apart. None is put farther into the scene than half that way.
+_SIDE, _DEEPEST = 0.35, 1.5
+_POINT_SIZE = 0.004
+_POINT_COLOR = (110, 140, 190)
+# Raking light from up on the left, and how much of it is round about; degrees.
+_AZIMUTH, _ELEVATION, _AMBIENT = -45.0, 40.0, 0.15
+# Of light that falls straight on: three.js divides by pi what a matte surface reflects.
+_BRIGHTNESS = math.pi
+
+
+class Viewer:
+    """A scene in a browser, which grows while it is looked at.
+
+    Attributes:
+        server: viser's own, for whatever else is to be shown.
+        unit: Of lengths, as the legend tells it.
+    """
+
+    def __init__(self, server: "ViserServer", unit: str = "scene units") -> None:
+        self.server, self.unit = server, unit
+        self._lock = threading.RLock()
+        self._frame: Frame | None = None
+        self._passes: list[tuple[str, Mesh]] = []
+        self._poses: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, float]] = {}
+        self._lights: dict[str, Float[Tensor, " 4"]] = {}
+        scene = server.scene
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(hdri=None)
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
+        self._sun = scene.add_light_directional("/light", intensity=_BRIGHTNESS)
+        self._sky = scene.add_light_ambient("/ambient", intensity=_BRIGHTNESS * _AMBIENT)
+        self._add_controls()
+        self._light()
+
+    @property
+    def address(self) -> str:
+        """What a browser opens."""
+        return address(self.server)
+
+    def stop(self) -> None:
+        """Close the server; the page stays as it was."""
+        close_server(self.server)
+
+    def wait(self) -> None:
+        """Go on until Ctrl-C, which raises ``KeyboardInterrupt``."""
+        self.server.sleep_forever()
+
+    def _repr_html_(self) -> str:
+        """Show the page in a notebook."""
+        return f'<iframe src="{self.address}" width="100%" height="600"></iframe>'
+
+    def add_cameras(
+        self,
+        names: Sequence[str],
+        cameras: Cameras,
+        points_world: Float[Tensor, "point 3"],
+        reference: int = 0,
+        views: Views | None = None,
+    ) -> None:
+        """Show cameras and the sparse cloud, and photographs in place where they are at hand.
+
+        Args:
+            names: Of the photographs, in the order of the cameras.
+            reference: View that the page begins in.
+            views: The photographs.
+        """
+        frame = self._frame = frame_of_cameras(cameras, reference, points_world)
+        scene = self.server.scene
+        points = frame.points(points_world).float().numpy()
+        scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=_POINT_SIZE)
+        self._points.disabled = False
+        scene.add_frame("/cameras", show_axes=False)
+        scene.add_frame("/photographs", show_axes=False)
+        pictures = None if views is None else small_pictures(views)
+        self._photographs.disabled = pictures is None
+        for view, name in enumerate(names):
+            self._add_camera(view, name, cameras, None if pictures is None else pictures[view])
+        self._chosen.options = (NO_PHOTOGRAPH, *names)
+        initial = self.server.initial_camera
+        _, position, ahead, fov = self._poses[names[reference]]
+        initial.position, initial.look_at, initial.fov = position, ahead, fov
+        self.choose(names[reference])
+
+    def _add_camera(
+        self, view: int, name: str, cameras: Cameras, picture: np.ndarray | None
+    ) -> None:
+        from viser.transforms import SO3
+
+        assert self._frame is not None
+        world_from_cam = invert_rigid(cameras.cam_from_world[view].detach().cpu().double())
+        position = self._frame.points(world_from_cam[None, :3, 3])[0].numpy()
+        wxyz = SO3.from_matrix((self._frame.rotation @ world_from_cam[:3, :3]).numpy()).wxyz
+        (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[view].tolist()
+        width, height = cameras.sizes_px[view].tolist()
+        fov = 2 * math.atan(height / 2 / fy)
+        forward = (self._frame.rotation @ world_from_cam[:3, 2]).numpy()
+        ahead = position - (position @ forward) * forward  # turns about the middle
+        self._poses[name] = (wxyz, position, ahead, fov)
+        depth = min(_DEEPEST, _SIDE / max(width / fx, height / fy))
+        # viser makes frusta of the same volume; this one is as deep.
+        scale = depth * math.cbrt(width / height * math.tan(fov / 2) ** 2 / 3)
+        scene, node = self.server.scene, f"{view:05d}"
+        handles: list[Any] = [
+            scene.add_camera_frustum(
+                f"/cameras/{node}",
+                fov,
+                width / height,
+                scale=scale,
+                wxyz=wxyz,
+                position=position,
+                thickness=1.5,
+                thickness_units="screen",
+            )
+        ]
+        if picture is not None:
+            off_center = torch.tensor([(width / 2 - cx) / fx, (height / 2 - cy) / fy, 1.0]).double()
+            middle = self._frame.rotation @ world_from_cam[:3, :3] @ (depth * off_center)
+            handles.append(
+                scene.add_image(
+                    f"/photographs/{node}",
+                    picture,
+                    depth * width / fx,
+                    depth * height / fy,
+                    wxyz=wxyz,
+                    position=position + middle.numpy(),
+                )
+            )
+        for handle in handles:
+            handle.on_click(lambda event, name=name: self.choose(name, event.client))
+
+    def add_pass(self, name: str, mesh: Mesh) -> None:
+        """Show a surface; the slider goes back to those before.
+
+        Args:
+            mesh: In the world of the cameras.
+
+        Raises:
+            InputError: It has no faces.
+        """
+        if not len(mesh.faces):
+            raise InputError(
+                f"the {name} has {len(mesh.vertices_world)} vertices and no faces; needed: a "
+                "surface, as a viewer of point clouds shows clouds."
+            )
+        with self._lock:
+            if self._frame is None:
+                self._frame = frame_of_mesh(mesh)
+            if not self._passes:
+                self._points.value = False  # they lie on the surface
+            self._passes.append((name, mesh.detach().to("cpu")))
+            last = len(self._passes) - 1
+            self._pass.max, self._pass.visible = max(1, last), last > 0
+            if self._pass.value == last:
+                self._paint()
+            else:
+                self._pass.value = last  # paints
+
+    def set_lights(
+        self, names: Sequence[str], lights_world: Float[Tensor, "view 4"] | None
+    ) -> None:
+        """Know the light of photographs, which choosing one of them sets.
+
+        Args:
+            lights_world: First-order harmonics; NaN where unknown.
+        """
+        for name, light in zip(names, () if lights_world is None else lights_world, strict=False):
+            if bool(light.isfinite().all()) and float(light[1:].norm()) > 0:
+                self._lights[name] = light.detach().cpu().double()
+
+    def choose(self, name: str, client: "ClientHandle | None" = None) -> None:
+        """Set the light of a photograph, and stand where it was taken.
+
+        Its own frustum is hidden meanwhile, as it is before the object.
+
+        Args:
+            name: Of the photograph; :data:`NO_PHOTOGRAPH` stays where one is.
+            client: Page that stands there; all of them unless given.
+        """
+        self._chosen.value = name
+        for view, other in enumerate(self._poses):
+            for group in ("cameras", "photographs"):
+                node = self.server.scene.get_handle_by_name(f"/{group}/{view:05d}")
+                if node is not None:
+                    node.visible = other != name
+        if name not in self._poses:
+            return
+        wxyz, position, ahead, fov = self._poses[name]
+        for one in self.server.get_clients().values() if client is None else (client,):
+            with one.atomic():
+                one.camera.fov = fov
+                one.camera.position = position
+                one.camera.look_at = ahead
+                one.camera.wxyz = wxyz
+        if name in self._lights and self._frame is not None:
+            ambient = max(0.0, float(self._lights[name][0]))
+            x, y, z = self._frame.directions(self._lights[name][None, 1:])[0].tolist()
+            self._azimuth.value = math.degrees(math.atan2(y, x))
+            self._elevation.value = math.degrees(math.atan2(z, math.hypot(x, y)))
+            self._ambient.value = ambient / (ambient + math.hypot(x, y, z))
+
+    def _add_controls(self) -> None:
+        gui, scene = self.server.gui, self.server.scene
+        self._layer = gui.add_dropdown("layer", LAYERS)
+        self._pass = gui.add_slider("pass", 0, 1, 1, 0, visible=False)
+        self._about = gui.add_markdown("No surface yet.")
+        self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
+        with gui.add_folder("light"):
+            self._azimuth = gui.add_slider("azimuth", -180.0, 180.0, 1.0, _AZIMUTH)
+            self._elevation = gui.add_slider("elevation", -90.0, 90.0, 1.0, _ELEVATION)
+            self._ambient = gui.add_slider("ambient", 0.0, 1.0, 0.01, _AMBIENT)
+        with gui.add_folder("show"):
+            self._surface = gui.add_checkbox("surface", True)
+            self._cameras = gui.add_checkbox("cameras", True)
+            self._photographs = gui.add_checkbox("photographs", True, disabled=True)
+            self._points = gui.add_checkbox("points", True, disabled=True)
+        for control in (self._layer, self._pass):
+            control.on_update(lambda _: self._paint())
+        for slider in (self._azimuth, self._elevation, self._ambient):
+            slider.on_update(lambda _: self._light())
+        # Without a client it is `choose` itself that sets it.
+        self._chosen.on_update(
+            lambda event: self.choose(self._chosen.value, event.client) if event.client else None
+        )
+        for name in ("surface", "cameras", "photographs", "points"):
+            box = getattr(self, f"_{name}")
+
+            def show(_: object, name: str = name, box: Any = box) -> None:  # noqa: ANN401 - viser's
+                node = scene.get_handle_by_name(f"/{name}")
+                if node is not None:
+                    node.visible = box.value
+
+            box.on_update(show)
+
+    def _paint(self) -> None:
+        """Colour the chosen surface by the chosen layer."""
+        with self._lock:
+            if not self._passes or self._frame is None:
+                return
+            name, mesh = self._passes[round(self._pass.value)]
+            wanted = self._layer.value
+            there = wanted in layers_of(mesh)
+            layer = painted(mesh, wanted if there else "shape", self._frame, self.unit)
+            data = glb_of(
+                self._frame.points(mesh.vertices_world),
+                self._frame.directions(layer.normals_world),
+                layer.colors,
+                mesh.faces,
+                lit=layer.lit,
+            )
+            self.server.scene.add_glb("/surface", data, visible=self._surface.value)
+            legend = layer.legend if there else f'It has no layer "{wanted}": grey clay.'
+            self._about.content = f"**{name}**, {len(mesh.faces):,} faces. {legend}"
+
+    def _light(self) -> None:
+        """Move the light where the sliders are."""
+        azimuth, elevation = math.radians(self._azimuth.value), math.radians(self._elevation.value)
+        flat = math.cos(elevation)
+        direction = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
+        self._sun.position = tuple(10 * one for one in direction)  # it shines on the origin
+        self._sun.intensity = _BRIGHTNESS * (1 - self._ambient.value)
+        self._sky.intensity = _BRIGHTNESS * self._ambient.value
+
+
+@contextmanager
+def opened(host: str = HOST, port: int = PORT) -> Iterator[Viewer]:
+    """Have an empty page in the ``with`` block, see :func:`open_server`."""
+    viewer = Viewer(open_server(host, port))
+    try:
+        yield viewer
+    finally:
+        viewer.stop()

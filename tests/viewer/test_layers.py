@@ -1,0 +1,126 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.records import Cameras, Mesh
+from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh
+from pimper_torch.viewer.glb import glb_of
+from pimper_torch.viewer.layers import LAYERS, layers_of, painted
+
+
+@pytest.fixture
+def ball():
+    """A sphere that carries all that a result does."""
+    vertices, faces = icosphere(2)
+    vertices = vertices.float()
+    return Mesh(
+        vertices_world=vertices,
+        faces=faces,
+        normals_world=vertices,
+        albedo=0.5 + 0.4 * vertices,
+        confidence=(1 + vertices[:, 2]) / 2,
+        expected_error=0.01 * (1 + vertices[:, 2]),
+    )
+
+
+def test_a_mesh_has_the_layers_that_it_carries(ball):
+    assert layers_of(ball) == LAYERS
+    bare = Mesh(vertices_world=ball.vertices_world, faces=ball.faces)
+    assert layers_of(bare) == ("shape", "normals")
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_every_layer_gives_colours_and_says_what_they_mean(ball, name):
+    layer = painted(ball, name, frame_of_mesh(ball))
+    assert layer.colors.shape == ball.vertices_world.shape
+    assert 0 <= float(layer.colors.min()) <= float(layer.colors.max()) <= 1
+    assert layer.lit == (name in ("lit", "shape"))
+    assert layer.legend
+
+
+def test_errors_are_violet_to_yellow_with_their_unit(ball):
+    layer = painted(ball, "expected error", frame_of_mesh(ball), "mm")
+    low, high = (
+        layer.colors[ball.expected_error.argmin()],
+        layer.colors[ball.expected_error.argmax()],
+    )
+    assert low[2] > low[1]
+    assert high[0] > 0.9
+    assert high[2] < 0.1
+    assert "mm" in layer.legend
+
+
+def test_an_unknown_error_is_white(ball):
+    error = ball.expected_error.clone()
+    error[3] = torch.nan
+    layer = painted(ball.replace(expected_error=error), "expected error", frame_of_mesh(ball))
+    assert layer.colors[3].tolist() == [1, 1, 1]
+
+
+def test_the_shape_is_shaded_by_its_own_normals(ball):
+    lying = ball.replace(normals_world=-ball.normals_world)
+    layer = painted(lying, "shape", frame_of_mesh(ball))
+    assert ((layer.normals_world * ball.vertices_world).sum(dim=1) > 0.99).all()
+
+
+def cameras_on_a_ring(count, distance, height):
+    """Upright cameras round the z axis that look at the origin."""
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        center = np.array([distance * np.cos(angle), distance * np.sin(angle), height])
+        z = -center / np.linalg.norm(center)
+        x = np.cross(z, [0, 0, 1])
+        x /= np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(z, x), z])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+        poses.append(pose)
+    return Cameras(
+        intrinsics=torch.eye(3).double().expand(count, 3, 3),
+        cam_from_world=torch.tensor(np.stack(poses)),
+        sizes_px=torch.full((count, 2), 10),
+    )
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_viewer_stands_on_the_ring_of_cameras(known):
+    """Up is the ring's axis, x points to the reference, and cameras are three away."""
+    cameras = cameras_on_a_ring(8, 40.0, 30.0)
+    points = torch.zeros(1 if known else 0, 3)
+    frame = frame_of_cameras(cameras, 2, points)
+    torch.testing.assert_close(frame.rotation[2], torch.tensor([0, 0, 1.0]).double())
+    torch.testing.assert_close(frame.rotation @ frame.rotation.mT, torch.eye(3).double())
+    assert float(frame.rotation.det()) == pytest.approx(1)
+    placed = frame.points(torch.tensor([[0.0, 40.0, 30.0]]))
+    torch.testing.assert_close(placed, torch.tensor([[2.4, 0.0, 1.8]]).double())
+
+
+def test_normals_are_coloured_as_the_reference_camera_sees_them(ball):
+    """Blue towards it, red to its right, green up."""
+    cameras = cameras_on_a_ring(8, 40.0, 0.0)
+    frame = frame_of_cameras(cameras, 0, torch.zeros(1, 3))
+    normals = torch.eye(3)
+    three = Mesh(vertices_world=normals, faces=torch.tensor([[0, 1, 2]]), normals_world=normals)
+    colors = painted(three, "normals", frame).colors
+    assert colors.argmax(dim=1).tolist() == [2, 0, 1]
+
+
+def test_the_file_is_a_glb_of_the_same_surface(ball):
+    trimesh = pytest.importorskip("trimesh")
+    from io import BytesIO
+
+    colors = torch.rand(len(ball.vertices_world), 3, generator=torch.Generator().manual_seed(0))
+    data = glb_of(ball.vertices_world, ball.normals_world, colors, ball.faces, lit=False)
+    read = trimesh.load(BytesIO(data), file_type="glb", process=False, force="mesh")
+    np.testing.assert_array_equal(read.vertices, ball.vertices_world.numpy())
+    np.testing.assert_array_equal(read.faces, ball.faces.numpy())
+    assert len(data) == int.from_bytes(data[8:12], "little")
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    span = tree["bufferViews"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    start = 28 + int.from_bytes(data[12:16], "little") + span["byteOffset"]
+    shorts = np.frombuffer(data[start : start + span["byteLength"]], "<u2").reshape(-1, 4)
+    np.testing.assert_allclose(shorts[:, :3] / 65_535, colors.numpy(), atol=1e-5)
