@@ -1,5 +1,6 @@
 """A surface with textures on few faces."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -26,6 +27,6 @@ def textured(
         few: The same of fewer vertices; it is reduced where it has more faces.
         reflectance: Metallic, roughness and specular of the surface's vertices; matte without.
     """
-    few = reduced(few, _FACES)
+    full, few = (one.detach().to(torch.float32) for one in (full, reduced(few, _FACES)))
     side = float(side_lengths(full.vertices_world[full.faces]).median())
     return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance)

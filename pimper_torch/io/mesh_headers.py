@@ -34,6 +34,26 @@ def impossible(data: bytes, suffix: str) -> str:
         return "its header is nested too deeply"
 
 
+# glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of
+# the first it rounds to 8 bits, or cuts to them.
+COLORS, RAW_COLORS = "COLOR_0", "_COLOR_0"
+_POINTS = 0
+
+
+def with_raw_colors(data: bytes) -> bytes:
+    """Rename the colours of surfaces in a GLB file; trimesh reads no other attributes of points."""
+    length, size = struct.unpack_from("<2I", data, 8)
+    tree = json.loads(data[20 : 20 + size])
+    for mesh in tree.get("meshes", []):
+        for part in mesh["primitives"]:
+            if COLORS in part["attributes"] and part.get("mode") != _POINTS:
+                part["attributes"][RAW_COLORS] = part["attributes"].pop(COLORS)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = struct.pack("<2I", length - size + len(text), len(text))
+    return data[:8] + sizes + data[16:20] + text + data[20 + size :]
+
+
 def _impossible_ply(data: bytes) -> str:
     """Compare counts with the rows of a text; of a binary file, with its bytes."""
     header, _, body = data.partition(b"end_header")

@@ -19,7 +19,7 @@ from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import corners_of
-from pimper_torch.io.mesh_headers import impossible
+from pimper_torch.io.mesh_headers import RAW_COLORS, impossible, with_raw_colors
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.records.faults import beyond, not_finite
@@ -159,7 +159,7 @@ def read_mesh(path: Path | str) -> Mesh:
     try:
         # Without a resolver nothing but the file itself is opened.
         scene = trimesh.load_scene(
-            BytesIO(data),
+            BytesIO(with_raw_colors(data) if suffix == ".glb" else data),
             file_type=suffix.lstrip("."),
             process=False,
             maintain_order=True,
@@ -291,10 +291,11 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
     if len(faces):
         visual = part.visual
         colors = visual.vertex_colors if visual.kind == "vertex" else None
-        colors = getattr(visual, "vertex_attributes", {}).get("color", colors)
+        colors = part.vertex_attributes.get(RAW_COLORS, colors)
     encoded = _rows(colors)
     if encoded is not None:
-        encoded = encoded[:, :3] / (255 if np.asarray(colors).dtype.kind in "ui" else 1)
+        kind = np.asarray(colors).dtype
+        encoded = encoded[:, :3] / (np.iinfo(kind).max if kind.kind in "ui" else 1)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     written = getattr(getattr(raw, "dtype", None), "names", None) or raw
     known = {name: _rows(raw[name]) if name in written else None for name in _ERRORS}

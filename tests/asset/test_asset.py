@@ -21,6 +21,7 @@ from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import write_glb
+from pimper_torch.parallel import on_one_thread
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import base_color
@@ -65,7 +66,7 @@ def sampled(picture, uv):
 
 
 def seen(asset: Textured, count: int = 50_000):
-    """Points anywhere on the asset with normals and base colours as three.js draws them."""
+    """Points on every part of the asset, with normals and base colours as three.js draws them."""
     random = torch.Generator().manual_seed(1)
     face = torch.randint(len(asset.mesh.faces), (count,), generator=random)
     weights = torch.rand(count, 3, generator=random)
@@ -106,8 +107,9 @@ def test_normals_and_albedo_are_those_of_the_surface(full, few, asset, packed):
     assert (color - 255 * srgb_from_linear(albedo)).abs().max() < 1
 
 
-def test_the_same_surface_gives_the_same_texture(full, few, asset):
-    again = textured(full, few)
+def test_the_number_of_threads_changes_no_bit(full, few, asset):
+    with on_one_thread():
+        again = textured(full, few)
     assert torch.equal(again.normal, asset.normal)
     assert torch.equal(again.uv, asset.uv)
     assert torch.equal(again.base_color, asset.base_color)
@@ -155,7 +157,7 @@ def test_every_face_is_a_chart_where_xatlas_fails(few, monkeypatch, why):
 
 
 def test_a_texture_is_never_larger_than_browsers_take(few):
-    for atlas in (unwrapped(few, 0.0005), by_triangles(few, 0.0001)):
+    for atlas in (unwrapped(few, 0.001), by_triangles(few, 0.0001)):
         assert max(atlas.width, atlas.height) in range(MAX_SIDE - 100, MAX_SIDE + 1)
 
 

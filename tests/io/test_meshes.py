@@ -37,11 +37,42 @@ def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
     assert_close(read.vertices_world, mesh.vertices_world, rtol=0, atol=1e-7)  # float32 files
     assert torch.equal(read.faces, mesh.faces)
     assert_close(read.normals_world, mesh.normals_world, rtol=0, atol=1e-6)
-    # 8 bits, in sRGB steepest in the light: 2.3 / 255 / 2.
-    assert_close(read.albedo, mesh.albedo * albedo_scale(mesh), rtol=0, atol=0.006)
+    # The PLY has 8 bits, in sRGB steepest in the light: 2.3 / 255 / 2.
+    tolerance = 0.006 if suffix == ".ply" else 1e-6
+    albedo = (mesh.albedo * albedo_scale(mesh)).clamp(0, 1)
+    assert_close(read.albedo, albedo, rtol=0, atol=tolerance)
     if suffix == ".ply":
         assert_close(read.confidence, mesh.confidence, rtol=0, atol=1e-7)
         assert_close(read.expected_error, mesh.expected_error, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_colours_of_any_kind_that_gltf_has_are_read_as_they_are(kind, mesh, tmp_path):
+    path = tmp_path / "a.glb"
+    write_glb(mesh, path)
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    tree = json.loads(data[20 : 20 + size])
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    top = np.iinfo(kind).max
+    colors = np.random.default_rng(5).integers(0, top, (5, 4), endpoint=True).astype(kind)
+    names = {np.uint8: 5121, np.uint16: 5123}
+    accessor.update(componentType=names[kind], normalized=True, type="VEC4")
+    accessor["bufferView"] = len(tree["bufferViews"])
+    (buffer,) = tree["buffers"]
+    view = {"buffer": 0, "byteOffset": buffer["byteLength"], "byteLength": colors.nbytes}
+    tree["bufferViews"].append(view)
+    buffer["byteLength"] += colors.nbytes
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = data[28 + size :] + colors.tobytes()
+    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(body))
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0")
+    )
+    path.write_bytes(head + chunks + body)
+    wanted = torch.from_numpy(colors[:, :3].astype(np.float64) / top)
+    assert_close(read_mesh(path).albedo, wanted, rtol=0, atol=1e-12)
 
 
 def test_parts_of_a_scene_stand_where_the_scene_puts_them(tmp_path):
