@@ -67,10 +67,8 @@ def run(reconstruction, photographs):
 
 
 @pytest.fixture
-def folder(run, photographs, tmp_path, monkeypatch):
+def folder(run, photographs, tmp_path, small_pictures):
     """The folder of results of that run."""
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
     config = CoarseToFineConfig(photographs=ENCODING)
     about = {"photographs": str(photographs), "masks": None}
     results.write_result(run, config, tmp_path / "out", about=about)
