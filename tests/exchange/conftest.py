@@ -67,7 +67,14 @@ def run(reconstruction, photographs):
 
 
 @pytest.fixture
-def folder(run, photographs, tmp_path, small_pictures):
+def without_pictures(monkeypatch):
+    """Draw nothing: pictures are not read back, and take longer than all else."""
+    for draw in ("draw_overview", "draw_turn"):
+        monkeypatch.setattr(results, draw, lambda *given: given[-1].write_bytes(b""))
+
+
+@pytest.fixture
+def folder(run, photographs, tmp_path, without_pictures):
     """The folder of results of that run."""
     config = CoarseToFineConfig(photographs=ENCODING)
     about = {"photographs": str(photographs), "masks": None}
