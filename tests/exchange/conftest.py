@@ -67,10 +67,15 @@ def run(reconstruction, photographs):
 
 
 @pytest.fixture
-def folder(run, photographs, tmp_path, monkeypatch):
+def without_pictures(monkeypatch):
+    """Draw nothing: pictures are not read back, and take longer than all else."""
+    for draw in ("draw_overview", "draw_turn"):
+        monkeypatch.setattr(results, draw, lambda *given: given[-1].write_bytes(b""))
+
+
+@pytest.fixture
+def folder(run, photographs, tmp_path, without_pictures):
     """The folder of results of that run."""
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
     config = CoarseToFineConfig(photographs=ENCODING)
     about = {"photographs": str(photographs), "masks": None}
     results.write_result(run, config, tmp_path / "out", about=about)

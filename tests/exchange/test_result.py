@@ -117,8 +117,8 @@ def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
     assert torch.equal(found.cameras.intrinsics, there.cameras.intrinsics)
 
 
-def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path, monkeypatch):
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: path.write_bytes(b""))
+@pytest.mark.usefixtures("without_pictures")
+def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path):
     far = (500_000.0, -3.0, 0.0)
     scene = run.scene.replace(offset_world=far)
     about = {"photographs": str(photographs)}

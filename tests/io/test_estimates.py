@@ -13,9 +13,7 @@ from pimper_torch.io.meshes import write_ply
 
 
 @pytest.fixture
-def folder(reconstruction, tmp_path, monkeypatch):
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+def folder(reconstruction, tmp_path, small_pictures):
     results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out")
     return tmp_path / "out"
 
