@@ -29,7 +29,7 @@ from pimper_torch.chains.presets import load_chain, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_llff, write_colmap
-from pimper_torch.evidence.datasets.pictures import file_names
+from pimper_torch.exchange.pictures import file_names
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene

@@ -118,7 +118,7 @@ def leave_out(
     if mask is not None and names:
         names = [name for name, gone in zip(names, mask.tolist(), strict=True) if gone]
     what, reason = GUARDS[guard]
-    count = int(taken) if mask is None else int(mask.sum())
+    count = int(taken) if mask is None else int(mask.count_nonzero())
     entry = LeftOut(
         guard=guard, what=what, count=count, total=total, reason=reason, names=tuple(names)
     )

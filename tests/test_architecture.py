@@ -51,6 +51,9 @@ ROOMS = [
     "reporting",
     "chains",
     "viz",
+    "asset",
+    "relighting",
+    "report",
     "outputs",
     "io",
     "exchange",
@@ -66,6 +69,7 @@ ROOMS = [
 SOLE_IMPORTERS = {
     "pycolmap": {"sfm/binding.py"},
     "embreex": {"geometry/visibility.py"},
+    "xatlas": {"asset/charts.py"},
     "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py", "io/tiff.py"},
     "tifffile": {"io/tiff.py"},

@@ -36,6 +36,7 @@ usage: pimper reconstruct PHOTOS -o OUT [options]
        pimper demo [-o OUT] [options]
        pimper config [NAME] [options]
        pimper render SCENE -o OUT [options]
+       pimper export RESULT -o OUT --format FORMAT [options]
        pimper evaluate RESULT TRUTH [options]
        pimper bench [-o OUT] [options]
        pimper convert DATA -o OUT --source KIND --target KIND [options]
@@ -54,6 +55,7 @@ albedo and light.
   demo          the photographs of a skull that come with the package
   config        the settings of a preset and what they mean, or one of them
   render        photographs of a scene with known truth
+  export        a result in the layouts of other programs
   evaluate      a result against the truth
   bench         the table: scenes, presets and baselines
   convert       a data set of another layout, or to one
@@ -75,6 +77,7 @@ _COMMANDS = {
     "demo": "pimper_torch.cli.run",
     "config": "pimper_torch.cli.settings",
     "render": "pimper_torch.evidence.cli.render",
+    "export": "pimper_torch.cli.export",
     "evaluate": "pimper_torch.evidence.cli.evaluate",
     "bench": "pimper_torch.evidence.cli.bench",
     "convert": "pimper_torch.evidence.cli.convert",

@@ -43,6 +43,7 @@ class CommonOptions:
         watertight: Close the mesh; caps are marked as not measured.
         stl: Write the mesh as STL, too.
         obj: Write the mesh as OBJ, too.
+        no_report: Leave out report.html.
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
         max_kept: Size it may reach, such as 2GB.
@@ -58,6 +59,7 @@ class CommonOptions:
     watertight: Flag = False
     stl: Flag = False
     obj: Flag = False
+    no_report: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
@@ -126,7 +128,10 @@ class Job:
 
 
 # What few people need: `--help-all` tells of it.
-_RARE = (*("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),)
+_RARE = (
+    *("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
+    "--no-report",
+)
 
 # The skull's cranium and face both show in this photograph.
 SKULL = CommonOptions(reference="37")
@@ -208,7 +213,8 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
         return {name for option in every for name in option.names}
 
     written = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
-    for option in sorted(written - options(preset)):
+    named = {argument for argument in written if argument.startswith("--")}
+    for option in sorted(named - options(preset)):
         having = [name for name in presets() if option in options(name)]
         if having:
             raise ConfigError(

@@ -2,7 +2,6 @@
 
 import json
 import time
-import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -19,7 +18,7 @@ from pimper_torch.cli.view import tell_place
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.doctor.forecast import Forecast
-from pimper_torch.errors import ConfigError, PimperWarning
+from pimper_torch.errors import ConfigError, caution, overheard
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -56,7 +55,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = reported("import", time.perf_counter() - output.began)
     held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
-    with held, output.observer(forecast) as observer:
+    with held, output.observer(forecast) as observer, overheard() as messages:
         with stage("read") as told:
             views = _read(job)
             told["photographs"] = views.num_views
@@ -75,7 +74,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             result, scale = sized(job, bars, result)
             if scale is not None:
                 told["scale"] = scale.factor
-            _write(job, result, scale)
+            _write(job, result, scale, messages)
         result = result.replace(report=(imports, *accounted()))
     if scale is not None:
         output.remark(told_size(scale))
@@ -136,10 +135,10 @@ def _examine(job: Job, views: Views) -> None:
         own.add("cost")  # which is that of `default`
     for finding in examine_views(views):
         if finding.severity == "warning" and finding.check not in own:
-            warnings.warn(f"{job.photos}: {finding}", PimperWarning, stacklevel=2)
+            caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
+def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequence[str]) -> None:
     about: dict[str, object] = {
         "photographs": str(job.photos.absolute()),
         "masks": _text(job.inputs.masks),
@@ -151,6 +150,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
         "device": job.common.device,
         "torch": str(torch.__version__),
         "scale": None if scale is None else scale.report(),
+        "warnings": list(dict.fromkeys(messages)),
     }
     write_result(
         result,
@@ -159,6 +159,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
         overwrite=job.common.overwrite,
         about=about,
         files=job.common.files,
+        report=not job.common.no_report,
     )
 
 
@@ -178,7 +179,8 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
         output.warning(result.scene.doubt)
     if left_out := closing_line(result.left_out):
         output.remark(left_out)
-    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {job.out}/overview.png shows it.")
+    shown = job.out / ("overview.png" if job.common.no_report else "report.html")
+    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {shown} shows it.")
     paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
     figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))
     output.result({"folder": job.out, **paths}, figures=figures)

@@ -49,6 +49,14 @@ class Result(Record):
     reference: str
     summary: Mapping[str, object] = field(repr=False)
 
+    @property
+    def masked_views(self) -> Views:
+        """The undistorted photographs, with silhouettes for masks where there are some."""
+        views = self.scene.views
+        if self.silhouettes.source == "everything":
+            return views
+        return views.replace(masks=self.silhouettes.masks)
+
 
 def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
     """Read a folder of results, and the photographs it was made from with the same settings.

@@ -151,24 +151,25 @@ def vertex_fans(
     >>> vertex_fans(bow_tie)[0]
     tensor([0, 1, 2, 2, 3, 4])
     """
-    pairs, ends = face_pairs(faces)
-    corners = [
-        torch.stack([_corner(faces, face, end) for face in pairs.unbind(dim=1)], dim=1)
-        for end in ends.unbind(dim=1)
-    ]
-    label = graph_components(torch.cat(corners), 3 * len(faces))
+    label = graph_components(_fan_links(faces), 3 * len(faces)).long()
     old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
     order = old.argsort(stable=True)
     rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
     return old[order], rank[label].reshape(-1, 3)
 
 
-def _corner(
-    faces: Int[Tensor, "face 3"], face: Int[Tensor, " pair"], vertex: Int[Tensor, " pair"]
-) -> Int[Tensor, " pair"]:
-    """Number the corners of faces that are vertices of theirs."""
-    second, third = (faces[face, corner] == vertex for corner in (1, 2))
-    return 3 * face + second.long() + 2 * third.long()
+def _fan_links(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "link 2"]:
+    """List the corners that two faces have in common, at both ends of every edge of theirs.
+
+    Half as many bits as indices have elsewhere: there are six corners a vertex, and as many links.
+    """
+    pairs, ends = face_pairs(faces)
+    links = torch.empty(2, *pairs.shape, dtype=torch.int32, device=faces.device)
+    for end, at in zip(ends.unbind(dim=1), links, strict=True):
+        for column, face in enumerate(pairs.unbind(dim=1)):
+            second, third = (faces[face, corner] == end for corner in (1, 2))
+            at[:, column] = 3 * face + second.int() + 2 * third.int()
+    return links.flatten(0, 1)
 
 
 def boundary_loops(

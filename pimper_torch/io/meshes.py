@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.asset.gltf import MATTE, write_gltf
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
@@ -22,7 +23,7 @@ from pimper_torch.io.mesh_headers import impossible
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.records.faults import beyond, not_finite
-from pimper_torch.viz.maps import albedo_scale
+from pimper_torch.viz.maps import base_color
 
 # One number a vertex, written and read under the names of the record's fields.
 _ERRORS = ("confidence", "expected_error")
@@ -213,23 +214,17 @@ def write_glb(
         offset_world: Of the node; see ``SparseScene.offset_world``.
         measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
     """
-    path = Path(path)
-    colors = None if mesh.albedo is None else (255 * _colors(mesh)).round().cpu().numpy()
-    shape = _trimesh(mesh, None if colors is None else colors.astype(np.uint8))
+    attributes = {"POSITION": mesh.vertices_world, "NORMAL": _normals(mesh)}
+    if mesh.albedo is not None:
+        attributes["COLOR_0"] = _colors(mesh)
     if measured is not None:
-        known = corners_of(mesh.faces, measured, len(mesh.vertices_world))
-        shape.vertex_attributes["_MEASURED"] = known.cpu().numpy().astype(np.float32)
-    scene = trimesh.Scene(shape)
-
-    def postprocess(tree: dict[str, Any]) -> None:
-        _make_matte(tree)
-        if offset_world != NO_OFFSET:
-            _place(tree, offset_world)
-
-    path.write_bytes(
-        trimesh.exchange.gltf.export_glb(
-            scene, include_normals=True, tree_postprocessor=postprocess
-        )
+        attributes["_MEASURED"] = corners_of(mesh.faces, measured, len(mesh.vertices_world))
+    write_gltf(
+        path,
+        {name: values.detach().cpu().numpy() for name, values in attributes.items()},
+        mesh.faces.cpu().numpy(),
+        MATTE,
+        offset_world=offset_world,
     )
 
 
@@ -348,43 +343,10 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def _colors(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
-    assert mesh.albedo is not None
-    scaled = mesh.albedo.detach() * albedo_scale(mesh)
-    return scaled.nan_to_num(0).clamp(0, 1).expand(-1, 3)
+    return base_color(mesh).expand(-1, 3)
 
 
 def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
     if mesh.normals_world is None:
         return vertex_normals(mesh.vertices_world, mesh.faces)
     return mesh.normals_world
-
-
-def _trimesh(mesh: Mesh, colors: np.ndarray | None) -> trimesh.Trimesh:
-    return trimesh.Trimesh(
-        vertices=mesh.vertices_world.detach().cpu().double().numpy(),
-        faces=mesh.faces.cpu().numpy(),
-        vertex_normals=_normals(mesh).detach().cpu().double().numpy(),
-        vertex_colors=colors,
-        process=False,  # keeps the order and number of vertices
-    )
-
-
-def _place(tree: dict[str, Any], offset_world: Offset) -> None:
-    """Put the node of every mesh at the offset, in place."""
-    for node in tree["nodes"]:
-        if "mesh" in node:
-            node.pop("matrix", None)  # of nothing but zero translation
-            node["translation"] = list(offset_world)
-
-
-def _make_matte(tree: dict[str, Any]) -> None:
-    """Assign every primitive one material, in place as trimesh wants it; glTF's own is metal."""
-    tree["materials"] = [
-        {
-            "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-            "doubleSided": True,
-        }
-    ]
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0

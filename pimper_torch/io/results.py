@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from pimper_torch.asset.bake import Textured
+from pimper_torch.asset.make import textured
+from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.finish import Finished, MeshFiles, finished
@@ -20,10 +24,15 @@ from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
+from pimper_torch.relighting.lights import fit_lights
+from pimper_torch.report.layers import surface_layers
+from pimper_torch.report.page import asset_within, write_page
+from pimper_torch.report.predictions import predictions
 from pimper_torch.reporting import reported
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.overview import draw_overview
+from pimper_torch.viz.overview import draw_overview, headline
+from pimper_torch.viz.turn import draw_turn
 
 # What a result consists of, and nothing else.
 RESULT_NAMES = (
@@ -31,6 +40,11 @@ RESULT_NAMES = (
     "mesh.glb",
     "mesh.stl",
     "mesh.obj",
+    "asset.glb",
+    "asset.obj",
+    "asset.mtl",
+    "asset_albedo.png",
+    "asset_normal.png",
     "sparse",
     "masks",
     "normals.png",
@@ -40,8 +54,10 @@ RESULT_NAMES = (
     "config.yaml",
     "summary.json",
     "overview.png",
+    "turn.webp",
+    "report.html",
 )
-_PARTS = 4  # of the bar: simplification, meshes and cameras, maps, contact sheet
+_PARTS = 7  # of the bar: simplification, meshes, asset, maps, contact sheet, turning picture, page
 
 
 def write_result(
@@ -52,6 +68,7 @@ def write_result(
     overwrite: bool = False,
     about: Mapping[str, object] | None = None,
     files: MeshFiles | None = None,
+    report: bool = True,
 ) -> None:
     """Write everything a run found into a folder.
 
@@ -63,6 +80,11 @@ def write_result(
     `mesh.glb`       the same for viewers, albedo linear as glTF wants it
     `mesh.stl`       if asked for: triangles alone
     `mesh.obj`       if asked for: normals, albedo as sRGB colour
+    `asset.glb`      50,000 faces at most, without caps: albedo and normals as textures, baked
+                     from every vertex; ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence) of its
+                     vertices
+    `asset.obj`      if an OBJ is asked for: the same, with `asset.mtl`, `asset_albedo.png` and
+                     `asset_normal.png`
     `sparse/`        COLMAP model, in the mesh's frame
     `masks/`         the object's silhouette in every photograph as it was undistorted, PNG of its
                      name; none where everything is the object
@@ -75,6 +97,8 @@ def write_result(
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
     `overview.png`   contact sheet, every photograph with its silhouette below
+    `turn.webp`      the surface turning once round, its shape beside its albedo
+    `report.html`    unless unwanted: all of this to look at in a browser, offline
     ===============  ==============================================================
 
     Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
@@ -96,6 +120,7 @@ def write_result(
         overwrite: Replace a former result.
         about: More for ``summary.json``.
         files: How many faces the mesh has, and in which formats.
+        report: Whether ``report.html`` is written.
 
     Raises:
         OutputError: The folder holds something else, or cannot be written.
@@ -108,11 +133,47 @@ def write_result(
         found, whole = whole, whole.replace(mesh=ready.mesh)
         with part(1, _PARTS):
             _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
+        with part(2, _PARTS):
+            asset = textured(found.mesh, ready.mesh)
+            _write_asset(asset, files or MeshFiles(), whole.scene.offset_world, staging)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
-        summary = {**summary_report(found, about or {}), **ready.summary}
+        summary = {
+            **summary_report(found, about or {}),
+            **ready.summary,
+            "asset": asset.summary,
+        }
         _write_json(summary, staging / "summary.json", indent=2)
+        with part(6, _PARTS):
+            if report:
+                _write_page(whole, asset, staging, title=folder.absolute().name, summary=summary)
+
+
+def _write_page(
+    result: Reconstruction,
+    asset: Textured,
+    folder: Path,
+    *,
+    title: str,
+    summary: Mapping[str, Any],
+) -> None:
+    """Write the page of a result whose other files are in a folder already."""
+    scene, mesh = result.scene, result.mesh
+    lights = fit_lights(mesh, scene, result.silhouettes)
+    write_page(
+        folder / "report.html",
+        title=title,
+        headline=headline(result),
+        asset=asset_within(asset, folder / "asset.glb"),
+        scene=scene,
+        silhouettes=result.silhouettes,
+        reference=result.coarse.reference,
+        predictions=predictions(mesh, scene, lights, None, [""] * scene.views.num_views),
+        layers=surface_layers(asset.mesh),
+        summary=summary,
+        settings=(folder / "config.yaml").read_text(encoding="utf-8"),
+    )
 
 
 def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
@@ -127,16 +188,24 @@ def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Pat
         write_obj(mesh, folder / "mesh.obj", offset, measured)
 
 
+def _write_asset(asset: Textured, files: MeshFiles, offset: Offset, folder: Path) -> None:
+    write_asset(asset, folder / "asset.glb", offset)
+    if "obj" in files.formats:
+        write_asset_obj(asset, folder / "asset.obj", offset)
+
+
 def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
-    with part(2, _PARTS):
+    with part(3, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(3, _PARTS):
+    with part(4, _PARTS):
         draw_overview(result, folder / "overview.png")
+    with part(5, _PARTS):
+        draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
 
 
 def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:

@@ -4,11 +4,9 @@ An error map has one number a pixel: finite where it was measured, infinite wher
 shows something that the surface misses, NaN where there is nothing to compare.
 """
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,20 +16,17 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.visibility import Hits
-from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.maps import normal_colors, view_maps
 from pimper_torch.viz.render import shade
-
-Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+from pimper_torch.viz.tiles import Picture, Tile, array, sheet
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)
 _DARKEST = 0.65  # shading of the steepest height field; darker would hide the colour it tints
 _MARGIN = 0.04
-# Inches: width of a panel, room between panels, a title, names at the left, the colour bar.
-_PANEL_IN, _GAP_IN, _TITLE_IN, _NAME_IN, _BAR_IN = 2.6, 0.08, 0.32, 0.3, 0.95
-_NOTE_WIDTH = 38  # letters across a panel
+_PANEL_PX, _HEATMAP_PX = 260, 620
+_BAR_PX = (16, 400)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +49,8 @@ class ErrorScale:
 
     @property
     def label(self) -> str:
-        """What stands beside the colour bar."""
-        return f"{self.what}, {self.unit} (clipped at {self.clip:g})"
+        """What stands above the colour bar."""
+        return f"{self.what}, {self.unit}, 0 to {self.clip:g} (clipped at {self.clip:g})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,8 +112,7 @@ def error_picture(
         colors = colors * (_DARKEST + (1 - _DARKEST) * tone)
     colors[values.isnan().numpy()] = 1
     colors[values.isinf().numpy()] = MISSED
-    picture: Picture = colors.astype(np.float32)
-    return picture
+    return np.asarray(colors, dtype=np.float32)
 
 
 def shading_in_view(
@@ -148,13 +142,6 @@ def surface_picture(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None =
         width, height = (int(side) for side in cameras.sizes_px[view])
         return np.ones((height, width, 3), dtype=np.float32)
     return _on_white(view_maps(mesh, cameras, view, hits).normals_cam)
-
-
-def photograph_picture(radiance: Float[Tensor, "channel height width"]) -> Picture:
-    """Encode a photograph for the screen."""
-    encoded = srgb_from_linear(radiance.detach().clamp(0, 1)).expand(3, -1, -1)
-    picture: Picture = encoded.movedim(0, -1).cpu().float().numpy()
-    return picture
 
 
 def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
@@ -189,17 +176,10 @@ def draw_heatmap(
         path: Ends in ``.png``.
         shading: The surface in that view, see :func:`shading_in_view`.
     """
-    path = Path(path)
-    picture = error_picture(error, scale, shading=shading)
     rows, columns = crop_to(~error.isnan())
-    cropped = picture[rows, columns]
-    tall = 2 * _PANEL_IN * cropped.shape[0] / cropped.shape[1]
-    size = (2 * _PANEL_IN + 2 * _GAP_IN + _BAR_IN, max(tall, _PANEL_IN) + _TITLE_IN + _GAP_IN)
-    figure = _figure(size)
-    box = (_GAP_IN, _GAP_IN, 2 * _PANEL_IN, size[1] - _TITLE_IN - _GAP_IN)
-    _show(figure, size, box, cropped, title=title)
-    _bar(figure, size, scale, missed=bool(error.isinf().any()))
-    figure.savefig(path, dpi=120, facecolor="white")
+    picture = error_picture(error, scale, shading=shading)[rows, columns]
+    shown = [[Tile(title=title, picture=picture)], [_bar(scale, missed=bool(error.isinf().any()))]]
+    sheet(shown, _HEATMAP_PX).save(path)
 
 
 def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) -> None:
@@ -215,112 +195,33 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
     Raises:
         InputError: There are no rows.
     """
-    path = Path(path)
     if not rows:
         raise InputError("there is no scene to draw; needed: one or more.")
     names = tuple(dict.fromkeys(panels.method for row in rows for panels in row.methods))
-    heights = [_PANEL_IN * row.photograph.shape[0] / row.photograph.shape[1] for row in rows]
-    width = _NAME_IN + (1 + len(names)) * (_PANEL_IN + _GAP_IN) + _BAR_IN
-    size = (width, _TITLE_IN + sum(2 * (height + _GAP_IN) for height in heights))
-    figure = _figure(size)
-    top = size[1] - _TITLE_IN
-    for index, name in enumerate(("photograph, true normals", *names)):
-        x = _NAME_IN + index * (_PANEL_IN + _GAP_IN) + _PANEL_IN / 2
-        figure.text(x / size[0], (top + 0.1) / size[1], name, ha="center", fontsize=10)
-    for row, height in zip(rows, heights, strict=True):
-        centre = (top - height - _GAP_IN / 2) / size[1]
-        figure.text(
-            0.12 / size[0], centre, row.scene, rotation=90, va="center", ha="center", fontsize=11
-        )
-        for index, panels in enumerate(_columns(row, names)):
-            left = _NAME_IN + index * (_PANEL_IN + _GAP_IN)
-            again = "" if panels.surface is None else panels.note  # once is enough
-            for picture, bottom, note in (
-                (panels.surface, top - height, panels.note),
-                (panels.error, top - 2 * height - _GAP_IN, again),
-            ):
-                _show(figure, size, (left, bottom, _PANEL_IN, height), picture, note=note)
-        top -= 2 * (height + _GAP_IN)
-    _bar(figure, size, scale, missed=True)
-    figure.savefig(path, dpi=100, facecolor="white")
-
-
-def _columns(row: SceneRow, names: Sequence[str]) -> list[MethodPanels]:
-    """Return a scene's pictures column by column: the truth, then every method of the sheet."""
-    truth = MethodPanels(method="truth", surface=row.photograph, error=row.truth)
-    of_method = {panels.method: panels for panels in row.methods}
-    return [truth, *(of_method.get(name, MethodPanels(method=name)) for name in names)]
+    shown: list[list[Tile]] = []
+    for row in rows:
+        of_method = {panels.method: panels for panels in row.methods}
+        methods = [of_method.get(name, MethodPanels(method=name)) for name in names]
+        above = [Tile(title=f"{row.scene}, photograph", picture=row.photograph)]
+        below = [Tile(title="true normals", picture=row.truth)]
+        for one in methods:
+            above.append(Tile(title=one.method, picture=one.surface, note=one.note))
+            note = "" if one.surface is None else one.note  # once is enough
+            below.append(Tile(picture=one.error, note=note))
+        shown += [above, below]
+    sheet([*shown, [_bar(scale, missed=True)]], _PANEL_PX).save(path)
 
 
 def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
     there = (normals_cam != 0).any(dim=-1, keepdim=True)
-    colors = torch.where(there, normal_colors(normals_cam), 1.0)
-    picture: Picture = colors.detach().cpu().float().numpy()
-    return picture
+    return array(torch.where(there, normal_colors(normals_cam), 1.0))
 
 
-def _figure(size: tuple[float, float]) -> Any:  # noqa: ANN401 - matplotlib is not loaded yet
-    # Figure without pyplot leaves no global state behind.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _show(
-    figure: Any,  # noqa: ANN401 - see _figure
-    size: tuple[float, float],
-    box: tuple[float, float, float, float],
-    picture: Picture | None,
-    *,
-    title: str = "",
-    note: str = "",
-) -> None:
-    """Put a picture, or the note on why there is none, in a box of inches from bottom left."""
-    left, bottom, width, height = box
-    axes = figure.add_axes(
-        (left / size[0], bottom / size[1], width / size[0], height / size[1]),
-    )
-    axes.set_axis_off()
-    axes.set_title(title, fontsize=10)
-    if picture is not None:
-        axes.imshow(picture, interpolation="antialiased")
-        return
-    first = (note.strip().splitlines() or [""])[0]
-    words = textwrap.fill(first, _NOTE_WIDTH, max_lines=4, placeholder=" …")
-    axes.text(0.5, 0.5, words, ha="center", va="center", fontsize=8, color="0.4")
-
-
-def _bar(
-    figure: Any,  # noqa: ANN401 - see _figure
-    size: tuple[float, float],
-    scale: ErrorScale,
-    *,
-    missed: bool,
-) -> None:
-    """Draw the colour bar at the right, and what red means below it."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.patches import Rectangle
-
-    tall = min(size[1] - 2 * _TITLE_IN, 4.0)
-    left, bottom = size[0] - _BAR_IN + 0.15, (size[1] - tall) / 2
-    axes = figure.add_axes((left / size[0], bottom / size[1], 0.15 / size[0], tall / size[1]))
-    shown = ScalarMappable(norm=Normalize(0, scale.clip), cmap=_COLORS)
-    bar = figure.colorbar(shown, cax=axes, extend="max")
-    bar.set_label(scale.label, fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+def _bar(scale: ErrorScale, *, missed: bool) -> Tile:
+    """Draw the colours of a scale in a row, and what red means."""
+    height, width = _BAR_PX
+    values = torch.linspace(0, scale.clip, width).expand(height, width).clone()
     if missed:
-        y = bottom - 0.22
-        figure.add_artist(
-            Rectangle(
-                (left / size[0], y / size[1]),
-                0.15 / size[0],
-                0.12 / size[1],
-                color=MISSED,
-                transform=figure.transFigure,
-            )
-        )
-        figure.text((left + 0.2) / size[0], y / size[1], "missed", fontsize=8)
+        values[:, -width // 10 :] = torch.inf
+    title = f"{scale.label}{'; red: missed' if missed else ''}"
+    return Tile(title=title, picture=error_picture(values, scale), wide=True)

@@ -96,3 +96,10 @@ def albedo_scale(mesh: Mesh) -> float:
         return 1.0
     rank = max(1, round(0.99 * len(known)))
     return float(0.9 / known.kthvalue(rank).values)
+
+
+def base_color(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
+    """Return a mesh's albedo in [0, 1], linear: glTF's base colour; grey where it has none."""
+    if mesh.albedo is None:
+        return torch.full_like(mesh.vertices_world, _GREY)
+    return (albedo_scale(mesh) * mesh.albedo.detach()).nan_to_num(0).clamp(0, 1)

@@ -1,7 +1,9 @@
 """Every option of every command, once, from the command line."""
 
 import dataclasses
+import json
 import re
+import shutil
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -14,7 +16,6 @@ from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.io import results
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.store import Store
@@ -33,7 +34,7 @@ RUNS = {
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
-        "--overwrite --faces 500 --watertight --stl --obj --fresh --cache {out}_kept "
+        "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
         "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view",
     ],
     "render": [
@@ -49,6 +50,10 @@ RUNS = {
         "--no-fixed-table --constant-light",
         "{ball} -o {out} {tiny} --no-constant-light --turned-over --table patterned",
         "{ball} -o {out} {tiny} --no-turned-over",
+    ],
+    "export": [
+        "{result} --out {out} --format colmap nerfstudio alicevision maps lights --axes lub "
+        "--photos {photos} --overwrite",
     ],
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
@@ -97,7 +102,15 @@ def world(tmp_path_factory, dtu):
     true_mesh = read_mesh(scene / "truth" / "mesh.ply")
     told = true_mesh.replace(expected_error=0.01 + 0.01 * true_mesh.vertices_world[:, 2])
     write_ply(told, folder / "told.ply")
+    result = folder / "result"
+    shutil.copytree(scene / "truth" / "sparse", result / "sparse")
+    shutil.copy(scene / "truth" / "mesh.ply", result / "mesh.ply")
+    lights = [{"name": f"view_{index:03d}.png", "light": [1, 0, 0, 1]} for index in range(6)]
+    (result / "lights.json").write_text(json.dumps({"views": lights}))
+    (result / "config.yaml").write_text("photographs: {response: srgb}\n")
+    (result / "summary.json").write_text("{}")
     return {
+        "result": result,
         "ball": folder / "ball.ply",
         "told": folder / "told.ply",
         "preset": folder / "preset.yaml",
@@ -112,12 +125,6 @@ def world(tmp_path_factory, dtu):
     }
 
 
-@pytest.fixture
-def small_overview(monkeypatch):
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
-
-
 def run(command, line, world, tmp_path):
     return main([command, *line.format(out=tmp_path / "out", **world).split()])
 
@@ -126,7 +133,7 @@ def run(command, line, world, tmp_path):
     ("command", "line"),
     [(command, line) for command in RUNS if command != "demo" for line in RUNS[command]],
 )
-@pytest.mark.usefixtures("small_overview", "ctrl_c")
+@pytest.mark.usefixtures("small_pictures", "ctrl_c")
 def test_every_option_of_a_command_runs(command, line, world, tmp_path):
     assert run(command, line, world, tmp_path) == 0
 

@@ -92,6 +92,12 @@ def test_an_input_of_convert_in_its_output_is_refused(project, capsys, option):
     assert option in capsys.readouterr().err
 
 
+def test_an_input_of_export_in_its_output_is_refused(project, capsys):
+    for given in ([project], [project.parent, "--photos", project / "sparse"]):
+        assert run("export", *given, "-o", project, "--format", "maps", "--overwrite") == 2
+        assert "lies in the folder of the result" in capsys.readouterr().err
+
+
 def test_an_input_of_bench_in_its_output_is_refused(project, capsys):
     (project / "mine.yaml").write_text("seed: 3\n")
     for given in (["--cache", project / "sparse"], ["--methods", project / "mine.yaml"]):
@@ -99,14 +105,16 @@ def test_an_input_of_bench_in_its_output_is_refused(project, capsys):
         assert "lies in the folder of the result" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert"])
+@pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert", "export"])
 def test_two_runs_into_one_folder_do_not_meet(photos, chain, tmp_path, capsys, command):
     """While another run holds the folder, every command that writes there is refused."""
-    kind = {"render": "scene", "bench": "table", "convert": "data set"}.get(command, "result")
+    kinds = {"render": "scene", "bench": "table", "convert": "data set", "export": "data set"}
+    kind = kinds.get(command, "result")
     given = {
         "reconstruct": [photos],
         "render": ["mug"],
         "convert": [photos, "--source", "idr", "--target", "colmap"],
+        "export": [photos, "--format", "maps"],
     }.get(command, [])
     codes = []
     with held_output(tmp_path / "out", kind):

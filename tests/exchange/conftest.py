@@ -1,9 +1,12 @@
+import av
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.exchange import read_result
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io import results
 from pimper_torch.io.photographs import load_views
@@ -72,3 +75,32 @@ def folder(run, photographs, tmp_path, monkeypatch):
     about = {"photographs": str(photographs), "masks": None}
     results.write_result(run, config, tmp_path / "out", about=about)
     return tmp_path / "out"
+
+
+@pytest.fixture
+def result(folder):
+    """That folder, read back."""
+    return read_result(folder)
+
+
+@pytest.fixture
+def read_exr():
+    """Read an OpenEXR file by FFmpeg."""
+
+    def read(path):
+        with av.open(str(path)) as file:
+            return next(file.decode(video=0)).to_ndarray()
+
+    return read
+
+
+@pytest.fixture
+def same_cameras():
+    """Compare cameras with those of a result, as numbers in text may differ."""
+
+    def compare(found, expected):
+        assert_close(found.intrinsics, expected.intrinsics, rtol=0, atol=1e-9)
+        assert_close(found.cam_from_world, expected.cam_from_world, rtol=0, atol=1e-9)
+        assert torch.equal(found.sizes_px, expected.sizes_px)
+
+    return compare

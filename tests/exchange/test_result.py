@@ -6,9 +6,16 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets import read_transforms
 from pimper_torch.exchange import read_result
+from pimper_torch.exchange.nerfstudio import write_nerfstudio
+from pimper_torch.geometry.projection import project
+from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import Encoding
 
 
 def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
@@ -98,3 +105,38 @@ def test_a_mask_of_another_size_is_refused(folder):
     Image.fromarray(np.full((40, 50), 255, np.uint8)).save(folder / "masks" / "c.png")
     with pytest.raises(InputError, match=r"c\.png: has 50 x 40 pixels; needed: 60 x 40"):
         read_result(folder)
+
+
+def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
+    there = read_result(folder)
+    for path in photographs.iterdir():
+        with Image.open(path) as picture:
+            picture.resize((120, 80), Image.Resampling.NEAREST).save(path)
+    found = read_result(folder)
+    assert torch.equal(found.scene.views.sizes_px, there.scene.views.sizes_px)
+    assert torch.equal(found.cameras.intrinsics, there.cameras.intrinsics)
+
+
+def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: path.write_bytes(b""))
+    far = (500_000.0, -3.0, 0.0)
+    scene = run.scene.replace(offset_world=far)
+    about = {"photographs": str(photographs)}
+    config = CoarseToFineConfig(photographs=Encoding(response="linear"))
+    results.write_result(run.replace(scene=scene), config, tmp_path / "far", about=about)
+    found = read_result(tmp_path / "far")
+    assert abs(found.scene.offset_world[0] - far[0]) < 10
+    seen = [
+        project(
+            one.mesh.vertices_world, one.scene.cameras.cam_from_world, one.scene.cameras.intrinsics
+        )[0]
+        for one in (run, found)
+    ]
+    assert_close(*seen, rtol=0, atol=1e-3)
+    centers = run.scene.cameras.centers_world.double() + torch.tensor(far)
+    assert_close(found.cameras.centers_world, centers, rtol=0, atol=1e-5)
+    write_nerfstudio(found, tmp_path / "splats")
+    splats = read_transforms(tmp_path / "splats").cameras
+    assert_close(splats.centers_world, centers, rtol=0, atol=1e-5)
+    placed = found.mesh.vertices_world.double() + torch.tensor(found.scene.offset_world)
+    assert_close(read_mesh(tmp_path / "splats" / "sparse_pc.ply").vertices_world, placed)

@@ -19,7 +19,6 @@ from pimper_torch.viz.heatmap import (
     draw_sheet,
     error_picture,
     normals_picture,
-    photograph_picture,
     shading_in_view,
     surface_picture,
 )
@@ -85,13 +84,6 @@ def test_normals_are_coloured_in_the_cameras_frame(plane, front):
     np.testing.assert_allclose(picture[5, 6], [0.5, 0.5, 1.0], atol=1e-6)
     assert (picture[0, 0] == 1).all()
     np.testing.assert_allclose(surface_picture(plane, front, 0)[18, 24], [0.5, 0.5, 1], atol=1e-5)
-
-
-def test_photographs_are_encoded_and_grey_ones_coloured():
-    picture = photograph_picture(torch.full((1, 2, 3), 0.2140))
-    assert picture.shape == (2, 3, 3)
-    np.testing.assert_allclose(picture, 0.5, atol=1e-3)
-    assert photograph_picture(torch.full((3, 1, 1), 7.0)).max() == pytest.approx(1)
 
 
 def test_the_crop_holds_every_true_pixel_and_stays_inside():

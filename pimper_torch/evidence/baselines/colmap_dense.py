@@ -5,7 +5,6 @@ without; what is run is the program ``colmap``.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from pimper_torch.evidence.baselines.external import (
     run_program,
     workspace,
 )
+from pimper_torch.exchange.colmap_workspace import write_stereo_folder
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, SparseScene
 from pimper_torch.stage import Stage
@@ -40,7 +40,6 @@ COLMAP = Program(
 )
 
 _FUSED, _MESHED = "fused.ply", "meshed.ply"
-_PARTNERS = 20  # views that one is compared with; what COLMAP's own undistorter writes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,19 +193,6 @@ def trim_depth(num_points: int) -> float:
     10.0
     """
     return max(0.0, 10.0 - math.log(1e7 / max(1, num_points), 4))
-
-
-def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
-    """Write what COLMAP's undistorter would: which views to compare and to fuse, and folders.
-
-    The photographs have no lenses any more, so the undistorter itself is not run: it would
-    resample them once more.
-    """
-    for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
-        (folder / kind).mkdir(parents=True)
-    pairs = "".join(f"{name}\n__auto__, {_PARTNERS}\n" for name in names)
-    (folder / "patch-match.cfg").write_text(pairs, encoding="ascii")
-    (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="ascii")
 
 
 def _run(program: Path, folder: Path, deadline: Deadline, threads: int, step: Step) -> str:

@@ -7,16 +7,12 @@ model: all see the very photographs and cameras that our own stages see.
 
 from pathlib import Path
 
-import numpy as np
-import torch
-from PIL import Image
-from scipy.spatial.transform import Rotation
-
 from pimper_torch.errors import InputError, ReconstructionError
 from pimper_torch.evidence.baselines.external import last_lines
-from pimper_torch.geometry.projection import project
+from pimper_torch.exchange.colmap_workspace import write_pinholes
+from pimper_torch.exchange.pictures import write_mask, write_picture
+from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 
 
@@ -31,15 +27,11 @@ def write_photographs(scene: SparseScene, folder: Path, suffix: str) -> tuple[st
     Returns:
         The files' names, ``00000000.png`` and so on, in the order of the views.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    names = []
-    for index, (image, (width, height)) in enumerate(
-        zip(scene.views.images, scene.cameras.sizes_px.tolist(), strict=True)
-    ):
-        encoded = to_bytes(image[:, :height, :width].detach()).expand(3, -1, -1)
-        names.append(f"{index:08d}{suffix}")
-        Image.fromarray(encoded.movedim(0, -1).cpu().numpy()).save(folder / names[-1])
-    return tuple(names)
+    names = tuple(f"{index:08d}{suffix}" for index in range(scene.views.num_views))
+    colour = scene.views.replace(images=scene.views.images.expand(-1, 3, -1, -1))
+    for index, name in enumerate(names):
+        write_picture(colour, index, folder / name)
+    return names
 
 
 def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
@@ -50,25 +42,17 @@ def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
     """
     if scene.views.masks is None:
         return False
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, (mask, (width, height)) in enumerate(
-        zip(scene.views.masks, scene.cameras.sizes_px.tolist(), strict=True)
-    ):
-        white = 255 * mask[:height, :width].cpu().numpy().astype(np.uint8)
-        Image.fromarray(white).save(folder / f"{index:08d}{suffix}")
+    for index in range(scene.views.num_views):
+        write_mask(scene.views, index, folder / f"{index:08d}{suffix}")
     return True
 
 
 def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path) -> None:
-    """Write pinholes and cloud as a COLMAP model in text, which every program reads.
-
-    Every view has a camera of its own, number and image number one more than the view's.
-    Observations are put where the pinholes see their points. Points that no view sees are
-    left out.
+    """Write pinholes, cloud and tracks as a COLMAP model, binary, in the scene's own frame.
 
     Args:
         names: Of the written photographs, one a view.
-        folder: Gets ``cameras.txt``, ``images.txt`` and ``points3D.txt``.
+        folder: Gets ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
 
     Raises:
         InputError: No view sees a point; stereo programs choose partners and depths by them.
@@ -78,61 +62,8 @@ def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path
             "the scene has no sparse points that a view sees; needed: some, for a stereo program "
             "chooses its pairs of views and its range of depth by them."
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    cameras = scene.cameras
-    poses = cameras.cam_from_world.detach().cpu().double().numpy()
-    intrinsics = cameras.intrinsics.detach().cpu().double().numpy()
-    lens_lines, image_lines = [], []
-    rows_of_view, point_lines = _observations(scene)
-    for index, (K, (width, height)) in enumerate(
-        zip(intrinsics, cameras.sizes_px.tolist(), strict=True)
-    ):
-        params = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-        lens_lines.append(f"{index + 1} PINHOLE {width} {height} {params}")
-        x, y, z, w = Rotation.from_matrix(poses[index, :3, :3]).as_quat()
-        pose = _numbers([w, x, y, z, *poses[index, :3, 3]])
-        image_lines += [f"{index + 1} {pose} {index + 1} {names[index]}", rows_of_view[index]]
-    for name, lines in (
-        ("cameras", lens_lines),
-        ("images", image_lines),
-        ("points3D", point_lines),
-    ):
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def _observations(scene: SparseScene) -> tuple[list[str], list[str]]:
-    """Return the line of observations of every view, and the line of every observed point."""
-    points = scene.points_world.detach().cpu().double()
-    cameras = scene.cameras
-    pixels, _ = project(
-        points, cameras.cam_from_world.cpu().double(), cameras.intrinsics.cpu().double()
-    )
-    observed = scene.observed.cpu()
-    identifier = torch.cumsum(observed.any(dim=1), dim=0)  # from 1, without the unseen
-    index = torch.cumsum(observed, dim=0) - 1  # in the view's line
-    views = [
-        " ".join(
-            f"{_numbers(pixels[view, point].tolist())} {int(identifier[point])}"
-            for point in torch.nonzero(observed[:, view])[:, 0].tolist()
-        )
-        for view in range(cameras.num_views)
-    ]
-    errors = scene.reprojection_errors_px.detach().cpu().double()
-    errors = torch.where(errors.isfinite(), errors, 0)  # C++ does not read "inf"
-    lines = []
-    for point in torch.nonzero(observed.any(dim=1))[:, 0].tolist():
-        track = " ".join(
-            f"{view + 1} {int(index[point, view])}"
-            for view in torch.nonzero(observed[point])[:, 0].tolist()
-        )
-        where = _numbers(points[point].tolist())
-        error = _numbers([float(errors[point])])
-        lines.append(f"{int(identifier[point])} {where} 128 128 128 {error} {track}")
-    return views, lines
-
-
-def _numbers(values: list[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
+    here = scene.replace(offset_world=NO_OFFSET).detach().to("cpu")
+    write_pinholes(here, here.cameras, names, folder)
 
 
 def read_surface(path: Path, program: str, printed: str) -> Mesh:

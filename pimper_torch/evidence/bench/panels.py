@@ -18,10 +18,10 @@ from pimper_torch.viz.heatmap import (
     draw_heatmap,
     error_picture,
     normals_picture,
-    photograph_picture,
     shading_in_view,
     surface_picture,
 )
+from pimper_torch.viz.tiles import encoded
 
 # Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
 ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
@@ -61,7 +61,7 @@ def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> 
     taken = inputs.scene.views.images[inputs.coarse.reference]
     return SceneRow(
         scene=scene,
-        photograph=photograph_picture(taken)[crop],
+        photograph=encoded(taken.movedim(0, -1))[crop],
         truth=normals_picture(maps.truth.normals_world[0], maps.cameras, 0)[crop],
         methods=methods,
     )

@@ -33,6 +33,7 @@ from pimper_torch.evidence.datasets import (
     write_transforms,
 )
 from pimper_torch.evidence.datasets.posed import assemble, shrink
+from pimper_torch.exchange.nerfstudio import thinned
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
@@ -54,9 +55,6 @@ Source = Literal[
     "rendered",
 ]
 Target = Literal["colmap", "idr", "transforms"]
-
-# Enough to start from or to see the object's extent, and no more than viewers like.
-_MAX_POINTS = 100_000
 
 
 _PHOTOGRAPHS = ("response", "saturation", "black")
@@ -258,10 +256,7 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
     """Return points of the true surface, at most a hundred thousand, or ``None``."""
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
-    if points is None or len(points) <= _MAX_POINTS:
-        return points
-    chosen = torch.linspace(0, len(points) - 1, _MAX_POINTS, dtype=torch.float64)
-    return points[chosen.round().long().to(points.device)]
+    return None if points is None else points[thinned(len(points)).to(points.device)]
 
 
 def describe(capture: Capture, job: Job) -> str:

@@ -1,7 +1,7 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
 from pimper_torch.evidence.datasets.check import check_capture, require_consistent
-from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene, write_colmap
+from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
 from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
@@ -14,7 +14,9 @@ from pimper_torch.evidence.datasets.middlebury import read_middlebury
 from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.datasets.sampling import one_light_per_position
-from pimper_torch.evidence.datasets.transforms import read_transforms, write_transforms
+from pimper_torch.evidence.datasets.transforms import read_transforms
+from pimper_torch.exchange.colmap_workspace import write_colmap
+from pimper_torch.exchange.nerfstudio import write_transforms
 
 __all__ = [
     "check_capture",

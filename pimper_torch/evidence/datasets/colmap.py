@@ -1,19 +1,9 @@
-"""COLMAP models beside their photographs: read and written."""
+"""COLMAP models beside their photographs."""
 
 from pathlib import Path
 from typing import Unpack
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from pimper_torch.camera_files.layout import expect, first_of, inside
-from pimper_torch.evidence.datasets.pictures import (
-    file_names,
-    refuse_skew,
-    write_mask,
-    write_picture,
-)
 from pimper_torch.evidence.datasets.posed import (
     PosedOptions,
     PosedPhotograph,
@@ -22,9 +12,8 @@ from pimper_torch.evidence.datasets.posed import (
     read_views,
 )
 from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Cameras, Capture, SparseScene, Views
-from pimper_torch.sfm.colmap import pinhole_lenses, read_model, write_binary
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.records import Capture, SparseScene
+from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct
 
 _KIND = "a COLMAP model with its photographs"
@@ -79,49 +68,6 @@ def read_colmap_scene(
     expect(not missing, model_folder, _KIND, "all its photographs", f"no {', '.join(missing[:5])}")
     views = read_views(photographs, encoding=encoding, max_size_px=max_size_px)
     return Reconstruct()(views, model_folder)
-
-
-def write_colmap(
-    views: Views,
-    cameras: Cameras,
-    folder: Path | str,
-    *,
-    points_world: Float[Tensor, "point 3"] | None = None,
-) -> None:
-    """Write photographs, masks and pinholes as COLMAP reads them.
-
-    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
-    ``.png`` behind, ``sparse/0/`` the model, binary.
-
-    Args:
-        views: Undistorted.
-        folder: Made if it is not there.
-        points_world: A cloud to put in the model, without tracks and black.
-
-    Raises:
-        InputError: A camera has a skew, which COLMAP's pinhole cannot have.
-        OutputError: The model cannot be written.
-    """
-    folder = Path(folder)
-    refuse_skew(cameras, views.names, "a COLMAP model")
-    files = file_names(views.names)
-    for index, file in enumerate(files):
-        write_picture(views, index, folder / "images" / file)
-        if views.masks is not None:
-            write_mask(views, index, folder / "masks" / f"{file}.png")
-    points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
-    nothing = torch.zeros(0, dtype=torch.long)
-    model = SparseModel(
-        names=files,
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=cameras.cam_from_world.detach().cpu().double(),
-        points_world=points.double(),
-        observation_point=nothing,
-        observation_view=nothing,
-        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
-    )
-    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
-    write_binary(model, colors, folder / "sparse" / "0")
 
 
 def _photographs(

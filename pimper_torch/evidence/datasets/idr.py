@@ -12,13 +12,13 @@ from pimper_torch.camera_files.camera_arrays import IDR, numbered_matrices, read
 from pimper_torch.camera_files.layout import expect, first_of
 from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.pictures import write_mask, write_picture
 from pimper_torch.evidence.datasets.posed import (
     PosedOptions,
     PosedPhotograph,
     assemble,
     image_files,
 )
+from pimper_torch.exchange.pictures import write_mask, write_picture
 from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import read_header

@@ -1,33 +1,19 @@
-"""NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio; read and written."""
+"""NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Unpack
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from pimper_torch.camera_files.layout import expect, first_of, inside
 from pimper_torch.camera_files.transforms_json import (
-    FLIP,
     KIND,
     frame_camera,
     read_frames,
     stated_size,
 )
-from pimper_torch.evidence.datasets.pictures import (
-    file_names,
-    refuse_skew,
-    write_mask,
-    write_picture,
-)
 from pimper_torch.evidence.datasets.posed import PosedOptions, PosedPhotograph, assemble
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Cameras, Capture, Mesh, Views
+from pimper_torch.records import Capture
 
 _FILES = ("transforms.json", "transforms_train.json")
 
@@ -63,66 +49,6 @@ def read_transforms(
         for frame, image, name in zip(frames, images, _names(images, path), strict=True)
     ]
     return assemble(photographs, path, KIND, **options)
-
-
-def write_transforms(
-    views: Views,
-    cameras: Cameras,
-    folder: Path | str,
-    *,
-    points_world: Float[Tensor, "point 3"] | None = None,
-) -> None:
-    """Write ``transforms.json`` as nerfstudio reads it, with ``images/`` and ``masks/``.
-
-    Intrinsics that all views share stand once in the file, where instant-ngp looks for them.
-
-    Args:
-        views: Undistorted.
-        folder: Made if it is not there.
-        points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
-
-    Raises:
-        InputError: A camera has a skew, which the format cannot represent.
-    """
-    folder = Path(folder)
-    refuse_skew(cameras, views.names, "transforms.json")
-    files = file_names(views.names)
-    world_from_cam = invert_rigid(cameras.cam_from_world.detach().cpu().double()).clone()
-    world_from_cam[:, :3, :3] *= FLIP
-    lenses, frames = [], []
-    for index, file in enumerate(files):
-        write_picture(views, index, folder / "images" / file)
-        frame: dict[str, object] = {"file_path": f"images/{file}"}
-        if views.masks is not None:
-            write_mask(views, index, folder / "masks" / file)
-            frame["mask_path"] = f"masks/{file}"
-        frame["transform_matrix"] = world_from_cam[index].tolist()
-        frames.append(frame)
-        lenses.append(_said(cameras, index))
-    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
-    if not shared:
-        frames = [{**lens, **frame} for lens, frame in zip(lenses, frames, strict=True)]
-    whole: dict[str, object] = {"camera_model": "PINHOLE", **shared}
-    if points_world is not None:
-        whole["ply_file_path"] = "sparse_pc.ply"
-        faces = torch.zeros(0, 3, dtype=torch.long)
-        write_ply(Mesh(vertices_world=points_world, faces=faces), folder / "sparse_pc.ply")
-    text = json.dumps({**whole, "frames": frames}, indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / "transforms.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _said(cameras: Cameras, index: int) -> dict[str, float | int]:
-    """Put a pinhole in the words of the format."""
-    K = cameras.intrinsics[index].detach().cpu().double()
-    width, height = (int(side) for side in cameras.sizes_px[index])
-    return {
-        "w": width,
-        "h": height,
-        "fl_x": float(K[0, 0]),
-        "fl_y": float(K[1, 1]),
-        "cx": float(K[0, 2]),
-        "cy": float(K[1, 2]),
-    }
 
 
 def _image(frame: Mapping[str, object], path: Path) -> Path:

@@ -4,15 +4,16 @@ Radiance is counted so that a white matte surface facing a light of irradiance 1
 radiance 1: physics' irradiance divided by pi. A highlight is then pi times the usual
 bidirectional reflectance, times irradiance and cosine.
 
-Source: Cook & Torrance, ACM TOG 1(1), 1982, for the model; Walter et al., EGSR 2007, for
-the distribution GGX; Heitz, JCGT 3(2), 2014, for Smith's masking with correlated heights;
-Schlick, Computer Graphics Forum 13(3), 1994, for Fresnel's factor.
+Source: Cook & Torrance, ACM TOG 1(1), 1982, for the model; Schlick, Computer Graphics Forum
+13(3), 1994, for Fresnel's factor.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
+
+from pimper_torch.relighting.microfacets import facet_density, masking
 
 # A dielectric mirrors everything at grazing incidence; no real one mirrors less than 2 % head
 # on, so that what is given less than that stands for something wholly or partly matte.
@@ -30,38 +31,6 @@ def fresnel(
     """
     grazing = (specular / _MIN_SPECULAR).clamp_max(1)
     return specular + (grazing - specular) * (1 - cosine).clamp(0, 1) ** 5
-
-
-def facet_density(
-    cosine: Float[Tensor, "*batch"], alpha: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch"]:
-    """Return GGX's density of facets per solid angle.
-
-    Normalized so that the facets' area seen from above is that of the surface.
-
-    Args:
-        cosine: Between a facet's normal and the surface's.
-        alpha: Width of the distribution; squared roughness.
-    """
-    spread = cosine**2 * (alpha**2 - 1) + 1
-    return alpha**2 / (torch.pi * spread**2)
-
-
-def masking(
-    to_light: Float[Tensor, "*batch"],
-    to_eye: Float[Tensor, "*batch"],
-    alpha: Float[Tensor, "*batch"],
-) -> Float[Tensor, "*batch"]:
-    """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
-
-    Args:
-        to_light: Cosine between light and normal, more than 0.
-        to_eye: Cosine between eye and normal, more than 0.
-        alpha: As in :func:`facet_density`.
-    """
-    light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
-    eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()
-    return 0.5 / (light_side + eye_side)
 
 
 def reflect(

@@ -6,10 +6,11 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
 from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
+from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap import read_model
+from pimper_torch.sfm.colmap import distort, read_model
 
 # Every program refuses options it does not know, checks its input, and leaves what OpenMVS
 # leaves. `points` says whether this is a version that wants the dense points named.
@@ -113,13 +114,15 @@ def test_the_written_model_is_the_undistorted_scene(reconstruction, triangle, tm
     own[:, 0, 2] = 28.25
     lens = scene.lenses[0].replace(model="SIMPLE_RADIAL", params=(80.0, 30.0, 20.0, 0.1))
     kept = scene.observation_point != 3
+    rays = transform(scene.cameras.cam_from_world, scene.points_world)
+    photographed = distort(lens, rays[scene.observation_view, scene.observation_point])
     scene = scene.replace(
         cameras=scene.cameras.replace(intrinsics=own),
         lenses=(lens,) * 3,
         views=scene.views.replace(names=("a b.png", "folder/b.png", "ü.png")),
         observation_point=scene.observation_point[kept],
         observation_view=scene.observation_view[kept],
-        observation_pixels=scene.observation_pixels[kept],
+        observation_pixels=photographed[kept],
         reprojection_errors_px=torch.full_like(scene.reprojection_errors_px, torch.inf),
     )
     OpenMvs()(scene, reconstruction.coarse)

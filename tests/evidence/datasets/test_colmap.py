@@ -3,7 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene, write_colmap
+from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
+from pimper_torch.exchange.colmap_workspace import write_colmap
 from pimper_torch.sfm.colmap import read_model
 
 # `hand_camera` as a quaternion: a third of a turn about (-1, -1, -1), w = 0.5.

@@ -8,7 +8,8 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.transforms import read_transforms, write_transforms
+from pimper_torch.evidence.datasets.transforms import read_transforms
+from pimper_torch.exchange.nerfstudio import write_transforms
 from pimper_torch.io.meshes import read_mesh
 
 # `hand_camera`: columns are the camera's right, up (its down is the world's z), back, place.

@@ -1,0 +1,1 @@
+"""A surface of few faces with textures, for other programs to light."""

@@ -1,0 +1,84 @@
+"""``pimper export``: a result in the layouts of other programs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.config import require
+from pimper_torch.errors import InputError
+from pimper_torch.exchange.formats import Format, write_formats
+from pimper_torch.exchange.map_files import Axes
+from pimper_torch.exchange.result import read_result
+from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.reporting import stage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """Write a result for other programs, each format in a folder of its name in OUT.
+
+    All formats but `lights` have maps or photographs as pinholes saw them, undistorted.
+
+    Attributes:
+        result: Folder that `pimper reconstruct` wrote.
+        out: Folder for the formats; new or empty.
+        formats: One or more: `colmap` (dense workspace: depth and normal maps), `nerfstudio`
+            (transforms.json with masks, for Brush, too), `alicevision` (.sfm with normals and
+            albedo, for Meshroom and Open-RNb), `maps` (normals, depth and albedo as EXR, PNG and
+            NPZ), `lights` (lights.lp for RTI).
+        axes: Of normals in `maps`: `opengl` (right, up, to the viewer), `opencv` (right, down,
+            into the scene) or `lub` (left, up, to the viewer).
+        photos: Folder of the photographs, if they are not where the run found them.
+        overwrite: Replace a former export in OUT.
+    """
+
+    result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    formats: Annotated[tuple[Format, ...], tyro.conf.arg(name="format", metavar="FORMAT")]
+    axes: Axes = "opengl"
+    photos: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    overwrite: Flag = False
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``export``: read the result, and write all formats or none.
+
+    Raises:
+        PimperError: Before anything is written.
+    """
+    job = checked(command, arguments)
+    with (
+        output.observer(),
+        written_whole(job.out, "data set", overwrite=job.overwrite) as staging,
+    ):
+        with stage("read") as told:
+            result = read_result(job.result, job.photos)
+            told["photographs"] = result.scene.views.num_views
+        with stage("write"):
+            write_formats(result, job.formats, staging, job.axes)
+    paths: dict[str, Path] = {name: job.out / name for name in job.formats}
+    output.remark("\n".join(f"{path} is the result as {name}." for name, path in paths.items()))
+    output.result({"folder": job.out, **paths}, photographs=result.scene.views.num_views)
+
+
+def checked(command: str, arguments: Sequence[str]) -> Job:
+    """Read the arguments, and check what can be checked without reading RESULT.
+
+    Raises:
+        PimperError: No format, the folder for them is taken, or there is no result.
+        SystemExit: ``--help`` was answered.
+    """
+    job = read_arguments(Job, command, arguments)
+    require(len(job.formats) > 0, "--format", "nothing", "one format or more")
+    require_apart(job.out, {"RESULT": job.result, "--photos": job.photos})
+    prepare_output(job.out, "data set", job.overwrite)
+    if not job.result.is_dir():
+        raise InputError(
+            f"{job.result}: is no folder; needed: a folder written by `pimper reconstruct`."
+        )
+    return job

@@ -1,0 +1,75 @@
+"""Numbers of a surface's vertices that a page shows in colours."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.records import Mesh
+
+# Colours end where one vertex in so many is beyond: a few would take all colours.
+_BEYOND = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """One number a vertex, shown in colours from ``low`` to ``high``.
+
+    Attributes:
+        attribute: Of the asset's vertices, in small letters.
+        title: On the button.
+        about: Longer, shown when the button is pointed at.
+        low_text: Beside the lowest colour.
+        high_text: Beside the highest.
+    """
+
+    attribute: str
+    title: str
+    about: str
+    low: float
+    high: float
+    low_text: str
+    high_text: str
+
+
+def surface_layers(mesh: Mesh) -> list[Layer]:
+    """Return the layers of what a result's surface says of itself.
+
+    Args:
+        mesh: Of the asset.
+    """
+    layers = []
+    if mesh.expected_error is not None:
+        about = "Standard deviation of the surface along its normal, as the run expects it"
+        layers.append(length_layer("_expected_error", "expected error", about, mesh.expected_error))
+    if mesh.confidence is not None:
+        layers.append(
+            Layer(
+                attribute="_support",
+                title="support",
+                about="Confidence of the normals: how many lights told them, and how well",
+                low=0,
+                high=1,
+                low_text="none",
+                high_text="full",
+            )
+        )
+    return layers
+
+
+def length_layer(
+    attribute: str, title: str, about: str, values: Float[Tensor, " vertex"], unit: str = "units"
+) -> Layer:
+    """Return a layer of lengths, from 0 to what nearly all are below."""
+    known = values[values.isfinite()]
+    rank = max(1, len(known) - len(known) // _BEYOND)
+    high = float(known.kthvalue(rank).values) if len(known) else 0.0
+    return Layer(
+        attribute=attribute,
+        title=title,
+        about=about,
+        low=0,
+        high=high,
+        low_text="0",
+        high_text=f"{high:.3g} {unit} or more",
+    )

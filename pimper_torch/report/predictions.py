@@ -1,0 +1,73 @@
+"""Photographs as the surface explains them, small enough for a page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.parallel import side_by_side
+from pimper_torch.records import Cameras, Mesh, Record, SparseScene
+from pimper_torch.relighting.lights import ViewLights
+from pimper_torch.relighting.materials import Materials
+from pimper_torch.relighting.predict import predict
+from pimper_torch.relighting.surface_pixels import LitSurface
+from pimper_torch.report.pictures import longest_px
+
+# Predictions have half as many pixels a side as photographs: rays are what they cost.
+_COARSER = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Prediction(Record):
+    """A photograph as the surface explains it.
+
+    Attributes:
+        radiance: Linear, under the photograph's fitted light; zero off the surface.
+        light: Of the photograph.
+        figure: What the prediction is worth, in a few words.
+    """
+
+    radiance: Float[Tensor, "channel height width"]
+    light: ViewLights
+    figure: str = ""
+
+
+def predictions(
+    mesh: Mesh,
+    scene: SparseScene,
+    lights: ViewLights,
+    materials: Materials | None,
+    figures: Sequence[str],
+) -> list[Prediction]:
+    """Predict every photograph of a scene under its fitted light.
+
+    Args:
+        mesh: In the scene's frame, with albedo.
+        materials: Of the mesh; matte without.
+        figures: One a view.
+    """
+    surface = LitSurface(mesh)
+    longest = longest_px(scene.views.num_views) // _COARSER
+
+    def one(view: int) -> Prediction:
+        light = lights.take([view])
+        seen = predict(surface, _smaller(scene.cameras.take([view]), longest), light, materials)
+        radiance = seen.nan_to_num(0).movedim(-1, 0)
+        return Prediction(radiance=radiance, light=light, figure=figures[view])
+
+    return list(side_by_side(one, range(scene.views.num_views), tracked=False))
+
+
+def _smaller(camera: Cameras, longest: int) -> Cameras:
+    """Return a camera whose picture is at most ``longest`` pixels wide and high."""
+    width, height = (int(side) for side in camera.sizes_px[0])
+    factor = min(1.0, longest / max(width, height))
+    sides = [max(1, round(factor * side)) for side in (width, height)]
+    return Cameras(
+        intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
+        cam_from_world=camera.cam_from_world,
+        sizes_px=torch.tensor([sides]),
+    )

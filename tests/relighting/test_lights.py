@@ -1,0 +1,120 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.evidence.scenes.meshes import icosphere, join, moved, table
+from pimper_torch.io.tensors import scene_of
+from pimper_torch.records import Mesh
+from pimper_torch.relighting.lights import ViewLights, fit_lights
+from pimper_torch.relighting.observed import observe
+from pimper_torch.relighting.predict import predict, psnr, shaded
+from pimper_torch.relighting.surface_pixels import LitSurface
+from tests.relighting.ball import ball_mesh, photographed
+from tests.threads import on_threads
+
+MATTE, GLOSSY = (0.0, 1.0, 0.0), (0.0, 0.3, 1.0)
+
+
+def angles_deg(one, other):
+    return (one * other).sum(dim=1).clamp(-1, 1).acos().rad2deg()
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return ball_mesh()
+
+
+def test_the_light_of_a_matte_ball_is_found(ball):
+    scene, lights = photographed(MATTE)
+    found = fit_lights(ball, scene)
+    assert angles_deg(found.direction_world, lights.direction_world).max() < 0.2
+    assert torch.allclose(found.ambient, lights.ambient, atol=0.002)
+    assert torch.allclose(found.directed, lights.directed, atol=0.002)
+
+
+def test_highlights_hardly_move_a_light(ball):
+    scene, lights = photographed(GLOSSY)
+    found = fit_lights(ball, scene)
+    assert angles_deg(found.direction_world, lights.direction_world).max() < 2
+
+
+def test_a_matte_ball_is_predicted(ball):
+    scene, _ = photographed(MATTE, views=3)
+    found, surface = fit_lights(ball, scene), LitSurface(ball)
+    for view in range(3):
+        seen = observe(surface, scene, view, None)
+        predicted = shaded(surface, seen.pixels, found.take([view]), None)
+        assert psnr(predicted, seen.radiance) > 55
+
+
+def test_a_photograph_without_the_object_gets_no_light(ball):
+    scene, _ = photographed(MATTE, views=3)
+    nothing = torch.zeros_like(scene.views.images[:, 0], dtype=torch.bool)
+    scene = scene.replace(views=scene.views.replace(masks=nothing))
+    found = fit_lights(ball, scene)
+    assert not found.ambient.any()
+    assert not found.directed.any()
+    assert torch.allclose(found.direction_world.norm(dim=1), torch.ones(3))
+
+
+def test_lights_have_the_same_bits_on_any_number_of_threads(ball):
+    scene, _ = photographed(GLOSSY, views=3)
+    first, *others = on_threads(lambda: fit_lights(ball, scene), 1, 2, 3)
+    for other in others:
+        assert torch.equal(first.direction_world, other.direction_world)
+        assert torch.equal(first.directed, other.directed)
+
+
+@pytest.fixture(scope="module")
+def ball_over_table():
+    vertices, faces = icosphere(4)
+    ball = moved(
+        Mesh(vertices_world=vertices, faces=faces, normals_world=vertices),
+        scale=0.5,
+        shift=(0.0, 0.0, 1.2),
+    )
+    mesh = join(ball, table(3.0)).to(torch.float32)
+    return mesh.replace(albedo=torch.full_like(mesh.vertices_world, 0.5))
+
+
+def from_above():
+    eye = torch.tensor([[0.0, -4, 6]])
+    pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    return pinholes(pose, 200.0, 160, 120)
+
+
+def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table):
+    direction = normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1)
+    light = ViewLights(
+        direction_world=direction,
+        ambient=torch.full((1, 3), 0.1),
+        directed=torch.full((1, 3), 0.8),
+    )
+    surface, camera = LitSurface(ball_over_table), from_above()
+    picture = predict(surface, camera, light)
+    pixels = surface.pixels(camera, 0)
+    on_table = pixels.points_world[:, 2] < 1e-3
+    points = pixels.points_world[on_table]
+    centre = torch.tensor([0.0, 0, 1.2]) - points
+    apart = (centre - (centre @ direction[0])[:, None] * direction).norm(dim=1)
+    shade = picture.reshape(-1, 3)[pixels.pixel[on_table], 0]
+    dark, bright = 0.9 * 0.1, 0.9 * (0.1 + 0.8 * float(direction[0, 2]))
+    assert torch.allclose(shade[apart < 0.48], torch.tensor(dark), atol=1e-4)
+    assert torch.allclose(shade[apart > 0.52], torch.tensor(bright), atol=1e-4)
+    assert (apart < 0.48).sum() > 100
+
+
+def test_cast_shadows_tell_a_light_that_shading_leaves_open(ball_over_table):
+    """A plane alone is lit alike by all lights round its normal."""
+    direction = normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1)
+    light = ViewLights(
+        direction_world=direction,
+        ambient=torch.full((1, 3), 0.1),
+        directed=torch.full((1, 3), 0.8),
+    )
+    camera = from_above()
+    picture = predict(ball_over_table, camera, light).nan_to_num(0)
+    scene = scene_of(picture.movedim(-1, 0)[None], camera.intrinsics, camera.cam_from_world)
+    found = fit_lights(ball_over_table, scene)
+    assert angles_deg(found.direction_world, direction).max() < 0.5
