@@ -12,7 +12,7 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.lights import thinned
-from pimper_torch.records import Silhouettes, StageReport
+from pimper_torch.records import Silhouettes, SparseScene, StageReport
 from pimper_torch.reporting import Silent
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
@@ -134,6 +134,20 @@ def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
     contours = Contours.none(steps[0].silhouettes, scene.cameras)
     remeshed = chain.remesh(steps[0].heights, steps[0].surface, contours)
     assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
+
+
+def test_who_watches_is_shown_cameras_and_every_pass_and_changes_nothing():
+    chain, scene = in_iterations(Silent())
+    expected = chain(scene.views)
+    seen = []
+    chain.watch = seen.append
+    found = chain(scene.views)
+    assert [type(one) for one in seen] == [SparseScene, pt.Step, pt.Step]
+    assert seen[0].views.names == scene.views.names
+    assert [one.scale for one in seen[1:]] == [0.5, 1.0]
+    assert [report.name for report in found.report].count("view") == 3
+    assert torch.equal(found.mesh.vertices_world, expected.mesh.vertices_world)
+    assert torch.equal(found.mesh.albedo, expected.mesh.albedo)
 
 
 def test_a_stage_that_the_chain_has_not_is_refused():

@@ -1,5 +1,6 @@
 """The frame of the viewer: z up, its origin in the middle, cameras about three units away."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +36,43 @@ class Frame(Record):
     def directions(self, vectors_world: Float[Tensor, "vector 3"]) -> Float[Tensor, "vector 3"]:
         """Carry directions from the world to the viewer, float64 on the CPU."""
         return vectors_world.detach().cpu().double() @ self.rotation.mT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stand(Record):
+    """A camera in the viewer.
+
+    Attributes:
+        rotation: From the camera's axes, x right, y down, z forward.
+        position: Of its centre.
+        fov: Across the height of the picture, radians.
+    """
+
+    rotation: Float[Tensor, "3 3"]
+    position: Float[Tensor, " 3"]
+    fov: float
+
+    @property
+    def ahead(self) -> Float[Tensor, " 3"]:
+        """A point before it, as far away as the middle: what is looked at turns about it."""
+        return self.position + self.position.norm() * self.rotation[:, 2]
+
+    @property
+    def up(self) -> Float[Tensor, " 3"]:
+        """Up of the viewer, turned about the line of sight as the picture is."""
+        up, right = self.rotation.new_tensor([0.0, 0.0, 1.0]), self.rotation[:, 0]
+        return normalize(up - (up @ right) * right, dim=0)
+
+
+def stand_of(cameras: Cameras, view: int, frame: Frame) -> Stand:
+    """Put a camera in the viewer."""
+    world_from_cam = invert_rigid(cameras.cam_from_world[view].detach().cpu().double())
+    height, focal_px = float(cameras.sizes_px[view, 1]), float(cameras.intrinsics[view, 1, 1])
+    return Stand(
+        rotation=frame.rotation @ world_from_cam[:3, :3],
+        position=frame.points(world_from_cam[None, :3, 3])[0],
+        fov=2 * math.atan(height / 2 / focal_px),
+    )
 
 
 def frame_of_cameras(

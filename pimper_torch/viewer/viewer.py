@@ -7,14 +7,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Cameras, Mesh, Views
-from pimper_torch.viewer.frame import Frame, frame_of_cameras, frame_of_mesh
+from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.glb import glb_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 from pimper_torch.viewer.photographs import small_pictures
@@ -48,7 +46,7 @@ class Viewer:
         self._lock = threading.RLock()
         self._frame: Frame | None = None
         self._passes: list[tuple[str, Mesh]] = []
-        self._poses: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, float]] = {}
+        self._stands: dict[str, Stand] = {}
         self._lights: dict[str, Float[Tensor, " 4"]] = {}
         scene = server.scene
         scene.configure_default_lights(enabled=False)
@@ -104,34 +102,25 @@ class Viewer:
         for view, name in enumerate(names):
             self._add_camera(view, name, cameras, None if pictures is None else pictures[view])
         self._chosen.options = (NO_PHOTOGRAPH, *names)
-        initial = self.server.initial_camera
-        _, position, ahead, fov = self._poses[names[reference]]
-        initial.position, initial.look_at, initial.fov = position, ahead, fov
+        _stand_at(self.server.initial_camera, self._stands[names[reference]])
         self.choose(names[reference])
 
     def _add_camera(
         self, view: int, name: str, cameras: Cameras, picture: np.ndarray | None
     ) -> None:
-        from viser.transforms import SO3
-
         assert self._frame is not None
-        world_from_cam = invert_rigid(cameras.cam_from_world[view].detach().cpu().double())
-        position = self._frame.points(world_from_cam[None, :3, 3])[0].numpy()
-        wxyz = SO3.from_matrix((self._frame.rotation @ world_from_cam[:3, :3]).numpy()).wxyz
+        stand = self._stands[name] = stand_of(cameras, view, self._frame)
+        wxyz, position = _quaternion(stand), stand.position.numpy()
         (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[view].tolist()
         width, height = cameras.sizes_px[view].tolist()
-        fov = 2 * math.atan(height / 2 / fy)
-        forward = (self._frame.rotation @ world_from_cam[:3, 2]).numpy()
-        ahead = position - (position @ forward) * forward  # turns about the middle
-        self._poses[name] = (wxyz, position, ahead, fov)
         depth = min(_DEEPEST, _SIDE / max(width / fx, height / fy))
         # viser makes frusta of the same volume; this one is as deep.
-        scale = depth * math.cbrt(width / height * math.tan(fov / 2) ** 2 / 3)
+        scale = depth * math.cbrt(width / height * math.tan(stand.fov / 2) ** 2 / 3)
         scene, node = self.server.scene, f"{view:05d}"
         handles: list[Any] = [
             scene.add_camera_frustum(
                 f"/cameras/{node}",
-                fov,
+                stand.fov,
                 width / height,
                 scale=scale,
                 wxyz=wxyz,
@@ -141,16 +130,12 @@ class Viewer:
             )
         ]
         if picture is not None:
-            off_center = torch.tensor([(width / 2 - cx) / fx, (height / 2 - cy) / fy, 1.0]).double()
-            middle = self._frame.rotation @ world_from_cam[:3, :3] @ (depth * off_center)
+            size = (depth * width / fx, depth * height / fy)
+            middle = [size[0] / 2 - depth * cx / fx, size[1] / 2 - depth * cy / fy, depth]
+            at = stand.position + stand.rotation @ stand.position.new_tensor(middle)
             handles.append(
                 scene.add_image(
-                    f"/photographs/{node}",
-                    picture,
-                    depth * width / fx,
-                    depth * height / fy,
-                    wxyz=wxyz,
-                    position=position + middle.numpy(),
+                    f"/photographs/{node}", picture, *size, wxyz=wxyz, position=at.numpy()
                 )
             )
         for handle in handles:
@@ -205,20 +190,16 @@ class Viewer:
             client: Page that stands there; all of them unless given.
         """
         self._chosen.value = name
-        for view, other in enumerate(self._poses):
+        for view, other in enumerate(self._stands):
             for group in ("cameras", "photographs"):
                 node = self.server.scene.get_handle_by_name(f"/{group}/{view:05d}")
                 if node is not None:
                     node.visible = other != name
-        if name not in self._poses:
+        if name not in self._stands:
             return
-        wxyz, position, ahead, fov = self._poses[name]
         for one in self.server.get_clients().values() if client is None else (client,):
             with one.atomic():
-                one.camera.fov = fov
-                one.camera.position = position
-                one.camera.look_at = ahead
-                one.camera.wxyz = wxyz
+                _stand_at(one.camera, self._stands[name])
         if name in self._lights and self._frame is not None:
             ambient = max(0.0, float(self._lights[name][0]))
             x, y, z = self._frame.directions(self._lights[name][None, 1:])[0].tolist()
@@ -287,6 +268,20 @@ class Viewer:
         self._sun.position = tuple(10 * one for one in direction)  # it shines on the origin
         self._sun.intensity = _BRIGHTNESS * (1 - self._ambient.value)
         self._sky.intensity = _BRIGHTNESS * self._ambient.value
+
+
+def _quaternion(stand: Stand) -> np.ndarray:
+    from viser.transforms import SO3
+
+    return SO3.from_matrix(stand.rotation.numpy()).wxyz
+
+
+def _stand_at(camera: Any, stand: Stand) -> None:  # noqa: ANN401 - a page's, or of new pages
+    """Put the camera of a page where a photograph was taken."""
+    up = "up_direction" if hasattr(camera, "up_direction") else "up"
+    camera.fov, camera.position = stand.fov, stand.position.numpy()
+    camera.look_at = stand.ahead.numpy()
+    setattr(camera, up, stand.up.numpy())
 
 
 @contextmanager

@@ -456,6 +456,42 @@ def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monk
     assert moments == sorted(moments)
 
 
+def test_a_run_that_tells_events_does_not_wait_for_who_looks_at_it(
+    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
+):
+    pytest.importorskip("viser")
+
+    def show(self):
+        self.watch(reconstruction.scene)
+        self.preview(reconstruction.scene, reconstruction.coarse)
+
+    monkeypatch.setattr(chain, "work", show)
+    assert run("reconstruct", photos, "--view", "--json", "-o", tmp_path / "out") == 0
+    told = events(capsys)
+    (page,) = [one for one in told if one["event"] == "view"]
+    assert page["address"].startswith("http://127.0.0.1:")
+    assert told[-1]["event"] == "result"
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_a_run_that_is_looked_at_stays_until_ctrl_c(
+    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
+):
+    pytest.importorskip("viser")
+    monkeypatch.setattr(chain, "work", lambda self: self.watch(reconstruction.scene))
+    assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 0
+    assert capsys.readouterr().out.rstrip().endswith("until Ctrl-C.")
+
+
+def test_a_run_is_refused_before_it_begins_where_there_is_no_viewer(
+    photos, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("pimper_torch.viewer.server.find_spec", lambda _: None)
+    assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 2
+    assert "pip install 'pimper_torch[view]'" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
     photos, chain, reconstruction, tmp_path, capsys, monkeypatch
 ):

@@ -6,7 +6,7 @@ import torch
 
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh
+from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.glb import glb_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 
@@ -96,6 +96,21 @@ def test_the_viewer_stands_on_the_ring_of_cameras(known):
     assert float(frame.rotation.det()) == pytest.approx(1)
     placed = frame.points(torch.tensor([[0.0, 40.0, 30.0]]))
     torch.testing.assert_close(placed, torch.tensor([[2.4, 0.0, 1.8]]).double())
+
+
+def test_a_stand_looks_along_the_camera_and_rolls_with_it():
+    cameras = cameras_on_a_ring(8, 40.0, 30.0)
+    quarter = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]).double()
+    cameras = cameras.replace(
+        cam_from_world=torch.cat([cameras.cam_from_world[:7], quarter @ cameras.cam_from_world[7:]])
+    )
+    frame = frame_of_cameras(cameras_on_a_ring(8, 40.0, 30.0), 0, torch.zeros(1, 3))
+    upright, lying = stand_of(cameras, 0, frame), stand_of(cameras, 7, frame)
+    torch.testing.assert_close(upright.position.norm(), torch.tensor(3.0).double())
+    torch.testing.assert_close(upright.ahead, torch.zeros(3).double(), atol=1e-9, rtol=0)
+    torch.testing.assert_close(upright.up, torch.tensor([0, 0, 1.0]).double())
+    assert upright.fov == pytest.approx(2 * np.arctan(5))
+    assert abs(float(lying.up @ lying.rotation[:, 0])) < 1e-9  # right in its picture is right
 
 
 def test_normals_are_coloured_as_the_reference_camera_sees_them(ball):
