@@ -73,7 +73,10 @@ def observe_all(
 ) -> list[Observed]:
     """Look at the surface through every photograph; see :func:`observe`."""
     views = range(scene.cameras.num_views)
-    return list(side_by_side(lambda view: observe(surface, scene, view, silhouettes), views))
+    seen = side_by_side(
+        lambda view: observe(surface, scene, view, silhouettes), views, tracked=False
+    )
+    return list(seen)
 
 
 def observe(

@@ -32,8 +32,9 @@ def predict(
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
     pixels = surface.pixels(camera, 0)
     width, height = (int(side) for side in camera.sizes_px[0])
-    picture = torch.full((height * width, pixels.base_color.shape[1]), torch.nan)
-    picture[pixels.pixel] = shaded(surface, pixels, light, materials)
+    radiance = shaded(surface, pixels, light, materials)
+    picture = torch.full((height * width, radiance.shape[1]), torch.nan)
+    picture[pixels.pixel] = radiance
     return picture.reshape(height, width, -1)
 
 

@@ -21,7 +21,7 @@ from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.viz.maps import base_color, view_maps
-from tests.relighting.ball import ball_mesh, photographed
+from tests.relighting.ball import SIDE, ball_mesh, photographed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 sync_api = pytest.importorskip("playwright.sync_api")
@@ -60,9 +60,10 @@ def shown(tmp_path_factory):
     asset = textured(mesh, mesh, materials.at_vertices())
     write_asset(asset, folder / "asset.glb")
     views = scene.views.num_views
-    y, x = torch.meshgrid(torch.arange(120) - 59.5, torch.arange(120) - 59.5, indexing="ij")
+    across = torch.arange(SIDE) + 0.5 - SIDE / 2
+    y, x = torch.meshgrid(across, across, indexing="ij")
     silhouettes = Silhouettes(
-        inside=(torch.hypot(x, y) < 49.5).float().expand(views, 120, 120),
+        inside=(torch.hypot(x, y) < 0.41 * SIDE).float().expand(views, SIDE, SIDE),
         reliable=torch.ones(views, dtype=torch.bool),
         source="found",
     )
@@ -112,7 +113,7 @@ def opened(browser, shown):
 
 def opening(page, path):
     page.goto(path.as_uri())
-    page.wait_for_function("document.documentElement.dataset.ready", timeout=30_000)
+    page.wait_for_selector("html[data-ready]", state="attached", timeout=60_000)
 
 
 def choose(page, layer):
@@ -140,7 +141,7 @@ def photograph_of(picture):
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     square = Image.fromarray(picture[top : top + side, left : left + side].astype(np.uint8))
-    return np.asarray(square.resize((120, 120), Image.Resampling.BOX)).astype(float)
+    return np.asarray(square.resize((SIDE, SIDE), Image.Resampling.BOX)).astype(float)
 
 
 def inner(scene, mesh, view):
@@ -301,7 +302,7 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     page.locator("#trouble").wait_for(state="visible")
     assert "cannot be drawn here" in page.locator("#trouble").inner_text()
     page.locator("#thumbnails button").first.click()
-    assert page.locator("#prediction img").is_visible()
+    page.locator("#prediction img").wait_for(state="visible")
     assert page.get_by_role("heading", name="Stages").is_visible()
     plain.close()
 

@@ -111,6 +111,7 @@ def test_pinholes_are_those_of_the_run(reconstruction):
 def test_a_prediction_comes_with_its_light(reconstruction):
     light = ViewLights(
         direction_world=torch.tensor([[0.0, 0.6, 0.8]]),
+        closeness=torch.tensor([0.25]),
         ambient=torch.tensor([[0.1]]),
         directed=torch.tensor([[0.5]]),
     )
@@ -120,6 +121,7 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     )
     assert "prediction" not in first
     assert second["figure"] == "30.0 dB"
+    assert second["light"]["closeness"] == 0.25
     assert second["light"]["directed"] == pytest.approx([0.5] * 3)
     assert second["light"]["direction"] == pytest.approx([0.0, 0.6, 0.8])
     picture = decoded(second["prediction"])
@@ -130,6 +132,7 @@ def test_predictions_are_of_every_photograph(reconstruction):
     scene = reconstruction.scene
     lights = ViewLights(
         direction_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3),
+        closeness=torch.zeros(3),
         ambient=torch.tensor([[0.1], [0.2], [0.4]]),
         directed=torch.zeros(3, 1),
     )
