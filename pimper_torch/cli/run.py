@@ -29,6 +29,7 @@ from pimper_torch.outputs.marker import STAGES
 from pimper_torch.outputs.stages import PREVIEW
 from pimper_torch.records import CoarseMesh, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
+from pimper_torch.size.given import measured_in
 from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
 from pimper_torch.viz.overview import headline
@@ -55,6 +56,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, observer, _store(job))
+        chain.needed = tuple(measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
         result = result.replace(report=(imports, *accounted()))

@@ -20,6 +20,7 @@ from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
+from pimper_torch.relighting.held_out import relight
 from pimper_torch.reporting import reported
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
@@ -41,7 +42,7 @@ RESULT_NAMES = (
     "summary.json",
     "overview.png",
 )
-_PARTS = 4  # of the bar: simplification, meshes and cameras, maps, contact sheet
+_PARTS = 5  # of the bar: simplification, light and material, meshes and cameras, maps, sheet
 
 
 def write_result(
@@ -73,7 +74,8 @@ def write_result(
                      (float64 far from the origin), name
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
-    `summary.json`   counts, times, memory, convergence
+    `summary.json`   counts, times, memory, convergence; materials, and how near the surface comes
+                     to photographs with them and without, in decibels
     `overview.png`   contact sheet, every photograph with its silhouette below
     ===============  ==============================================================
 
@@ -107,11 +109,14 @@ def write_result(
             ready = finished(whole.mesh, files or MeshFiles())
         found, whole = whole, whole.replace(mesh=ready.mesh)
         with part(1, _PARTS):
+            relighting = relight(whole.mesh, whole.scene, whole.silhouettes, whole.held_out)
+        with part(2, _PARTS):
             _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
         summary = {**summary_report(found, about or {}), **ready.summary}
+        summary["relighting"] = relighting.report()
         _write_json(summary, staging / "summary.json", indent=2)
 
 
@@ -131,11 +136,11 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
-    with part(2, _PARTS):
+    with part(3, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(3, _PARTS):
+    with part(4, _PARTS):
         draw_overview(result, folder / "overview.png")
 
 
