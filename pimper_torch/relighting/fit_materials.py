@@ -74,7 +74,7 @@ def materials_under(
         split = shared.repeat(count, 1)
         for one in range(count):
             split = trial.improved(finer, split, one, _around(split[one], 2.0))
-        if len(torch.unique(split, dim=0)) < count:
+        if len({tuple(row) for row in split.tolist()}) < count:
             break
         cluster, values = finer, split
     return Materials.of(cluster, values)

@@ -26,7 +26,7 @@ RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
         "--faces all --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
-        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
+        "--hold-out 2 --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
@@ -35,7 +35,8 @@ RUNS = {
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
-        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view",
+        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view "
+        "--hold-out 0",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -275,7 +276,7 @@ def other_values(leaf):
     elif isinstance(value, str):
         yield from ("SIMPLE_PINHOLE", "other", "2GB")
     elif isinstance(value, int):
-        yield from (value + 1, value - 1)
+        yield from (value + 1, value - 1, value + 2)
     else:
         yield from (0.9 * value, 1.1 * value, 0.25, value + 1)
 

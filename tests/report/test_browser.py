@@ -15,6 +15,7 @@ from pimper_torch.asset.make import textured
 from pimper_torch.asset.write import write_asset
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes
+from pimper_torch.relighting.held_out import Judged, Relighting
 from pimper_torch.relighting.materials import Materials
 from pimper_torch.relighting.predict import predict
 from pimper_torch.report.layers import surface_layers
@@ -49,12 +50,12 @@ def shown(tmp_path_factory):
     mesh = mesh.replace(
         expected_error=0.01 + 0.005 * mesh.vertices_world[:, 2], confidence=torch.ones(count)
     )
-    metallic, roughness, specular = torch.tensor(GLOSSY)[:, None].unbind()
-    materials = Materials(
-        cluster=torch.zeros(count, dtype=torch.long),
-        metallic=metallic,
-        roughness=roughness,
-        specular=specular,
+    materials = Materials.of(torch.zeros(count, dtype=torch.long), torch.tensor([GLOSSY]))
+    worth = Judged(
+        psnr_db=torch.full((scene.views.num_views,), 31.0), lights=lights, names=scene.views.names
+    )
+    relighting = Relighting(
+        lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
     )
     folder = tmp_path_factory.mktemp("page")
     asset = textured(mesh, mesh, materials.at_vertices())
@@ -75,7 +76,7 @@ def shown(tmp_path_factory):
         scene=scene,
         silhouettes=silhouettes,
         reference=0,
-        predictions=predictions(mesh, scene, lights, materials, ["31.0 dB"] * views),
+        predictions=predictions(mesh, scene, relighting),
         layers=surface_layers(asset.mesh),
         summary=SUMMARY,
         settings="zeta: 0.5",

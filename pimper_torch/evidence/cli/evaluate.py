@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -138,18 +138,19 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         )
     truth = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
+    relighting = read_relighting(job.result)
     if not output.as_json:
-        show(evaluation, Console())
+        show(evaluation, Console(), relighting)
     _prepare_files(job)
     if job.out is not None:
-        write_report(evaluation, job)
+        write_report(evaluation, job, relighting)
         output.remark(f"{job.out} has all figures.")
     if job.calibration is not None:
         _draw(evaluation, job.calibration)
         output.remark(f"{job.calibration} is drawn.")
     files = {"figures": job.out, "calibration": job.calibration}
     paths = {name: path for name, path in files.items() if path is not None}
-    output.result(paths, figures=report(evaluation))
+    output.result(paths, figures={**report(evaluation), "relighting": relighting})
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
@@ -262,9 +263,21 @@ def mesh_capture(path: Path) -> Capture:
     )
 
 
-def show(evaluation: Evaluation, console: Console) -> None:
+def read_relighting(result: Path) -> dict[str, Any] | None:
+    """Read how near a result comes to photographs, where it tells."""
+    try:
+        summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    found: dict[str, Any] | None = summary.get("relighting")
+    return found
+
+
+def show(
+    evaluation: Evaluation, console: Console, relighting: dict[str, Any] | None = None
+) -> None:
     """Print the figures section by section, with what each says beside or below it."""
-    sections = rows(evaluation)
+    sections = rows(evaluation, relighting)
     lines = [row for _, found in sections for row in found]
     first = 2 + max(len(row.name) for row in lines)
     second = first + 2 + max(len(row.value) for row in lines)
@@ -281,7 +294,9 @@ def show(evaluation: Evaluation, console: Console) -> None:
             console.print(text, soft_wrap=True)
 
 
-def write_report(evaluation: Evaluation, job: Job) -> None:
+def write_report(
+    evaluation: Evaluation, job: Job, relighting: dict[str, Any] | None = None
+) -> None:
     """Write all figures and the settings they were made with as JSON, whole or not at all.
 
     Raises:
@@ -295,6 +310,7 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
         "truth": str(job.truth),
         "settings": to_mapping(job.options),
         **report(evaluation),
+        "relighting": relighting,
     }
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     with file_written_whole(job.out) as fresh:
