@@ -1,4 +1,4 @@
-"""Metallic, roughness and specular of a surface, one of each for every cluster of albedo."""
+"""Materials of a surface in glTF's terms, one for every cluster of albedo."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Materials(Record):
-    """Materials in glTF's terms, for base colours of :func:`~pimper_torch.viz.maps.base_color`.
+    """Materials for base colours of :func:`~pimper_torch.viz.maps.base_color`.
 
     Attributes:
         cluster: Of each vertex.
@@ -26,16 +26,17 @@ class Materials(Record):
     roughness: Float[Tensor, " cluster"]
     specular: Float[Tensor, " cluster"]
 
+    @classmethod
+    def of(cls, cluster: Int[Tensor, " vertex"], values: Float[Tensor, "cluster 3"]) -> "Materials":
+        """Return materials from metallic, roughness and specular of each cluster."""
+        metallic, roughness, specular = values.unbind(dim=1)
+        return cls(cluster=cluster, metallic=metallic, roughness=roughness, specular=specular)
+
+    @property
+    def values(self) -> Float[Tensor, "cluster 3"]:
+        """Metallic, roughness and specular of every cluster."""
+        return torch.stack([self.metallic, self.roughness, self.specular], dim=1)
+
     def at_vertices(self) -> Float[Tensor, "vertex 3"]:
         """Return metallic, roughness and specular of every vertex."""
-        return torch.stack([self.metallic, self.roughness, self.specular], dim=1)[self.cluster]
-
-
-def matte(num_vertices: int) -> Materials:
-    """Return one material without highlights."""
-    return Materials(
-        cluster=torch.zeros(num_vertices, dtype=torch.long),
-        metallic=torch.zeros(1),
-        roughness=torch.ones(1),
-        specular=torch.zeros(1),
-    )
+        return self.values[self.cluster]

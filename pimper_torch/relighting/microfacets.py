@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def facet_density(
-    cosine: Float[Tensor, "*batch"], alpha: Float[Tensor, "*#batch"]
+    cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch"]:
     """Return GGX's density of facets per solid angle.
 
@@ -25,7 +25,7 @@ def facet_density(
 
 
 def masking(
-    to_light: Float[Tensor, "*batch"],
+    to_light: Float[Tensor, "*#batch"],
     to_eye: Float[Tensor, "*#batch"],
     alpha: Float[Tensor, "*#batch"],
 ) -> Float[Tensor, "*batch"]:

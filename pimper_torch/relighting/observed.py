@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record, Silhouettes, SparseScene
 from pimper_torch.relighting.surface_pixels import LitSurface, SurfacePixels
@@ -27,13 +29,22 @@ class Observed(Record):
     Attributes:
         pixels: Of the photograph as it was shrunk.
         radiance: Linear; 1 is saturated.
-        weight: Of a squared error of radiance, so that errors count as sRGB shows them; 0 where
-            the photograph is saturated.
+        weight: Of a squared error of radiance, so that errors count as sRGB shows them.
+        saturated: True where the photograph is, in a part of the pixel at least: it tells no more
+            than that the radiance is not below what it shows.
     """
 
     pixels: SurfacePixels
     radiance: Float[Tensor, "pixel channel"]
     weight: Float[Tensor, "pixel channel"]
+    saturated: Bool[Tensor, " pixel"]
+
+    def errors(
+        self, predicted: Float[Tensor, "*batch pixel channel"]
+    ) -> Float[Tensor, "*batch pixel channel"]:
+        """Return how far predicted radiance is off; 0 where it exceeds a saturated photograph's."""
+        error = predicted - self.radiance
+        return torch.where(self.saturated[:, None], error.clamp_max(0), error)
 
     def thinned(self, most: int) -> "Observed":
         """Keep every n-th pixel, so that few enough are left."""
@@ -55,6 +66,14 @@ def shrunk(cameras: Cameras, view: int) -> Cameras:
         cam_from_world=cameras.cam_from_world[view : view + 1],
         sizes_px=cameras.sizes_px[view : view + 1] // factor,
     )
+
+
+def observe_all(
+    surface: LitSurface, scene: SparseScene, silhouettes: Silhouettes | None
+) -> list[Observed]:
+    """Look at the surface through every photograph; see :func:`observe`."""
+    views = range(scene.cameras.num_views)
+    return list(side_by_side(lambda view: observe(surface, scene, view, silhouettes), views))
 
 
 def observe(
@@ -79,9 +98,12 @@ def observe(
     pixels = pixels.take(kept)
     radiance = radiance[pixels.pixel].clamp(0, 1)
     # The slope of sRGB but for its factor.
-    weight = radiance.clamp_min(_DARK) ** (2 / 2.4 - 2)
-    weight = weight * (saturated.flatten()[pixels.pixel] == 0)[:, None]
-    return Observed(pixels=pixels, radiance=radiance, weight=weight)
+    return Observed(
+        pixels=pixels,
+        radiance=radiance,
+        weight=radiance.clamp_min(_DARK) ** (2 / 2.4 - 2),
+        saturated=saturated.flatten()[pixels.pixel] > 0,
+    )
 
 
 def _masks(scene: SparseScene, view: int, silhouettes: Silhouettes | None) -> list[Tensor]:

@@ -8,7 +8,7 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.relighting.lights import ViewLights
 from pimper_torch.relighting.materials import Materials
-from pimper_torch.relighting.reflectance import response
+from pimper_torch.relighting.reflectance import diffuse_color, response
 from pimper_torch.relighting.surface_pixels import LitSurface, SurfacePixels
 
 
@@ -46,9 +46,9 @@ def shaded(
         light: Of one view.
     """
     material = None if materials is None else materials.at_vertices()[pixels.vertex]
-    cosine = surface.cosines(pixels, light.direction_world)
-    lit = response(pixels, light.direction_world, cosine, material)[0]
-    return light.ambient * pixels.base_color + light.directed * lit
+    incidence = surface.incidence(pixels, light.direction_world, light.closeness)
+    lit = response(pixels, incidence, material)[0]
+    return light.ambient * diffuse_color(pixels, material) + light.directed * lit
 
 
 def psnr(

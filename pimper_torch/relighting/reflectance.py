@@ -17,54 +17,45 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.relighting.microfacets import facet_density, masking
-from pimper_torch.relighting.surface_pixels import SurfacePixels
+from pimper_torch.relighting.surface_pixels import Incidence, SurfacePixels
 
 DIELECTRIC = 0.04
 """What glTF's dielectric mirrors head on."""
 
 
-def lobe(
-    pixels: SurfacePixels,
-    to_light: Float[Tensor, "direction 3"],
-    cosine: Float[Tensor, "direction pixel"],
-    roughness: Float[Tensor, "*#pixel"],
-) -> tuple[Float[Tensor, "direction pixel"], Float[Tensor, "direction pixel"]]:
-    """Return the highlight of a perfect mirror's facets, and Schlick's ``(1 - v . h)^5``.
+def diffuse_color(
+    pixels: SurfacePixels, material: Float[Tensor, "*batch pixel 3"] | None = None
+) -> Float[Tensor, "*batch pixel channel"]:
+    """Return the albedo of the matte part, which ambient light meets, too.
 
     Args:
-        to_light: Unit, world.
-        cosine: Between light and normal; 0 in shadow.
-        roughness: More than 0.
+        material: Metallic, roughness and specular; matte without.
     """
-    aligned = to_light @ pixels.to_eye.mT
-    length = (2 + 2 * aligned).clamp_min(1e-6).sqrt()  # of the sum of both directions
-    to_eye = (pixels.normals_world * pixels.to_eye).sum(dim=1).clamp_min(1e-3)
-    alpha = roughness**2
-    density = facet_density(((cosine + to_eye) / length).clamp(0, 1), alpha)
-    grazing = (1 - (1 + aligned) / length).clamp(0, 1) ** 5
-    return torch.pi * density * masking(cosine, to_eye, alpha) * cosine, grazing
+    return pixels.base_color if material is None else (1 - material[..., :1]) * pixels.base_color
 
 
 def response(
-    pixels: SurfacePixels,
-    to_light: Float[Tensor, "direction 3"],
-    cosine: Float[Tensor, "direction pixel"],
-    material: Float[Tensor, "pixel 3"] | None = None,
-) -> Float[Tensor, "direction pixel channel"]:
+    pixels: SurfacePixels, light: Incidence, material: Float[Tensor, "*batch pixel 3"] | None = None
+) -> Float[Tensor, "lit pixel channel"]:
     """Return the radiance under directed lights of strength 1.
 
     Args:
-        to_light: Unit, world.
-        cosine: Between light and normal; 0 in shadow.
+        light: One for all materials, or as many.
         material: Metallic, roughness and specular; matte without.
     """
-    base = pixels.base_color
     if material is None:
-        return cosine[..., None] * base
-    metallic, roughness, specular = material.unbind(dim=1)
-    highlight, grazing = lobe(pixels, to_light, cosine, roughness)
+        return light.irradiance[..., None] * pixels.base_color
+    metallic, roughness, specular = material.unbind(dim=-1)
+    aligned = (light.to_light * pixels.to_eye).sum(dim=-1)
+    length = (2 + 2 * aligned).clamp_min(1e-6).sqrt()  # of the sum of both directions
+    to_eye = (pixels.normals_world * pixels.to_eye).sum(dim=1).clamp_min(1e-3)
+    alpha = roughness**2
+    density = facet_density(((light.cosine + to_eye) / length).clamp(0, 1), alpha)
+    highlight = torch.pi * density * masking(light.cosine, to_eye, alpha) * light.irradiance
+    grazing = (1 - (1 + aligned) / length).clamp(0, 1) ** 5
     dielectric = (1 - metallic) * specular
-    head_on = (DIELECTRIC * dielectric)[:, None] + metallic[:, None] * base
-    edge = ((1 - metallic) * specular.clamp_max(1) + metallic)[:, None]
+    head_on = (DIELECTRIC * dielectric)[..., None] + metallic[..., None] * pixels.base_color
+    edge = ((1 - metallic) * specular.clamp_max(1) + metallic)[..., None]
     mirrored = head_on + (edge - head_on) * grazing[..., None]
-    return cosine[..., None] * (1 - metallic[:, None]) * base + highlight[..., None] * mirrored
+    matte = light.irradiance[..., None] * diffuse_color(pixels, material)
+    return matte + highlight[..., None] * mirrored

@@ -12,9 +12,12 @@ from pimper_torch.geometry.visibility import RayCaster, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.viz.maps import base_color
 
-# Shadow rays start this far from the surface, as a fraction of its diagonal: beyond what
+# Shadow rays start this far from the surface, as a fraction of its radius: beyond what
 # simplification moves it by, and short of what casts a shadow worth seeing.
-_LIFT = 0.002
+_LIFT = 0.004
+
+# No point is nearer to a light than this fraction of the light's distance from the centre.
+_NEAREST = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -40,6 +43,21 @@ class SurfacePixels(Record):
     inner: Bool[Tensor, " pixel"]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Incidence(Record):
+    """How lights reach the pixels of a view.
+
+    Attributes:
+        to_light: Unit, world.
+        cosine: Between the normal and the light; 0 where the surface faces away or is shadowed.
+        irradiance: Of a light that has 1 at the surface's centre.
+    """
+
+    to_light: Float[Tensor, "light pixel 3"]
+    cosine: Float[Tensor, "light pixel"]
+    irradiance: Float[Tensor, "light pixel"]
+
+
 class LitSurface:
     """A mesh prepared to be seen and to cast shadows; a constant to autograd, on the CPU."""
 
@@ -52,8 +70,9 @@ class LitSurface:
         self.normals_world = normals
         self.base_color = base_color(mesh)
         self._caster = RayCaster(mesh.vertices_world, mesh.faces)
-        extent = mesh.vertices_world.amax(dim=0) - mesh.vertices_world.amin(dim=0)
-        self._lift = _LIFT * float(extent.norm())
+        low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
+        self.center_world = (low + high) / 2
+        self.radius = float((high - low).norm()) / 2
 
     def pixels(self, cameras: Cameras, view: int) -> SurfacePixels:
         """Return what a view shows."""
@@ -74,26 +93,36 @@ class LitSurface:
             inner=~elsewhere[seen],
         )
 
-    def cosines(
+    def incidence(
         self,
         pixels: SurfacePixels,
-        to_light: Float[Tensor, "direction 3"],
+        directions: Float[Tensor, "light 3"],
+        closeness: Float[Tensor, " light"],
         *,
         shadows: bool = True,
-    ) -> Float[Tensor, "direction pixel"]:
-        """Return the cosine between the normal and directions to a light; 0 in shadow.
+    ) -> "Incidence":
+        """Return from where lights reach pixels, and where they do.
 
         Args:
-            to_light: Unit, world.
+            directions: Unit, world, from the surface's centre.
+            closeness: The surface's radius over the light's distance from its centre; 0 for a light
+                at infinity.
             shadows: Whether the surface casts any; without, only what faces away is dark.
         """
-        cosine = (to_light @ pixels.normals_world.mT).clamp_min(0)
-        if not shadows:
-            return cosine
-        direction, pixel = (cosine > 0).nonzero(as_tuple=True)
-        along = to_light[direction]
-        start = pixels.points_world[pixel] + self._lift * (pixels.normals_world[pixel] + along)
-        reach = torch.full_like(start[:, 0], torch.inf)
-        blocked = self._caster.blocked(start, along, reach)
-        cosine[direction[blocked], pixel[blocked]] = 0
-        return cosine
+        offset = (pixels.points_world - self.center_world) / self.radius
+        toward = directions[:, None] - closeness[:, None, None] * offset
+        distance = toward.norm(dim=-1).clamp_min(_NEAREST)
+        toward = toward / distance[..., None]
+        cosine = (toward * pixels.normals_world).sum(dim=-1).clamp_min(0)
+        if shadows:
+            light, pixel = (cosine > 0).nonzero(as_tuple=True)
+            along = toward[light, pixel]
+            lift = _LIFT * self.radius * (pixels.normals_world[pixel] + along)
+            reach = torch.full_like(lift[:, 0], torch.inf)
+            blocked = self._caster.blocked(pixels.points_world[pixel] + lift, along, reach)
+            cosine[light[blocked], pixel[blocked]] = 0
+        return Incidence(
+            to_light=toward,
+            cosine=cosine,
+            irradiance=cosine / distance**2,
+        )

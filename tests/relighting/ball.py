@@ -12,7 +12,7 @@ from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.lights import ViewLights
 
-SIDE = 120
+SIDE = 80
 
 
 def ring(views):
@@ -32,6 +32,7 @@ def lights_beside(cameras):
     return ViewLights(
         direction_world=normalize(eyes + 0.7 * aside, dim=1).float(),
         ambient=(0.1 * torch.tensor([0.6, 0.8, 1.0])).expand(len(eyes), 3).contiguous(),
+        closeness=torch.zeros(len(eyes)),
         directed=(strength[:, None] * tint).float(),
     )
 
