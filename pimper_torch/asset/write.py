@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.asset.bake import Textured
-from pimper_torch.asset.gltf import MATTE, write_gltf
+from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.radiometry import to_bytes
 
@@ -41,7 +41,8 @@ def write_asset(asset: Textured, path: Path | str, offset_world: Offset = NO_OFF
     if asset.reflectance is not None:
         images += _reflect(material, asset.reflectance, len(images))
     arrays = {name: values.numpy() for name, values in attributes.items()}
-    write_gltf(path, arrays, mesh.faces.numpy(), material, images, offset_world)
+    data = gltf_of(arrays, mesh.faces.numpy(), material, images, offset_world)
+    Path(path).write_bytes(data)
 
 
 def _reflect(
