@@ -42,6 +42,16 @@ def shapes_unchecked(pytestconfig: pytest.Config) -> None:
 
 
 @pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write results with small pictures: the large ones take longer than all else."""
+    from pimper_torch.io import results
+
+    draw, turn = results.draw_overview, results.draw_turn
+    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+    monkeypatch.setattr(results, "draw_turn", lambda *arguments: turn(*arguments, side_px=8))
+
+
+@pytest.fixture
 def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize

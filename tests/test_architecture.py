@@ -52,6 +52,7 @@ ROOMS = [
     "chains",
     "viz",
     "asset",
+    "report",
     "outputs",
     "io",
     "doctor",

@@ -76,8 +76,9 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
         return found.replace(views=views)
 
     monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
-    draw = results.draw_overview
+    draw, turn = results.draw_overview, results.draw_turn
     monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
+    monkeypatch.setattr(results, "draw_turn", lambda *given: turn(*given, side_px=8))
     few = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}

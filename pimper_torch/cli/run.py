@@ -2,7 +2,6 @@
 
 import json
 import time
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -18,7 +17,7 @@ from pimper_torch.cli.size import bars_in_files, sized, told_size
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.doctor.forecast import Forecast
-from pimper_torch.errors import ConfigError, PimperWarning
+from pimper_torch.errors import ConfigError, caution, overheard
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -46,7 +45,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     _check_device(common.device)
     imports = reported("import", time.perf_counter() - output.began)
     held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
-    with held, output.observer(forecast) as observer:
+    with held, output.observer(forecast) as observer, overheard() as messages:
         with stage("read") as told:
             views = _read(job)
             told["photographs"] = views.num_views
@@ -62,7 +61,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             result, scale = sized(job, bars, result)
             if scale is not None:
                 told["scale"] = scale.factor
-            _write(job, result, scale)
+            _write(job, result, scale, messages)
         result = result.replace(report=(imports, *accounted()))
     if scale is not None:
         output.remark(told_size(scale))
@@ -115,10 +114,10 @@ def _examine(job: Job, views: Views) -> None:
         own.add("cost")  # which is that of `default`
     for finding in examine_views(views):
         if finding.severity == "warning" and finding.check not in own:
-            warnings.warn(f"{job.photos}: {finding}", PimperWarning, stacklevel=2)
+            caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
+def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequence[str]) -> None:
     about: dict[str, object] = {
         "photographs": str(job.photos),
         "masks": _text(job.inputs.masks),
@@ -130,6 +129,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
         "device": job.common.device,
         "torch": str(torch.__version__),
         "scale": None if scale is None else scale.report(),
+        "warnings": list(dict.fromkeys(messages)),
     }
     write_result(
         result,

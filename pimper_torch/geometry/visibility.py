@@ -168,8 +168,11 @@ class RayCaster:
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
 
 
-def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
+def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     """Cast a ray through every pixel of a view.
+
+    Args:
+        mesh: Prepared for casting already where several views look at it.
 
     Returns:
         Hits of shape ``height width``; ``distance`` is depth along the camera's z.
@@ -179,7 +182,7 @@ def cast_view(mesh: Mesh, cameras: Cameras, view: int) -> Hits:
     rays = rays_through(
         pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
     ).reshape(height, width, 3)
-    caster = RayCaster(mesh.vertices_world, mesh.faces)
+    caster = RayCaster(mesh.vertices_world, mesh.faces) if isinstance(mesh, Mesh) else mesh
     return caster.cast(cameras.centers_world[view], rays)
 
 

@@ -27,6 +27,7 @@ from pimper_torch.reporting import reported
 from pimper_torch.sfm.scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview
+from pimper_torch.viz.turn import draw_turn
 
 # What a result consists of, and nothing else.
 RESULT_NAMES = (
@@ -48,8 +49,10 @@ RESULT_NAMES = (
     "config.yaml",
     "summary.json",
     "overview.png",
+    "turn.webp",
 )
-_PARTS = 5  # of the bar: simplification, meshes and cameras, asset, maps, contact sheet
+# Of the bar: simplification, meshes and cameras, asset, maps, contact sheet, turning picture.
+_PARTS = 6
 
 
 def write_result(
@@ -88,6 +91,7 @@ def write_result(
     `config.yaml`    every setting of the run
     `summary.json`   counts, times, memory, convergence
     `overview.png`   contact sheet, every photograph with its silhouette below
+    `turn.webp`      the surface turning once round, its shape beside its albedo
     ===============  ==============================================================
 
     Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
@@ -163,6 +167,8 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     with part(4, _PARTS):
         draw_overview(result, folder / "overview.png")
+    with part(5, _PARTS):
+        draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
 
 
 def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:

@@ -42,6 +42,7 @@ def chain(reconstruction, monkeypatch):
             """Whatever a test wants to happen in the centre of a run."""
 
     # Drawn in tests/io and tests/viz: half of what a run without work takes.
-    monkeypatch.setattr(results, "draw_overview", lambda _, path: Image.new("L", (1, 1)).save(path))
+    for draw in ("draw_overview", "draw_turn"):
+        monkeypatch.setattr(results, draw, lambda *given: Image.new("L", (1, 1)).save(given[-1]))
     monkeypatch.setattr(run, "make_chain", Chain)
     return Chain

@@ -14,7 +14,6 @@ from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.io import results
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.store import Store
@@ -111,12 +110,6 @@ def world(tmp_path_factory, dtu):
     }
 
 
-@pytest.fixture
-def small_overview(monkeypatch):
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
-
-
 def run(command, line, world, tmp_path):
     return main([command, *line.format(out=tmp_path / "out", **world).split()])
 
@@ -125,7 +118,7 @@ def run(command, line, world, tmp_path):
     ("command", "line"),
     [(command, line) for command in RUNS if command != "demo" for line in RUNS[command]],
 )
-@pytest.mark.usefixtures("small_overview")
+@pytest.mark.usefixtures("small_pictures")
 def test_every_option_of_a_command_runs(command, line, world, tmp_path):
     assert run(command, line, world, tmp_path) == 0
 

@@ -8,7 +8,6 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.io import results
 from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.results import write_result
@@ -16,11 +15,7 @@ from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale
 
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def half_ball() -> Mesh:

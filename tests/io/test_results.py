@@ -35,10 +35,7 @@ class Config:
     zeta: float = 0.5
 
 
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 OBJ = {"mesh.obj", "asset.obj", "asset.mtl", "asset_albedo.png", "asset_normal.png"}

@@ -1,0 +1,1 @@
+"""The page of a run: one file that shows its surface, photographs and stages in a browser."""
