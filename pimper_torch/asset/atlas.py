@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.errors import caution
+from pimper_torch.failures import reason_of
 from pimper_torch.records import Mesh, Record
 
 # A choice: what browsers on telephones take.
@@ -75,7 +77,6 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
             faces=torch.cat(corners).numpy().astype(np.uint32),
             vertex_counts=[len(one) for one in sources],
             face_counts=[len(one) for one in corners],
-            texels_per_unit=1.0,
         )
         command = [sys.executable, "-P", str(Path(__file__).with_name("charts.py"))]
         try:
@@ -86,7 +87,11 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
             )
-        except (subprocess.SubprocessError, OSError):
+        except (subprocess.SubprocessError, OSError) as error:
+            caution(
+                f"asset: xatlas made no atlas ({reason_of(error)}). Every face has a place of its "
+                "own on the textures, which makes `asset.glb` larger."
+            )
             return None
         with np.load(after) as found:
             values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}

@@ -94,7 +94,7 @@ def write_asset_obj(asset: Textured, path: Path | str, offset_world: Offset = NO
     normal.write_bytes(_png(asset.normal))
     path.with_suffix(".mtl").write_text(
         f"newmtl surface\nKd 1 1 1\nKs 0 0 0\nPm 0\nPr 1\nmap_Kd {albedo.name}\n"
-        f"norm {normal.name}\nmap_Bump {normal.name}\n",
+        f"norm {normal.name}\n",
         encoding="utf-8",
     )
     digits = 9 if offset_world == NO_OFFSET else 15
