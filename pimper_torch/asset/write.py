@@ -1,5 +1,6 @@
 """Textured meshes as files: GLB, and OBJ with a material."""
 
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,20 @@ _SPECULAR = "KHR_materials_specular"
 _EFFORT = 3
 
 
-def write_asset(asset: Textured, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+def write_asset(
+    asset: Textured,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    more: Mapping[str, Float[Tensor, " copy"]] | None = None,
+) -> None:
     """Write a GLB whose vertices tell ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence), if known.
 
     Args:
         offset_world: Of the node; see ``SparseScene.offset_world``.
+        more: Of the vertices, by the attributes' names.
     """
     mesh, images = asset.mesh, [_png(asset.base_color), _png(asset.normal)]
-    told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence}
+    told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence, **(more or {})}
     attributes = {
         "POSITION": mesh.vertices_world,
         "NORMAL": asset.normals,

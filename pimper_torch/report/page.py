@@ -73,6 +73,12 @@ def write_page(
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
 
 
+def is_page(path: Path | str) -> bool:
+    """Return whether a file is a page that was written here."""
+    with Path(path).open("rb") as file:
+        return b"<title>pimper_torch report</title>" in file.read(2000)
+
+
 def asset_within(asset: Textured, path: Path) -> bytes:
     """Read an asset's file, or make one with coarser textures where it is too large for a page.
 

@@ -62,6 +62,7 @@ RUNS = {
         "--trimmed-fraction 0.1 --icp-distance point",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
         "{told} {true_mesh} --samples 500 --calibration {out}.png --overwrite",
+        "{result} {scene} --samples 500 --report {out}.html --overwrite",
     ],
     "bench": [
         "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "
@@ -109,7 +110,9 @@ def world(tmp_path_factory, dtu):
     lights = [{"name": f"view_{index:03d}.png", "light": [1, 0, 0, 1]} for index in range(6)]
     (result / "lights.json").write_text(json.dumps({"views": lights}))
     (result / "config.yaml").write_text("photographs: {response: srgb}\n")
-    (result / "summary.json").write_text("{}")
+    summary = {"photographs": str(scene / "photos"), "stages": [], "seconds": 1.0}
+    summary |= {"peak_memory_mb": None, "left_out": [], "failures": []}
+    (result / "summary.json").write_text(json.dumps(summary))
     return {
         "result": result,
         "ball": folder / "ball.ply",

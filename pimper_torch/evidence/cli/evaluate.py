@@ -27,12 +27,14 @@ from pimper_torch.evidence.metrics.evaluate import (
     evaluate,
 )
 from pimper_torch.evidence.metrics.icp import IcpConfig
+from pimper_torch.evidence.metrics.page import write_compared_page
 from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.files import file_written_whole, is_titled, prepare_file, says_of_itself
-from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
+from pimper_torch.records import Capture, DtuProtocol, Estimate, Mesh, Truth, Views
+from pimper_torch.report.page import is_page
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
@@ -109,6 +111,8 @@ class Job:
         out: JSON file for all figures.
         calibration: PNG file for the calibration curve of a result that tells its expected
             error.
+        report: HTML file that shows the result in a browser with its errors; the photographs that
+            it was made from must be where they were.
         overwrite: Replace files that a former evaluation wrote, and no others.
         options: The measuring.
     """
@@ -117,6 +121,7 @@ class Job:
     truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     overwrite: Flag = False
     options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions()
 
@@ -148,7 +153,10 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     if job.calibration is not None:
         _draw(evaluation, job.calibration)
         output.remark(f"{job.calibration} is drawn.")
-    files = {"figures": job.out, "calibration": job.calibration}
+    if job.report is not None:
+        _write_page(evaluation, truth.capture.truth, job.result, job.report)
+        output.remark(f"{job.report} shows the errors.")
+    files = {"figures": job.out, "calibration": job.calibration, "report": job.report}
     paths = {name: path for name, path in files.items() if path is not None}
     output.result(paths, figures={**report(evaluation), "relighting": relighting})
 
@@ -336,6 +344,17 @@ def _draw(evaluation: Evaluation, path: Path) -> None:
         )
 
 
+def _write_page(evaluation: Evaluation, truth: Truth, result: Path, path: Path) -> None:
+    """Write the page of a result with its errors, whole or not at all."""
+    mesh = truth.mesh
+    if mesh is None and truth.points_world is not None:
+        mesh = Mesh(vertices_world=truth.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
+    if mesh is None:
+        raise InputError("the truth has no surface, so there are no errors to show.")
+    with file_written_whole(path) as fresh:
+        write_compared_page(result, mesh, evaluation.alignment.truth_from_world, fresh)
+
+
 def _prepare_files(job: Job) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace.
 
@@ -346,3 +365,5 @@ def _prepare_files(job: Job) -> None:
         prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))
     if job.calibration is not None:
         prepare_file(job.calibration, job.overwrite, lambda file: is_titled(file, TITLE))
+    if job.report is not None:
+        prepare_file(job.report, job.overwrite, is_page)
