@@ -99,7 +99,7 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
                 "textures, which makes `asset.glb` larger."
             )
             return None
-        with np.load(after) as found:
+        with np.load(after, allow_pickle=False) as found:
             values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}
             size, charts = found["size"].tolist(), int(found["charts"])
     shrunk = min(1.0, MAX_SIDE / max(size))

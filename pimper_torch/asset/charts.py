@@ -19,7 +19,7 @@ def main(pieces: str, found: str) -> None:
             and down in [0, 1]), for every face the corners in ``faces``, and ``size`` (width and
             height in texels) and the number of ``charts``.
     """
-    with np.load(pieces) as given:
+    with np.load(pieces, allow_pickle=False) as given:
         vertices = np.split(given["vertices"], given["vertex_counts"].cumsum()[:-1])
         faces = np.split(given["faces"], given["face_counts"].cumsum()[:-1])
     atlas = xatlas.Atlas()
