@@ -43,6 +43,7 @@ class Textured(Record):
 
     Attributes:
         mesh: Its vertices are copied along seams.
+        vertex: That each copy is of.
         normals: Of its vertices, unit; those that the normal map is relative to.
         uv: Right and down over the textures, in [0, 1].
         tangent: Unit along ``u``, and the sign of the bitangent.
@@ -53,6 +54,7 @@ class Textured(Record):
     """
 
     mesh: Mesh
+    vertex: Int[Tensor, " copy"]
     normals: Float[Tensor, "copy 3"]
     uv: Float[Tensor, "copy 2"]
     tangent: Float[Tensor, "copy 4"]
@@ -134,6 +136,7 @@ def baked(
     raster = raster[_nearest_known(known.reshape(size))[0]].reshape(*size, -1)
     return Textured(
         mesh=mesh,
+        vertex=atlas.vertex,
         normals=normals,
         uv=atlas.uv,
         tangent=tangent,

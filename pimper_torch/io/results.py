@@ -140,6 +140,7 @@ def write_result(
         with part(3, _PARTS):
             asset = textured(found.mesh, few, relighting.materials.at_vertices())
             _write_asset(asset, files or MeshFiles(), whole.scene.offset_world, staging)
+            relighting = _with_textures(relighting, asset, whole)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
@@ -154,6 +155,13 @@ def write_result(
             if report:
                 title = folder.absolute().name
                 _write_page(whole, few, asset, relighting, staging, title=title, summary=summary)
+
+
+def _with_textures(relighting: Relighting, asset: Textured, result: Reconstruction) -> Relighting:
+    """Judge the asset by the photographs that the mesh was judged by."""
+    if result.held_out is not None:
+        return relighting.with_textures(asset, result.held_out, None)
+    return relighting.with_textures(asset, result.scene, result.silhouettes)
 
 
 def _write_page(

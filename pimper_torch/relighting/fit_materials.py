@@ -38,7 +38,7 @@ _PIXELS = 20_000  # of all photographs together, and of one at most
 _PIXELS_OF_ONE = 3000
 
 # A gain counts from this fraction of the loss, and from so many standard errors of its mean.
-_LEAST_GAIN, _SIGNIFICANT = 2e-3, 2.0
+_LEAST_GAIN, _SIGNIFICANT = 2e-3, 1.0
 
 
 def fit_materials(

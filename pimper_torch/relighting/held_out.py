@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.asset.bake import Textured
 from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
 from pimper_torch.relighting.fit_materials import materials_under
 from pimper_torch.relighting.lights import ViewLights, lights_of
@@ -13,6 +14,7 @@ from pimper_torch.relighting.materials import Materials
 from pimper_torch.relighting.observed import Observed, observe_all
 from pimper_torch.relighting.predict import psnr, shaded
 from pimper_torch.relighting.surface_pixels import LitSurface
+from pimper_torch.relighting.textured_surface import TexturedSurface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -40,6 +42,7 @@ class Relighting(Record):
         judged: With materials.
         matte: Without any.
         held_out: Whether these photographs were held out, or the surface was made from them.
+        textured: With materials, and the asset's textures in place of values of vertices.
     """
 
     lights: ViewLights
@@ -47,6 +50,22 @@ class Relighting(Record):
     judged: Judged
     matte: Judged
     held_out: bool
+    textured: Judged | None = None
+
+    def with_textures(
+        self, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
+    ) -> "Relighting":
+        """Judge the textured surface, too, under the same lights.
+
+        Args:
+            scene: Of the photographs that are judged by.
+            silhouettes: Of its views.
+        """
+        surface = TexturedSurface(asset)
+        observed = observe_all(surface, scene, silhouettes)
+        materials = surface.materials(self.materials)
+        found = judge(surface, observed, self.judged.names, self.judged.lights, materials)
+        return self.replace(textured=found)
 
     def report(self) -> dict[str, object]:
         """Return what ``summary.json`` tells."""
@@ -63,6 +82,7 @@ class Relighting(Record):
             "photographs": "held out" if self.held_out else "used",
             "psnr_db": _mean(self.judged.psnr_db),
             "psnr_matte_db": _mean(self.matte.psnr_db),
+            "psnr_textured_db": None if self.textured is None else _mean(self.textured.psnr_db),
             "views": [
                 {"name": name, "psnr_db": _figure(with_one), "psnr_matte_db": _figure(without)}
                 for name, with_one, without in judged

@@ -57,10 +57,12 @@ def _relighting(summary: Summary) -> Json | None:
         for one in found["materials"]
     )
     whose = "held out of the run" if held_out else "that the surface was made from"
+    textured = _decibels(found.get("psnr_textured_db"))
+    whose += f"; with the asset's textures {textured} dB on average" if textured else ""
     return {
         "title": "Photographs predicted from the surface",
         "folded": True,
-        "text": f"Photographs {whose}, each under its own fitted light. Materials: {materials}.",
+        "text": f"Each under its own fitted light, of photographs {whose}. Materials: {materials}.",
         "table": {"columns": columns, "rows": [[*row, ""] for row in rows]},
     }
 

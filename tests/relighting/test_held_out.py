@@ -3,10 +3,12 @@ import math
 import pytest
 import torch
 
+from pimper_torch.asset.make import textured
 from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.errors import ConfigError
 from pimper_torch.records import Silhouettes
 from pimper_torch.relighting.held_out import relight
+from pimper_torch.sfm.surfaces import reduced
 from tests.relighting.ball import ball_mesh, photographed
 
 GLOSSY = (0.0, 0.3, 1.0)
@@ -78,3 +80,17 @@ def test_what_no_photograph_shows_has_no_figure():
     report = relight(ball_mesh(), scene, nothing).report()
     assert report["psnr_db"] is None
     assert not math.isnan(report["materials"][0]["roughness"])
+
+
+def test_textures_of_few_faces_come_as_near_as_vertices_of_many(scene):
+    full = ball_mesh()
+    few = reduced(full, 1200)
+    found = relight(few, scene, None)
+    asset = textured(full, few, found.materials.at_vertices())
+    judged = found.with_textures(asset, scene, None)
+    dense = relight(full, scene, None).judged.psnr_db.mean()
+    coarse, fine = found.judged.psnr_db.mean(), judged.textured.psnr_db.mean()
+    assert fine > coarse + 1
+    assert fine > dense - 2
+    assert judged.report()["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
+    assert found.report()["psnr_textured_db"] is None

@@ -233,8 +233,13 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
 def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[Row]:
     meaning = "mean over {} photographs of sRGB values on the object, each under its fitted light"
     meaning = meaning.format(len(relighting["views"]))
-    for key, name in (("psnr_db", "PSNR"), ("psnr_matte_db", "PSNR, matte")):
-        if (value := relighting[key]) is not None:
+    names = {
+        "psnr_db": "PSNR",
+        "psnr_matte_db": "PSNR, matte",
+        "psnr_textured_db": "PSNR, textured",
+    }
+    for key, name in names.items():
+        if (value := relighting.get(key)) is not None:
             yield Row(name=name, value=f"{value:.2f} dB", meaning=meaning)
     for one in relighting["materials"]:
         yield Row(
