@@ -31,7 +31,7 @@ from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
-from pimper_torch.outputs.files import file_written_whole, is_titled, prepare_file, says_of_itself
+from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
@@ -327,6 +327,6 @@ def _prepare_files(job: Job) -> None:
         OutputError: As :func:`pimper_torch.outputs.files.prepare_file`.
     """
     if job.out is not None:
-        prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))
+        prepare_file(job.out, job.overwrite, f'"format": "{FORMAT}"')
     if job.calibration is not None:
-        prepare_file(job.calibration, job.overwrite, lambda file: is_titled(file, TITLE))
+        prepare_file(job.calibration, job.overwrite, TITLE)
