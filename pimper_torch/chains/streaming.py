@@ -137,7 +137,7 @@ def photometry_and_heights(
                 photometry=solved.buckets[0],
                 heights=swept.buckets[0],
                 averaged=swept.averaged,
-                num_valid=int(seen.buckets[0].valid.sum()),
+                num_valid=int(seen.buckets[0].valid.count_nonzero()),
             )
 
         found = list(side_by_side(one, patches.buckets))

@@ -9,7 +9,6 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.interpolate import RBFInterpolator
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor
 
@@ -51,6 +50,9 @@ def interpolate_inverse_depth(
     """
     if len(wanted) == 0:
         return wanted.new_zeros(0)
+    # Local, as it takes long to load and other chains do without.
+    from scipy.interpolate import RBFInterpolator
+
     known = pixels.detach().cpu().double().numpy()
     values = inverse_depth.detach().cpu().double().numpy()
     center, unit = known.mean(axis=0), known.std() + 1e-12

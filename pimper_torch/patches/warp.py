@@ -119,7 +119,7 @@ class Warp(Stage):
             "These patches have no samples, as if no view showed them",
         )
         total = int(templates.inside.sum()) * cameras.num_views
-        leave_out("warp", total - int(found.valid.sum()), total=total)
+        leave_out("warp", total - int(found.valid.count_nonzero()), total=total)
         return found
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:

@@ -29,7 +29,7 @@ def code_of(module: str) -> str | None:
         return None
     found, waiting = {file}, [file]
     while waiting:
-        new = set(_imported(waiting.pop())) - found
+        new = _imported(waiting.pop()) - found
         found |= new
         waiting += new
     hashed = hashlib.blake2b(_versions().encode(), digest_size=16)
@@ -38,13 +38,14 @@ def code_of(module: str) -> str | None:
     return hashed.hexdigest()
 
 
-def _imported(file: Path) -> Iterator[Path]:
+@cache
+def _imported(file: Path) -> frozenset[Path]:
     """Return the files of this package that a file imports, inside functions too."""
+    modules = []
     for source, names, whole in _IMPORT.findall(file.read_bytes()):
         module = (source or whole).decode()
-        yield from _files(module)
-        for name in re.findall(rb"\w+", names):
-            yield from _files(f"{module}.{name.decode()}")
+        modules += [module, *(f"{module}.{name.decode()}" for name in re.findall(rb"\w+", names))]
+    return frozenset(found for module in modules for found in _files(module))
 
 
 def _files(module: str) -> Iterator[Path]:

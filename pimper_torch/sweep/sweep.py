@@ -241,15 +241,20 @@ class Sweep(Stage):
         # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
         weight = _LOSS_SCALE**2 * averaged / CORRELATED_SAMPLES
         costs = weight * window_mean(costs, window, _WINDOW)
-        costs = costs.movedim(1, -1)
+        weighed = window > 0
+        costs = costs.movedim(1, -1)[weighed]
         position, curvature, found = parabola_minimum(costs)
         variance = posterior_variance(costs, position, curvature)
         unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
         fraction = (1 / variance - 1 / unknown).clamp_min(0) / averaged
-        found = found & (window > 0) & (fraction > 0)
+        found = found & (fraction > 0)
+        step = step[:, None, None].expand_as(window)[weighed]
+        offset = torch.where(found, (position - config.steps) * step, 0)
+        information = torch.where(found, fraction / step.square(), 0)
+        none = torch.zeros_like(window)
         return Heights(
-            offset=torch.where(found, (position - config.steps) * step[:, None, None], 0),
-            information=torch.where(found, fraction / step[:, None, None].square(), 0),
+            offset=none.index_put((weighed,), offset),
+            information=none.index_put((weighed,), information),
             num_views=shown,
         )
 

@@ -13,7 +13,7 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Reconstruction
 from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, frame, rotation, shade
+from pimper_torch.viz.render import bounding_box, crop, rotation, shade
 from pimper_torch.viz.silhouettes import RELIABLE, thumbnails
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
@@ -26,6 +26,7 @@ _ACROSS = 4
 # Inches of the sheet: width of a panel, room round it, heights of its title and of the sheet's.
 _PANEL_IN, _GAP_IN, _TITLE_IN, _HEADLINE_IN = 3.9, 0.1, 0.35, 0.4
 _DPI = 100
+_PANEL_PX = round(_PANEL_IN * _DPI)
 _THUMBNAILS_ACROSS = 8
 _MAX_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
 _TALLEST = 1.6  # a panel that is higher for its width is shown narrower
@@ -48,7 +49,7 @@ class Panel:
     inside: Picture | None = None
 
 
-def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = 560) -> None:
+def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PANEL_PX) -> None:
     """Draw the contact sheet of a run as PNG.
 
     Shown in the reference view, cropped to the object: the photograph, the facets over it
@@ -59,7 +60,7 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = 560)
 
     Args:
         path: Ends in ``.png``.
-        panel_px: Longer side of a rendered picture.
+        panel_px: Width of a rendered picture.
     """
     # Local, so that importing the package does not load matplotlib; Figure without pyplot
     # leaves no global state behind.
@@ -95,7 +96,7 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = 560)
     with warnings.catch_warnings():
         # Names in scripts that the font lacks are drawn as boxes; the files have them.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure.savefig(path, dpi=_DPI, facecolor="white")
+        figure.savefig(path, dpi=_DPI, facecolor="white", pil_kwargs={"compress_level": 3})
 
 
 def _boxes(shown: list[Panel]) -> tuple[list[Box], tuple[float, float]]:
@@ -141,7 +142,7 @@ def _all_views(result: Reconstruction) -> Panel | None:
     silhouettes = result.silhouettes
     if silhouettes.source == "everything":
         return None
-    width_px = round(_DPI * _ACROSS * _PANEL_IN)
+    width_px = _ACROSS * _PANEL_PX
     tiles = thumbnails(
         result.scene.views, silhouettes, width_px=width_px, across=_THUMBNAILS_ACROSS
     )
@@ -160,14 +161,14 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
     own = result.cameras.take([reference])
     shape = reduced(result.mesh, _MAX_FACES)
     vertices = result.mesh.vertices_world
-    camera = frame(own, vertices, panel_px, _MARGIN)
+    camera = _framed(own, vertices, panel_px)
     name = result.scene.views.names[reference]
     photograph, facets, inside = _photograph(result, own)
     maps = view_maps(result.mesh, camera, 0)
     albedo = (albedo_scale(result.mesh) * maps.albedo).clamp(0, 1)
     center = vertices.mean(dim=0)
     sides = [
-        frame(rotation(own, center, angle), vertices, panel_px, _MARGIN)
+        _framed(rotation(own, center, angle), vertices, panel_px)
         for angle in (-_ROTATION_DEG, _ROTATION_DEG)
     ]
     coarse = result.coarse.mesh
@@ -189,6 +190,13 @@ def panels(result: Reconstruction, panel_px: int) -> list[Panel]:
             title=f"surface from {_ROTATION_DEG:.0f}° right", picture=_array(shade(shape, sides[1]))
         ),
     ]
+
+
+def _framed(camera: Cameras, vertices: Float[Tensor, "vertex 3"], width_px: int) -> Cameras:
+    """Crop a camera's picture to the object, at the size that its panel has on the sheet."""
+    low, high = bounding_box(camera, vertices, _MARGIN)
+    width, height = (high - low).tolist()
+    return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), _TALLEST)))
 
 
 def headline(result: Reconstruction) -> str:

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from pimper_torch.geometry.frames import rigid, rotate, transform
-from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Cameras, Mesh
@@ -29,7 +29,8 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     Faces seen from behind are bluish. A constant to autograd.
 
     Args:
-        flat: Every face has one tone; else the faces' normals are averaged round vertices.
+        flat: Every face has one tone; else tones are blended between vertices, whose normals are
+            their faces' mean.
 
     Returns:
         sRGB in [0, 1], white where nothing is seen.
@@ -42,17 +43,20 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     hits = cast_view(mesh, fine, 0)
     seen = hits.face >= 0
     per_face = unit_face_normals(mesh.vertices_world, mesh.faces)
-    shown = per_face[hits.face.clamp_min(0)]
+    corners = mesh.vertices_world[mesh.faces]
+    from_behind = ((corners[:, 0] - fine.centers_world[0]) * per_face).sum(dim=-1) > 0
+    shown = per_face[:, None].expand_as(corners)
     if not flat:
-        smooth = vertex_normals(mesh.vertices_world, mesh.faces)
-        shown = normalize(hits.interpolate(smooth, mesh.faces), dim=-1)
-    normals_cam = rotate(fine.cam_from_world[0], shown)
-    faces_cam = rotate(fine.cam_from_world[0], per_face[hits.face.clamp_min(0)])
-    from_behind = (faces_cam * _towards(fine)).sum(dim=-1) > 0
-    normals_cam = torch.where(from_behind[..., None], -normals_cam, normals_cam)
+        shown = vertex_normals(mesh.vertices_world, mesh.faces)[mesh.faces]
+    normals_cam = rotate(
+        fine.cam_from_world, torch.where(from_behind[:, None, None], -shown, shown)
+    )
     light = lambertian(normals_cam)
-    tint = torch.where(from_behind[..., None], light.new_tensor(_INSIDE), 1.0)
-    radiance = torch.where(seen[..., None], light[..., None] * tint, 1.0)
+    tint = torch.where(from_behind[:, None], light.new_tensor(_INSIDE), 1.0)
+    face = hits.face[seen]
+    blended = (hits.barycentric[seen] * light[face]).sum(dim=-1, keepdim=True)
+    radiance = torch.ones_like(hits.barycentric)
+    radiance[seen] = blended * tint[face]
     radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
     return tone(radiance)
 
@@ -136,11 +140,3 @@ def bounding_box(
     low, high = pixels.amin(dim=0), pixels.amax(dim=0)
     room = margin * (high - low).max().clamp_min(1)
     return low - room, high + room
-
-
-def _towards(camera: Cameras) -> Float[Tensor, "height width 3"]:
-    """Return the viewing ray of every pixel, camera frame."""
-    width, height = (int(side) for side in camera.sizes_px[0])
-    pixels = pixel_centers(width, height, like=camera.intrinsics).reshape(-1, 2)
-    standing = torch.eye(4).to(camera.intrinsics)
-    return rays_through(pixels, standing, camera.intrinsics[0]).reshape(height, width, 3)

@@ -164,6 +164,19 @@ def test_an_indefinite_matrix_is_refused_with_iterations_and_residual(generator)
         ).solve(random(generator, 900))
 
 
+def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(generator):
+    """Its right-hand side is small beside its energy norm, and so are residuals that matter not."""
+    tolerance = 1e-3
+    parts = entries(1500, generator, decades=1.0, anchor=1e-6)
+    rhs = torch.ones(1500, dtype=torch.float64)
+    found = Multigrid(*parts, size=1500, tolerance=tolerance).solve(rhs)
+    expected = SparseCholesky(*parts, size=1500).solve(rhs)
+    matrix = torch.from_numpy(compressed(*parts, 1500).toarray())
+    scale, off = matrix.diagonal().rsqrt(), found - expected
+    assert (scale * (matrix @ off)).norm() > 10 * tolerance * (scale * rhs).norm()
+    assert off @ matrix @ off <= tolerance**2 * (expected @ matrix @ expected)
+
+
 def test_hopeless_entries_are_refused_as_by_the_factor():
     index = torch.tensor([0, 2])
     with pytest.raises(SingularSystemError, match="unknown 1"):

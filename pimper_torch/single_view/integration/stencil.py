@@ -102,7 +102,7 @@ class CholeskyRaster:
     ) -> Iterate:
         """Substitute; the start is ignored."""
         found = self._factor.solve_values(rhs.reshape(-1))
-        return Iterate(values=found, iterations=1, residual=0.0)
+        return Iterate(values=found, iterations=1)
 
     def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
         """Keep nothing."""
@@ -131,7 +131,7 @@ class CosineRaster:
     ) -> Iterate:
         """Transform, divide and transform back; the start is ignored."""
         found = solve_poisson(rhs, self._right, self._down, self._anchor)
-        return Iterate(values=found.reshape(-1), iterations=1, residual=0.0)
+        return Iterate(values=found.reshape(-1), iterations=1)
 
     def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
         """Keep nothing."""
