@@ -26,7 +26,7 @@ from pimper_torch.outputs.marker import (
     seal,
 )
 from pimper_torch.outputs.names import require_name
-from pimper_torch.outputs.stages import NEW, is_ours, kept, locked
+from pimper_torch.outputs.stages import NEW, is_ours, kept, locked, resumption
 
 # What this run holds: what it calls may write there.
 _held: ContextVar[frozenset[Path]] = ContextVar("held_outputs", default=frozenset())
@@ -99,10 +99,7 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
                 yield target
             except BaseException as error:
                 if kept(target):
-                    error.add_note(
-                        f"What was finished is kept in {folder / STAGES}: the same command goes "
-                        f"on from there, and `pimper clean {folder}` removes it."
-                    )
+                    error.add_note(resumption(folder))
                 raise
             finally:
                 _held.reset(token)
@@ -194,15 +191,11 @@ def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None
     """
     target = Path(folder).resolve()
     for name, path in inputs.items():
-        if path is None:
-            continue
-        whole = path.resolve()
-        for one in (whole, *whole.parents):
-            if one == target or (one.exists() and target.exists() and one.samefile(target)):
-                raise InputError(
-                    f"{folder}: {name} ({path}) lies in the folder of the result, which is "
-                    "replaced as a whole. Write elsewhere, or move it."
-                )
+        if path is not None and path.resolve().is_relative_to(target):
+            raise InputError(
+                f"{folder}: {name} ({path}) lies in the folder of the result, which is replaced as "
+                "a whole. Write elsewhere, or move it."
+            )
 
 
 @contextmanager

@@ -39,6 +39,14 @@ def kept(target: Path) -> list[Path]:
     return [path for path in there if path.name not in own]
 
 
+def resumption(shown: Path) -> str:
+    """Return the sentence that tells how a run goes on from what is kept."""
+    return (
+        f"What was finished is kept in {shown / STAGES}: the same command goes on from there, and "
+        f"`pimper clean {shown}` removes it."
+    )
+
+
 @contextmanager
 def locked(target: Path, shown: Path) -> Iterator[None]:
     """Lock a folder of results for this process; a killed process's lock is free.
