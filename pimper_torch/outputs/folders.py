@@ -145,7 +145,10 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
         except OutputError as error:  # somebody wrote there meanwhile
             names = (target.with_name(f"{target.name}-{number}") for number in count(2))
             aside = next(path for path in names if not os.path.lexists(path))
-            new.rename(aside)
+            try:
+                new.rename(aside)
+            except OSError:  # beside a mount point, or where nothing may be written
+                aside = new
             raise OutputError(f"{error} The new result is in {aside}.") from error
 
 

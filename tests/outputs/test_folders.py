@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pimper_torch.errors import InputError, OutputError
+from pimper_torch.outputs.clean import clean_output
 from pimper_torch.outputs.folders import held_output, prepare_output, require_apart, written_whole
 from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
 
@@ -381,6 +382,29 @@ def test_a_file_that_comes_during_the_run_does_not_cost_the_result(out):
     assert contents(out) == result("first", "masks/a.png") | {"letter.txt": "dear"}
     assert contents(out.parent / "out-3") == result("second")
     write(out.parent / "out-3", result("third"), overwrite=True)  # it has its list
+
+
+def test_a_result_that_cannot_be_put_aside_waits_until_its_folder_is_free(out, monkeypatch):
+    rename = Path.rename
+
+    def refuse(path, target):
+        if target == out.parent / "out-2":
+            raise OSError(errno.EXDEV, "Invalid cross-device link")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with (
+        pytest.raises(OutputError, match=rf"letter\.txt.* The new result is in .*{STAGES}/new\."),
+        written_whole(out, "result", overwrite=True) as filled,
+    ):
+        fill(filled, result("second") | {"../../letter.txt": "dear"})
+    with pytest.raises(OutputError, match=r"letter\.txt"):
+        clean_output(out)
+    assert (out / STAGES / "new" / "mesh.ply").exists()
+    (out / "letter.txt").unlink()
+    clean_output(out)
+    assert contents(out) == result("second")
+    assert held(out) == [MARKER, "mesh.ply", "sparse"]
 
 
 def test_a_folder_that_was_made_for_a_run_that_wrote_nothing_is_removed(tmp_path):
