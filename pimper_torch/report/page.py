@@ -19,6 +19,9 @@ from pimper_torch.report.sections import section_entries
 from pimper_torch.report.views import view_entries
 from pimper_torch.viz.turn import up_world
 
+HEAD = "<title>pimper_torch report</title>"
+"""Of every page, by which a former one is known."""
+
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
@@ -71,12 +74,6 @@ def write_page(
         return parts[name] if name in parts else _read(name)
 
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
-
-
-def is_page(path: Path | str) -> bool:
-    """Return whether a file is a page that was written here."""
-    with Path(path).open("rb") as file:
-        return b"<title>pimper_torch report</title>" in file.read(2000)
 
 
 def asset_within(asset: Textured, path: Path) -> bytes:

@@ -32,9 +32,9 @@ from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
-from pimper_torch.outputs.files import file_written_whole, is_titled, prepare_file, says_of_itself
+from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Mesh, Truth, Views
-from pimper_torch.report.page import is_page
+from pimper_torch.report.page import HEAD
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
@@ -362,8 +362,8 @@ def _prepare_files(job: Job) -> None:
         OutputError: As :func:`pimper_torch.outputs.files.prepare_file`.
     """
     if job.out is not None:
-        prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))
+        prepare_file(job.out, job.overwrite, f'"format": "{FORMAT}"')
     if job.calibration is not None:
-        prepare_file(job.calibration, job.overwrite, lambda file: is_titled(file, TITLE))
+        prepare_file(job.calibration, job.overwrite, TITLE)
     if job.report is not None:
-        prepare_file(job.report, job.overwrite, is_page)
+        prepare_file(job.report, job.overwrite, HEAD)
