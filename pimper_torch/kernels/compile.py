@@ -41,17 +41,14 @@ _NICENESS = 10  # of the child: what the run itself does comes first
 _blocking: ContextVar[bool] = ContextVar("blocking", default=True)
 
 
-def compiled(
-    *signatures: str, fast: bool = False, inline: bool = False
-) -> Callable[[Function], Function]:
+def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Function]:
     """Compile a function for the given types when its module is imported.
 
     The machine code is cached on disk. The function releases the interpreter's lock (GIL).
 
     Args:
-        signatures: Without any, the function is compiled with the kernels that call it.
+        signatures: Without any, the function is inlined into the kernels that call it.
         fast: Whether sums may be reordered, as vectorization needs.
-        inline: Whether it is inlined into its callers, as vectorized loops need.
 
     Raises:
         filelock.Timeout: Another process compiles its module, and :func:`load` has others to do.
@@ -59,11 +56,14 @@ def compiled(
     import numba
     from filelock import FileLock
 
+    # A function that is called, not inlined, has two versions: its own machine code, and a copy in
+    # each kernel, which is optimized again and rounds otherwise. The linker takes the first that is
+    # loaded: its own where it has just been compiled, the copy where kernels come from disk.
     decorate = numba.njit(
         cache=True,
         nogil=True,
         error_model="numpy",
-        forceinline=inline,
+        forceinline=not signatures,
         fastmath=_FAST if fast else False,
     )
 

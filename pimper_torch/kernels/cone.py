@@ -77,7 +77,7 @@ def _step(tile: Doubles) -> None:
         tile[17 * TILE + k] = moved[3] if better else s[3]
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def at(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
     """Read a sample's ``A``, ``b`` and shading vector."""
     a = (
@@ -97,7 +97,7 @@ def at(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
     return a, b, s
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def apply(a: Ten, v: Four) -> Four:
     """Multiply a packed matrix with a vector."""
     return (
@@ -108,7 +108,7 @@ def apply(a: Ten, v: Four) -> Four:
     )
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def objective(s: Four, image: Four, b: Four) -> float:
     """Return ``s . (A s - 2 b)``."""
     return (
@@ -119,7 +119,7 @@ def objective(s: Four, image: Four, b: Four) -> float:
     )
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
     """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, of bounded length."""
     n, first, second = frame(s)
@@ -149,7 +149,7 @@ def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
     )
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def project(b: float, x: float, y: float, z: float) -> Four:
     """Return the nearest vector of the cone; see ``photometry.cone.project_to_cone``."""
     square = x * x + y * y + z * z
@@ -160,7 +160,7 @@ def project(b: float, x: float, y: float, z: float) -> Four:
     return albedo, x * ratio, y * ratio, z * ratio
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def frame(s: Four) -> tuple[Three, Three, Three]:
     """Return the normal, zero at the apex, and two tangents; see ``photometry.cone``."""
     square = s[1] * s[1] + s[2] * s[2] + s[3] * s[3]
@@ -176,7 +176,7 @@ def frame(s: Four) -> tuple[Three, Three, Three]:
     )
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
     """Return ``B^T A B``, packed, for the columns ``(1, n)``, ``(0, first)``, ``(0, second)``."""
     u = apply(a, (0.0, first[0], first[1], first[2]))
@@ -192,14 +192,14 @@ def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
     )
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def raised(m: Six) -> Six:
     """Raise the diagonal, so that the matrix can be inverted."""
     more = 1e-9 * (m[0] + m[3] + m[5])
     return m[0] + more, m[1], m[2], m[3] + more, m[4], m[5] + more
 
 
-@compiled(fast=True, inline=True)
+@compiled(fast=True)
 def inverse_factor(m: Six) -> Six:
     """Give ``C^-1`` row by row for ``m = C C^T``; see ``photometry.quadratics.PackedCholesky``."""
     floor = max(1e-12 * (m[0] + m[3] + m[5]), _TINY)

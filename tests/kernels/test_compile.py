@@ -118,6 +118,30 @@ def test_no_process_is_started_once_all_is_compiled():
         assert parent.wait() == 0
 
 
+@pytest.mark.slow
+def test_a_kernel_gives_the_same_bits_compiled_and_from_disk(fresh):
+    """The kernel calls many functions: its machine code has their copies, optimized again."""
+    code = (
+        "import numpy as np\n"
+        "from pimper_torch.kernels import lights\n"
+        "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
+        "normals = random.normal(size=(3, samples))\n"
+        "normals /= np.linalg.norm(normals, axis=0)\n"
+        "geometry = np.concatenate([np.ones((1, samples)), normals])\n"
+        "seen = (random.random((views, samples)) > 0.2).astype(float)\n"
+        "radiance = seen * random.random((views, samples))\n"
+        "light, albedo = random.random((views, 4)), np.ones(samples)\n"
+        "level = radiance.mean(axis=1)\n"
+        "lights.fit(geometry, radiance, seen, level, 2.0, 30, 1e-9, light, albedo)\n"
+        "misses = sum(lights.fit.stats.cache_misses.values())\n"
+        "print(misses, light.tobytes().hex(), albedo.tobytes().hex())"
+    )
+    runs = [subprocess.check_output([sys.executable, "-c", code], text=True) for _ in range(2)]
+    (first, *compiled_bits), (later, *loaded_bits) = (run.split() for run in runs)
+    assert (first, later) == ("1", "0")
+    assert compiled_bits == loaded_bits
+
+
 def test_an_unknown_kernel_is_an_error():
     with pytest.raises(ModuleNotFoundError):
         load(("no_such_kernel",))
