@@ -1,4 +1,4 @@
-"""Initial factors from the data alone: singular vectors, upgraded to the photometric cone."""
+"""Rank-four factors upgraded to the photometric cone."""
 
 from dataclasses import dataclass
 
@@ -6,13 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
+from pimper_torch.photometry.quadratics import diagonal, outer
 from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.ambiguity import minkowski
-
-# Imputations of missing entries, and steps of the weighted alternation after them: choices.
-FILL_STEPS = 20
-ALTERNATIONS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -29,38 +25,6 @@ class Upgraded(Record):
     lights: Float[Tensor, "patch view 4"]
     shading: Float[Tensor, "patch 4 sample"]
     lorentzian: Bool[Tensor, " patch"]
-
-
-def factorize_rank_four(
-    radiance: Float[Tensor, "patch view sample"], weight: Float[Tensor, "patch view sample"]
-) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    """Return the rank-four factors that minimize the weighted residual, the cone ignored.
-
-    Missing entries are imputed by a sample's albedo times a view's brightness, then
-    iteratively by the rank-four part of the imputed matrix (eigenvectors of the small
-    view-by-view matrix); weighted alternation follows. A view or sample with fewer than four
-    entries gets the minimum-norm solution. Factors are unique up to a 4 x 4 matrix.
-    """
-    count = weight.sum(dim=1, keepdim=True).clamp_min(1)
-    gain = (weight * radiance).sum(dim=2, keepdim=True) / weight.sum(dim=2, keepdim=True).clamp_min(
-        1
-    )
-    albedo = (weight * radiance).sum(dim=1, keepdim=True) / (
-        (weight * gain).sum(dim=1, keepdim=True).clamp_min(1e-12)
-    )
-    filled = torch.where(weight > 0, radiance, gain * albedo * (count > 0))
-    basis = _leading(filled)
-    for _ in range(FILL_STEPS):
-        filled = torch.where(weight > 0, radiance, basis @ (basis.mT @ filled))
-        basis = _leading(filled)
-    # A nearly flat patch is of lower rank but for its noise: float32 normal equations would
-    # amplify their own rounding without limit.
-    lights, mask, seen = basis.double(), weight.double(), (weight * radiance).double()
-    for _ in range(ALTERNATIONS):
-        shading = _solve(outer(lights.mT) @ mask, lights.mT @ seen)
-        packed = (mask @ outer(shading).mT).mT
-        lights = _solve(packed, (seen @ shading.mT).mT).mT
-    return lights.to(radiance), shading.to(radiance)
 
 
 def upgrade_to_cone(
@@ -109,20 +73,3 @@ def upgrade_to_cone(
     return Upgraded(
         lights=(L @ mirror).to(lights), shading=(mirror @ S).to(shading), lorentzian=lorentzian
     )
-
-
-def _leading(filled: Float[Tensor, "patch view sample"]) -> Float[Tensor, "patch view 4"]:
-    rows = filled.double()
-    vectors = torch.linalg.eigh(rows @ rows.mT).eigenvectors
-    lead = vectors[..., -4:]
-    padding = lead.new_zeros(*lead.shape[:-1], 4 - lead.shape[-1])
-    return torch.cat([lead, padding], dim=-1).to(filled.dtype)
-
-
-def _solve(
-    packed: Float[Tensor, "patch 10 item"], rhs: Float[Tensor, "patch 4 item"]
-) -> Float[Tensor, "patch 4 item"]:
-    ridge = 1e-9 * packed[:, diagonal(4)].sum(dim=1, keepdim=True).amax(dim=2, keepdim=True)
-    damped = packed.clone()
-    damped[:, diagonal(4)] += ridge
-    return solve_packed(damped, rhs)
