@@ -11,7 +11,6 @@ from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
 from pimper_torch.single_view.factorization.alternation import solve_alternation
-from pimper_torch.single_view.factorization.descent import solve_descent
 from pimper_torch.single_view.factorization.manifolds import Free, SecondOrder, second_order
 
 MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone(), SecondOrder()])
@@ -100,7 +99,6 @@ def test_vectors_without_a_normal_are_refused(generator):
     [
         (solve_alternation, 3e-3),
         (solve_balm, 1e-6),
-        (solve_descent, 1e-8),
         (solve_variable_projection, 1e-12),
     ],
 )
