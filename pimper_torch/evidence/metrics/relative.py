@@ -93,7 +93,6 @@ def meet_in_view(
         truth_from_world: Similarity.
         cameras_true: World frame and scene units of the truth.
         depth_true: Along that camera's z; infinite where there is nothing.
-        where: Restricts the comparison.
 
     Raises:
         InputError: No pixel is left to compare, or no ray meets the mesh.

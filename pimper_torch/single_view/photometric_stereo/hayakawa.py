@@ -86,7 +86,6 @@ def relief_from_albedo(
     Args:
         shading: Albedo times normal up to a bas-relief transformation, raster order.
         weight: Not negative.
-        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four pixels.
@@ -122,8 +121,6 @@ def relief_from_strength(
         lights: Of the same factorization as the shading; zero rows are ignored.
         shading: Albedo times normal up to a bas-relief transformation, raster order; it
             distinguishes convex from concave.
-        weight: Of the pixels.
-        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four point lights.

@@ -107,7 +107,6 @@ def integrability_equations(
     Args:
         vectors: Along normals, up to an invertible matrix.
         along_x: Their derivatives by the normalised image coordinates.
-        along_y: The same for y.
         rays: ``(x, y, 1)``.
     """
     cross_x = torch.linalg.cross(vectors, along_x, dim=0)

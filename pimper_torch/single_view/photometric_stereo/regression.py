@@ -60,8 +60,6 @@ def regress(
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        lights: One row a view.
-        robust: Whether to reweight.
         shadows: Of a light from behind: ``attached``, radiance is 0; ``none``, it is linear in
             the light, and negative.
         base: Whether radiance has a part that is the same in all views, such as ambient light.

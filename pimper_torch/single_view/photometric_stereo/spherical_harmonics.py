@@ -85,7 +85,6 @@ def four_harmonic_stereo(
     Args:
         radiance: Linear, gray, of the pixels inside the mask in raster order.
         weight: Not negative; 0 where missing.
-        mask: True at the pixels.
         generator: Of the starts; on the CPU.
         robust: Whether what harmonics do not explain loses weight: highlights, but also what
             point lights leave in attached shadow, so leave it for soft light.
@@ -236,11 +235,7 @@ def _resolved(
 def _surface(
     equations: Curls, mean: Float[Tensor, " 4"], generator: torch.Generator
 ) -> tuple[Float[Tensor, "4 4"], float]:
-    """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched.
-
-    Args:
-        mean: Of the shading vectors.
-    """
+    """Find the Lorentz transformation whose space rows are integrable; Gauss-Newton, batched."""
     drawn = torch.randn(_STARTS, 6, generator=generator, dtype=torch.float64)
     drawn[:, :3] *= _RAPIDITY
     drawn[:, 3:] *= 2.0  # rotations of any angle
