@@ -101,8 +101,7 @@ def four_harmonic_stereo(
         found = factorize_photographs(radiance, weight, 4, robust=robust, shadows="none")
         reliability = found.weight.sum(dim=0)
         reliability = reliability / reliability.amax()
-        upgraded = upgrade_to_cone(found.lights[None], found.shading[None], reliability[None])
-        L, S = upgraded.lights[0], upgraded.shading[0]
+        L, S = upgrade_to_cone(found.lights, found.shading, reliability)
         applied, curl = _resolved(S, reliability, mask, torch.linalg.inv(L.mT @ L), generator)
         on_cone = project_to_cone(applied.on_shading(S).mT).mT
         return Harmonic(
