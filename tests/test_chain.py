@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from comparison import compare_in_view
+from photographs import save_masks, save_photographs
 from torch import nn
 from torch.nn.functional import normalize
 
@@ -21,8 +22,6 @@ from pimper_torch.evidence.scenes import (
     RenderedScene,
     potato_on_table,
     render_shape,
-    save_masks,
-    save_photographs,
 )
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
