@@ -13,7 +13,7 @@ from pimper_torch.single_view.factorization.low_rank import (
     random_left,
     singular_left,
 )
-from pimper_torch.single_view.factorization.manifolds import Free, SecondOrder
+from pimper_torch.single_view.factorization.manifolds import Free
 from pimper_torch.single_view.factorization.restarts import Restarted, factorize_from_many
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "ColourFactors",
     "Free",
     "Restarted",
-    "SecondOrder",
     "factorize_from_many",
     "low_rank_problem",
     "random_left",
