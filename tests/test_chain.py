@@ -3,6 +3,7 @@
 import logging
 import math
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch as pt
+from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
@@ -152,6 +154,20 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
     fine = height_over_sphere(result.mesh).square().mean().sqrt()
     assert result.mesh.vertices_world.isfinite().all()
     assert fine < 1.5 * coarse
+
+
+def test_held_out_photographs_leave_the_surface_to_the_others():
+    scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
+    sparse = sparse_scene(scene, 150, torch.Generator().manual_seed(17))
+    used, held = held_apart(sparse, 4)
+    pimper = small_chain("default", sparse)
+    pimper.config = replace(pimper.config, hold_out=4)
+    result = pimper(scene.views)
+    assert result.held_out.views.names == held.views.names
+    assert result.scene.views.names == used.views.names
+    alone = small_chain("default", used)(used.views)
+    assert torch.equal(result.mesh.vertices_world, alone.mesh.vertices_world)
+    assert alone.held_out is None
 
 
 class Dragging(nn.Module):

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -26,8 +27,9 @@ from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.io import results
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.records import SparseScene, Views
+from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
+from tests.relighting import ball
 
 PACKAGE = Path(pimper_torch.__file__).parent
 ROOT = Path(__file__).parents[1]
@@ -193,6 +195,18 @@ def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
     return {}
 
 
+def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, _ = ball.photographed((0.0, 0.3, 1.0), views=3)
+    result = SimpleNamespace(
+        mesh=ball.ball_mesh(),
+        scene=scene,
+        cameras=scene.cameras,
+        silhouettes=Silhouettes.everything(scene.views),
+        held_out=None,
+    )
+    return {"result": result}
+
+
 # What each block of a page takes for granted, by page and number.
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
@@ -201,6 +215,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/parts.md", 0): a_matrix_and_patches,
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,
+    ("docs/result.md", 0): a_result,
     ("docs/conventions.md", 0): nothing,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): nothing,

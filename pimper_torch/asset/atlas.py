@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.errors import caution
+from pimper_torch.failures import reason_of
 from pimper_torch.records import Mesh, Record
 
 # A choice: what browsers on telephones take.
@@ -22,7 +24,11 @@ _PIECE_FACES = 512
 # The same mesh takes it 1.5 s. A choice: long enough for a slow machine.
 _LIMIT_S = 60.0
 
-# Between the two triangles of a cell and round it, so that bilinear samples stay inside.
+# Of Python: the folder of the script, with this room's modules, is no place to import from.
+_CHILD = ("-P",)
+
+# Round a cell's triangles; as much is between them, along each side. With 1, colours of a sphere
+# are off by 2.8 levels in place of 0.5.
 _GUTTER_TEXELS = 2
 
 
@@ -75,9 +81,8 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
             faces=torch.cat(corners).numpy().astype(np.uint32),
             vertex_counts=[len(one) for one in sources],
             face_counts=[len(one) for one in corners],
-            texels_per_unit=1.0,
         )
-        command = [sys.executable, "-P", str(Path(__file__).with_name("charts.py"))]
+        command = [sys.executable, *_CHILD, str(Path(__file__).with_name("charts.py"))]
         try:
             subprocess.run(
                 [*command, str(before), str(after)],
@@ -86,9 +91,15 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
             )
-        except (subprocess.SubprocessError, OSError):
+        except (subprocess.SubprocessError, OSError) as error:
+            told = (getattr(error, "stderr", None) or b"").decode(errors="replace").split("\n")
+            reason = next((line for line in reversed(told) if line.strip()), reason_of(error))
+            caution(
+                f"asset: xatlas made no atlas ({reason}). Every face has a place of its own on the "
+                "textures, which makes `asset.glb` larger."
+            )
             return None
-        with np.load(after) as found:
+        with np.load(after, allow_pickle=False) as found:
             values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}
             size, charts = found["size"].tolist(), int(found["charts"])
     shrunk = min(1.0, MAX_SIDE / max(size))

@@ -21,7 +21,7 @@ from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Mesh, Record
-from pimper_torch.viz.maps import base_color
+from pimper_torch.viz.maps import albedo_scale, base_color
 
 # Least component along the blended normal in a normal map: viewers do not draw a surface that
 # faces away from itself. A choice.
@@ -43,6 +43,7 @@ class Textured(Record):
 
     Attributes:
         mesh: Its vertices are copied along seams.
+        vertex: That each copy is of.
         normals: Of its vertices, unit; those that the normal map is relative to.
         uv: Right and down over the textures, in [0, 1].
         tangent: Unit along ``u``, and the sign of the bitangent.
@@ -53,6 +54,7 @@ class Textured(Record):
     """
 
     mesh: Mesh
+    vertex: Int[Tensor, " copy"]
     normals: Float[Tensor, "copy 3"]
     uv: Float[Tensor, "copy 2"]
     tangent: Float[Tensor, "copy 4"]
@@ -96,15 +98,19 @@ def baked(
     Args:
         full: The surface, on the CPU.
         few: The mesh that was laid out, its normals those that the normal map is relative to.
-        reflectance: Metallic, roughness and specular of the surface's vertices.
+        reflectance: Metallic, roughness and specular of the mesh's vertices.
     """
     normals = _normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
-    columns = [_normals(full), base_color(full).expand(-1, 3)]
-    columns += [] if reflectance is None else [reflectance.to(full.vertices_world)]
-    values, surface, laid = torch.cat(columns, dim=1), _Surface(full, few), _laid(atlas)
+    colors = base_color(full, albedo_scale(few)).expand(-1, 3)
+    values, surface, laid = (
+        torch.cat([_normals(full), colors], dim=1),
+        _Surface(full, few),
+        _laid(atlas),
+    )
+    own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
         """Return the values of texels, and whether the surface was met."""
@@ -117,11 +123,12 @@ def baked(
         met = surface.nearest(points, here.interpolate(shape, mesh.faces))
         found = met.interpolate(values, full.faces)
         axes = frames(here, normals, tangent, mesh.faces)
-        return torch.cat([_relative(found[:, :3], axes), found[:, 3:]], dim=1), met.face >= 0
+        columns = [_relative(found[:, :3], axes), found[:, 3:], here.interpolate(own, mesh.faces)]
+        return torch.cat(columns, dim=1), met.face >= 0
 
     (texels,) = torch.nonzero(laid.face >= 0, as_tuple=True)
     blocks = list(side_by_side(bake, torch.split(texels, _BLOCK_TEXELS), tracked=False))
-    raster = values.new_zeros(len(laid.face), values.shape[1])
+    raster = values.new_zeros(len(laid.face), values.shape[1] + own.shape[1])
     raster[texels] = torch.cat([found for found, _ in blocks])
     known = torch.zeros_like(laid.face, dtype=torch.bool)
     known[texels] = torch.cat([there for _, there in blocks])
@@ -129,6 +136,7 @@ def baked(
     raster = raster[_nearest_known(known.reshape(size))[0]].reshape(*size, -1)
     return Textured(
         mesh=mesh,
+        vertex=atlas.vertex,
         normals=normals,
         uv=atlas.uv,
         tangent=tangent,

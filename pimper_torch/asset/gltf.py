@@ -3,7 +3,6 @@
 import json
 import struct
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,15 +23,14 @@ MATTE: dict[str, Any] = {
 _UPWARD = (0.0, 0.0, 1.0)
 
 
-def write_gltf(
-    path: Path | str,
+def gltf_of(
     attributes: Mapping[str, np.ndarray],
     faces: np.ndarray,
     material: Mapping[str, Any],
     images: Sequence[bytes] = (),
     offset_world: Offset = NO_OFFSET,
-) -> None:
-    """Write one mesh of one material as a GLB.
+) -> bytes:
+    """Return one mesh of one material as a GLB.
 
     Args:
         attributes: By glTF's names, one row a vertex; written in single precision.
@@ -102,10 +100,9 @@ def write_gltf(
     tree["buffers"] = [{"byteLength": len(buffer)}]
     text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (-len(text) % 4)
-    with Path(path).open("wb") as file:
-        file.write(struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", len(buffer), b"BIN\0") + buffer)
+    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer))
+    head += struct.pack("<I4s", len(text), b"JSON") + text
+    return head + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

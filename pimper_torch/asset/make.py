@@ -17,16 +17,21 @@ _FACES = 50_000
 _TEXELS_PER_SIDE = 1.5
 
 
+def few_enough(mesh: Mesh) -> Mesh:
+    """Reduce a mesh to about 50,000 faces, where it has more."""
+    return reduced(mesh, _FACES)
+
+
 def textured(
     full: Mesh, few: Mesh, reflectance: Float[Tensor, "vertex 3"] | None = None
 ) -> Textured:
-    """Bake a surface onto about 50,000 faces.
+    """Bake a surface onto few faces.
 
     Args:
         full: The surface, on the CPU.
-        few: The same of fewer vertices; it is reduced where it has more faces.
-        reflectance: Metallic, roughness and specular of the surface's vertices; matte without.
+        few: The same of fewer faces, see :func:`few_enough`.
+        reflectance: Metallic, roughness and specular of its vertices; matte without.
     """
-    full, few = (one.detach().to(torch.float32) for one in (full, reduced(few, _FACES)))
+    full, few = (one.detach().to(torch.float32) for one in (full, few))
     side = float(side_lengths(full.vertices_world[full.faces]).median())
     return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance)

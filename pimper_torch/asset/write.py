@@ -1,5 +1,6 @@
 """Textured meshes as files: GLB, and OBJ with a material."""
 
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.asset.bake import Textured
-from pimper_torch.asset.gltf import MATTE, write_gltf
+from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.radiometry import to_bytes
 
@@ -21,14 +22,20 @@ _SPECULAR = "KHR_materials_specular"
 _EFFORT = 3
 
 
-def write_asset(asset: Textured, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+def write_asset(
+    asset: Textured,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    more: Mapping[str, Float[Tensor, " copy"]] | None = None,
+) -> None:
     """Write a GLB whose vertices tell ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence), if known.
 
     Args:
         offset_world: Of the node; see ``SparseScene.offset_world``.
+        more: Of the vertices, by the attributes' names.
     """
     mesh, images = asset.mesh, [_png(asset.base_color), _png(asset.normal)]
-    told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence}
+    told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence, **(more or {})}
     attributes = {
         "POSITION": mesh.vertices_world,
         "NORMAL": asset.normals,
@@ -41,7 +48,8 @@ def write_asset(asset: Textured, path: Path | str, offset_world: Offset = NO_OFF
     if asset.reflectance is not None:
         images += _reflect(material, asset.reflectance, len(images))
     arrays = {name: values.numpy() for name, values in attributes.items()}
-    write_gltf(path, arrays, mesh.faces.numpy(), material, images, offset_world)
+    data = gltf_of(arrays, mesh.faces.numpy(), material, images, offset_world)
+    Path(path).write_bytes(data)
 
 
 def _reflect(
@@ -93,7 +101,7 @@ def write_asset_obj(asset: Textured, path: Path | str, offset_world: Offset = NO
     normal.write_bytes(_png(asset.normal))
     path.with_suffix(".mtl").write_text(
         f"newmtl surface\nKd 1 1 1\nKs 0 0 0\nPm 0\nPr 1\nmap_Kd {albedo.name}\n"
-        f"norm {normal.name}\nmap_Bump {normal.name}\n",
+        f"norm {normal.name}\n",
         encoding="utf-8",
     )
     digits = 9 if offset_world == NO_OFFSET else 15

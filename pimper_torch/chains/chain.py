@@ -54,6 +54,7 @@ class Step(Record):
         scale: Of the photographs that templates were sampled for; 1 is their own size.
         last: Whether this step's surface is the result.
         scene: Cameras, undistorted photographs and the cloud.
+        held_out: Photographs that took no part but in finding cameras; None without any.
         silhouettes: Where every view shows the object.
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
@@ -71,6 +72,7 @@ class Step(Record):
     reports: tuple[StageReport, ...] = ()
     failures: tuple[Failure, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
+    held_out: SparseScene | None = None
 
     @property
     def photometric(self) -> PhotometricPatches:
@@ -100,7 +102,8 @@ class Chain(Stage):
 
     A function that is assigned to ``preview`` is called with the scene and the coarse surface as
     soon as they are there; one that is assigned to ``watch`` with the scene as soon as cameras are
-    known, and with every step that is done.
+    known, and with every step that is done. Photographs whose names are in ``needed`` are never
+    held out.
     """
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
@@ -121,6 +124,7 @@ class Chain(Stage):
         self.observer = observer or Silent()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
+        self.needed: tuple[str, ...] = ()
         self.store = store
 
     @abstractmethod
@@ -298,6 +302,7 @@ class Chain(Stage):
         return Reconstruction(
             mesh=found,
             scene=step.scene,
+            held_out=step.held_out,
             silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,

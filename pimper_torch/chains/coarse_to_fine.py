@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.chains.streaming import (
     Factorizing,
     Prepared,
@@ -17,7 +18,7 @@ from pimper_torch.chains.streaming import (
 )
 from pimper_torch.coarse.remesh import Remesh, RemeshConfig
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
-from pimper_torch.config import require
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.errors import caution, held
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
@@ -59,6 +60,7 @@ class CoarseToFineConfig:
             what is constant to autograd: structure from motion, the coarse surface (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
+        hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """
@@ -67,6 +69,7 @@ class CoarseToFineConfig:
     kernels: Kernels = "numba"
     on_failure: OnFailure = "skip"
     max_memory: str = ""
+    hold_out: Annotated[int, Range(least=0, most=1_000_000)] = 0
     scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -82,6 +85,8 @@ class CoarseToFineConfig:
 
     def __post_init__(self) -> None:
         bytes_of(self.max_memory)
+        require_ranges(self)
+        require(self.hold_out != 1, "hold_out", self.hold_out, "0, or 2 at least")
         # Photographs hold nothing between their pixels, and memory goes with the square.
         sound = bool(self.scales) and all(0 < scale <= 4 for scale in self.scales)
         require(sound, "scales", self.scales, "one at least, above 0 and at most 4 each")
@@ -124,7 +129,9 @@ class CoarseToFine(Chain):
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
-        placed = self.placed(views, sparse_model, mesh)
+        every = self.placed(views, sparse_model, mesh)
+        needed = (*self.references(), *self.needed)
+        placed, held_out = held_apart(every, self.config.hold_out, needed)
         self.need(COARSE)
         silhouettes = self.kept(self.silhouettes, placed)
         mesh = self.given_mesh(mesh, views, placed, silhouettes)
@@ -169,6 +176,7 @@ class CoarseToFine(Chain):
                 scale=scale,
                 last=number == last,
                 scene=scene,
+                held_out=held_out,
                 silhouettes=silhouettes,
                 heights=heights,
                 surface=surface,

@@ -14,7 +14,7 @@ from pimper_torch.ledger import kept_entries, noted_entries, repeat_entries
 from pimper_torch.records import Failure, Record, StageReport
 from pimper_torch.reporting import HASH, KEEP, aside, noted, repeat
 from pimper_torch.store import Store, digest, settled
-from pimper_torch.store.code import code_of
+from pimper_torch.store.code import code, is_known
 
 R = TypeVar("R")
 
@@ -45,18 +45,21 @@ def kept_call(
     if store is None or cls is None:
         return call(*inputs, **derived)
     with aside(HASH):
-        key = _key(call, inputs, settings)
-    if key is None:
+        own = all(map(is_known, _modules(call, *inputs)))
+        hashed = digest(code(), call, settings, *inputs) if own else None
+    if hashed is None:
         return call(*inputs, **derived)
+    key = f"{name}-{hashed}"
     with aside(KEEP):
-        found = store.find(f"{name}-{key}", cls)
+        found = store.find(key, cls)
     if found is not None:
-        skipped(*(Failure(**failure) for failure in found.about["failures"]))
-        repeat_entries(found.about["left_out"])
-        repeat([StageReport(**report) for report in found.about["reports"]])
-        for message in found.about["cautions"]:
+        record, told = found
+        skipped(*(Failure(**failure) for failure in told["failures"]))
+        repeat_entries(told["left_out"])
+        repeat([StageReport(**report) for report in told["reports"]])
+        for message in told["cautions"]:
             caution(message)
-        return typing.cast(R, _beside(found.record, inputs))
+        return typing.cast(R, _beside(record, inputs))
     with overheard() as cautions, noted() as reports, noted_entries() as entries:
         result = settled(typing.cast(Record, call(*inputs, **derived)))
     failures = distinct(entries)
@@ -70,24 +73,16 @@ def kept_call(
     }
     try:
         with aside(KEEP):
-            store.keep(f"{name}-{key}", result, about)
+            store.keep(key, result, about)
     except OutputError as error:
         caution(str(error))
     return typing.cast(R, result)
 
 
-def _key(call: Callable[..., object], inputs: tuple[object, ...], settings: object) -> str | None:
-    """Hash the stage, its code and inputs; ``None`` where one of them is not known."""
-    codes = [
-        code_of(_module(value)) for value in (call, *inputs) if isinstance(value, nn.Module)
-    ] + [code_of(call.__module__)]
-    return None if None in codes else digest(codes, call, settings, *inputs)
-
-
-def _module(stage: nn.Module) -> str:
-    """Name the module of the class, or of the first part that is none of this package."""
-    modules = [type(part).__module__ for part in stage.modules()]
-    return next((module for module in modules if code_of(module) is None), modules[0])
+def _modules(call: Callable[..., object], *inputs: object) -> set[str]:
+    """Name the Python modules of a function, and of all parts of stages."""
+    stages = [value for value in (call, *inputs) if isinstance(value, nn.Module)]
+    return {call.__module__} | {type(part).__module__ for one in stages for part in one.modules()}
 
 
 def _returns(call: Callable[..., object]) -> type[Record] | None:

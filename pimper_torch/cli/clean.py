@@ -14,7 +14,7 @@ from pimper_torch.outputs.clean import clean_output, require_cleanable
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Remove what a run into OUT kept to go on from, and what killed runs left beside it.
+    """Remove what a run into OUT kept to go on from, and what killed runs left there.
 
     The result itself stays.
 

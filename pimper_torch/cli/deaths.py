@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pimper_torch.cli.faults import limit, write_report
 from pimper_torch.cli.output import Output
-from pimper_torch.outputs.marker import STAGES
-from pimper_torch.outputs.stages import kept
+from pimper_torch.outputs.stages import kept, resumption
 
 _CRASHES = ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP", "SIGSYS")
 _LESS = (
@@ -66,10 +65,7 @@ def _kept(arguments: Sequence[str]) -> str:
         return " No result was written."
     if not kept(out):
         return " No result was written, and what was there before is there still."
-    return (
-        f" What was finished is kept in {out / STAGES}: the same command goes on from there, and "
-        f"`pimper clean {out}` removes it."
-    )
+    return f" {resumption(out)}"
 
 
 def folder_of(arguments: Sequence[str]) -> Path | None:

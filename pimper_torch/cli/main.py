@@ -19,11 +19,12 @@ import traceback
 import types
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from typing import TextIO
 
 from pimper_torch.cli.faults import limit, write_report
+from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import exit_code, stoppable
 from pimper_torch.cores import usable_cores
@@ -176,22 +177,22 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
     if usable_cores() < (os.cpu_count() or 1):  # OpenMP knows of affinity, not of quotas
         os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
     _limit_arenas()
-    from pimper_torch.cli.light import light
-
     home = _COMMANDS[command]
     try:
         for argument in arguments:
             require_name(argument, InputError)
-        _refuse_at_once(_READERS.get(home, home), command, arguments)
+        if command not in _LIGHT:
+            _refuse_at_once(_READERS.get(home, home), command, arguments)
         if output.as_json:
             from pimper_torch.io.version import versions
 
             output.event(
                 "start", command=command, arguments=arguments, versions=versions(), format=1
             )
-        run = light(home, "run") if command in _LIGHT else _loaded(home).run
-        with stoppable(repeat=not supervised):
-            run(command, arguments, output)
+        with absent() if command in _LIGHT else nullcontext():
+            run = _loaded(home).run
+            with stoppable(repeat=not supervised):
+                run(command, arguments, output)
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
             raise error.__context__ from None
@@ -259,12 +260,12 @@ def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
         PimperError: What ``checked`` of the command's module raises.
         SystemExit: ``--help`` was answered.
     """
-    from pimper_torch.cli.light import light
-
+    if "torch" in sys.modules:
+        return
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), absent():
             warnings.simplefilter("ignore")  # shown when the arguments are read in earnest
-            light(home, "checked")(command, arguments)
+            import_module(home).checked(command, arguments)
     except (PimperError, BrokenPipeError):
         raise
     except Exception:

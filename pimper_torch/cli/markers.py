@@ -12,7 +12,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.size.sheet import SIDE_MM, Paper, layout
-from pimper_torch.viz.sheet import is_sheet, write_sheet
+from pimper_torch.viz.sheet import TITLE, write_sheet
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,5 +60,5 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
     job = read_arguments(_Job, command, arguments)
     require(job.out.suffix.lower() == ".pdf", "SHEET", job.out.name, "a name ending in .pdf")
     layout(job.side_mm, job.paper)
-    prepare_file(job.out, job.overwrite, is_sheet)
+    prepare_file(job.out, job.overwrite, TITLE)
     return job

@@ -5,10 +5,10 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import tyro
 
@@ -48,29 +48,53 @@ class Option:
         return "." in self.names[-1]
 
 
-def options_of(command: Callable[..., object], between: str = " ") -> Iterator[Option]:
+def options_of(
+    command: object, between: str = " ", section: str = "", path: str = ""
+) -> Iterator[Option]:
     """List the options of a command as tyro makes them, in their order.
 
     Args:
-        command: Whose parameters are options.
+        command: Whose parameters are options; or settings, whose fields are.
         between: What stands between several values.
+        path: Of settings: what stands before a field's name.
     """
-    said = meanings(command)
-    for name, parameter in inspect.signature(command).parameters.items():
-        meaning = said.get(name, "")
-        given = _Given(name=name, meaning=meaning, section="", path="", between=between)
-        yield from _options(given, parameter.annotation, parameter.default)
+    said = meanings(type(command) if _is_settings(command) else command)
+    for field, annotation, default in _members(command):
+        is_marked = get_origin(annotation) is Annotated
+        kind, *marks = get_args(annotation) if is_marked else (annotation,)
+        known = next((mark for mark in marks if hasattr(mark, "aliases")), None)
+        name = field if known is None or known.name is None else known.name
+        meaning = said.get(field, "")
+        if _is_settings(default):
+            inner = f"{path}{name}." if name else path
+            title = f"{inner[:-1]}: {summary(kind)}" if inner else meaning.lower()
+            yield from options_of(default, between, title, inner)
+            continue
+        value = (known and known.metavar) or value_of(kind, between)
+        written = f"--{path}{name}".replace("_", "-")
+        names = (*((known and known.aliases) or ()), written)
+        if kind is bool:
+            value = ""
+            if _SWITCH not in marks:
+                stage, dot, last = written[2:].rpartition(".")
+                names = (written, f"--{stage}{dot}no-{last}")
+        if _POSITIONAL in marks:
+            names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
+        yield Option(section=section, names=names, value=value, meaning=meaning, default=default)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Given:
-    """A parameter or a field: its name, what it means, and where it stands."""
+def _is_settings(value: object) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
-    name: str
-    meaning: str
-    section: str
-    path: str
-    between: str
+
+def _members(command: Any) -> list[tuple[str, Any, Any]]:  # noqa: ANN401 - a function or settings
+    """List the name, the annotation and the default of each parameter or field."""
+    if not _is_settings(command):
+        parameters = inspect.signature(command).parameters
+        return [(name, one.annotation, one.default) for name, one in parameters.items()]
+    hints = typing.get_type_hints(type(command), include_extras=True)
+    names = [field.name for field in dataclasses.fields(command)]
+    return [(name, hints[name], getattr(command, name)) for name in names]
 
 
 def meanings(documented: object) -> dict[str, str]:
@@ -107,45 +131,6 @@ def plain(text: str) -> str:
     'What `load_views` takes as `encoding`.'
     """
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")
-
-
-def _options(given: _Given, annotation: object, default: object) -> Iterator[Option]:
-    kind, marks = annotation, []
-    if get_origin(annotation) is Annotated:
-        kind, *marks = get_args(annotation)
-    known = next((mark for mark in marks if hasattr(mark, "aliases")), None)
-    name = given.name if known is None or known.name is None else known.name
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        yield from _fields(given, name, kind, default)
-        return
-    value = (known and known.metavar) or value_of(kind, given.between)
-    written = f"--{given.path}{name}".replace("_", "-")
-    names = (*((known and known.aliases) or ()), written)
-    if kind is bool:
-        value = ""
-        if _SWITCH not in marks:
-            stage, dot, last = written[2:].rpartition(".")
-            names = (written, f"--{stage}{dot}no-{last}")
-    if _POSITIONAL in marks:
-        names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
-    yield Option(
-        section=given.section, names=names, value=value, meaning=given.meaning, default=default
-    )
-
-
-def _fields(given: _Given, name: str, kind: type, default: object) -> Iterator[Option]:
-    path = f"{given.path}{name}." if name else given.path
-    section = f"{path[:-1]}: {summary(kind)}" if path else given.meaning.lower()
-    said, hints = meanings(kind), typing.get_type_hints(kind, include_extras=True)
-    for field in dataclasses.fields(kind):
-        inner = _Given(
-            name=field.name,
-            meaning=said.get(field.name, ""),
-            section=section,
-            path=path,
-            between=given.between,
-        )
-        yield from _options(inner, hints[field.name], getattr(default, field.name))
 
 
 def value_of(kind: object, between: str = " ") -> str:

@@ -29,6 +29,7 @@ from pimper_torch.outputs.marker import STAGES
 from pimper_torch.outputs.stages import PREVIEW
 from pimper_torch.records import CoarseMesh, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
+from pimper_torch.size.given import measured_in
 from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
 from pimper_torch.viewer.results import COARSE, add_found, add_outcome
@@ -64,6 +65,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, observer, _store(job))
+        chain.needed = tuple(measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)

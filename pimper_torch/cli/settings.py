@@ -7,7 +7,7 @@ import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import tyro
 
@@ -46,7 +46,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         output.say("\n".join([*lines, *_yaml(job.config, job.path)]))
         output.result(settings=to_mapping(value))
     else:
-        output.say(_explained(job, owner, value))
+        output.say(_explained(job, owner))
         output.result(settings={".".join(job.path): value})
 
 
@@ -105,21 +105,18 @@ def _names(settings: object, stem: str) -> Iterator[str]:
 def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str]:
     """Write settings as YAML, what each means above it; of ``path`` alone, if one is given."""
     said, indent = meanings(type(settings)), "  " * depth
-    for name, hint in typing.get_type_hints(type(settings)).items():
+    for name in typing.get_type_hints(type(settings)):
         value = getattr(settings, name)
         if path and name != path[0]:
             continue
-        if typing.get_origin(hint) is ClassVar:
-            yield from _comment(said.get(name, ""), indent)
-            yield f"{indent}{name}: {written(value)}"
-        elif dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value):
             yield ""
             yield from _comment(summary(type(value)).split("\n\n")[0], indent)
             yield f"{indent}{name}:"
             yield from _yaml(value, path[1:], depth + 1)
         else:
             yield from _comment(said.get(name, ""), indent)
-            yield f"{indent}{name}: {written(to_mapping(settings)[name])}"
+            yield f"{indent}{name}: {written(to_mapping(settings).get(name, value))}"
 
 
 def _comment(text: str, indent: str) -> list[str]:
@@ -127,26 +124,15 @@ def _comment(text: str, indent: str) -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=start)
 
 
-def _explained(job: _Job, owner: object, value: object) -> str:
+def _explained(job: _Job, owner: object) -> str:
     """Report what a setting means, what it may be, and how it is set."""
-    name, kind = job.path[-1], type(owner)
-    option = f"--{'.'.join(job.path)}".replace("_", "-")
-    meaning = meanings(kind).get(name, "")
-    hint = typing.get_type_hints(kind)[name]
+    hint = typing.get_type_hints(type(owner))[job.path[-1]]
+    name = ".".join(job.path)
     lines = [
-        f"{'.'.join(job.path)}: {written(to_mapping(owner)[name])}  # in {job.preset}",
-        *textwrap.wrap(meaning, _WIDTH),
+        f"{name}: {written(to_mapping(owner)[job.path[-1]])}  # in {job.preset}",
         f"needed: {'true or false' if hint is bool else value_of(hint, ', ')}",
-        f"option: {option}",
+        f"option: --{name.replace('_', '-')}",
         "file:",
-        *_nested(job.path, written(to_mapping(owner)[name])),
+        *filter(None, _yaml(job.config, job.path)),
     ]
     return "\n".join(lines)
-
-
-def _nested(path: Sequence[str], value: str) -> list[str]:
-    ends = [""] * (len(path) - 1) + [f" {value}"]
-    return [
-        f"{'  ' * (depth + 1)}{name}:{end}"
-        for depth, (name, end) in enumerate(zip(path, ends, strict=True))
-    ]

@@ -54,7 +54,7 @@ def main() -> int:
         return code
     if watch.killed:
         code = 128 + watch.first
-        say("ended at once; what is left beside the result is removed by the next run.", code)
+        say("ended at once; what is left in `.stages` is removed by the next run.", code)
         return code
     from pimper_torch.cli.deaths import tell_death
 

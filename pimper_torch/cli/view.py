@@ -45,11 +45,11 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         PimperError: No surface to show, or no such address.
     """
     job = checked(command, arguments)
-    with opened(job.host, job.port) as viewer:
+    # Ctrl-C ends the page and no work.
+    with opened(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
         tell_place(viewer, output, job.port)
-        with suppress(KeyboardInterrupt):  # which ends the page and no work
-            add_folder(viewer, job.out, job.photos)
-            viewer.wait()
+        add_folder(viewer, job.out, job.photos)
+        viewer.wait()
 
 
 def tell_place(viewer: Viewer, output: Output, port: int = PORT) -> None:

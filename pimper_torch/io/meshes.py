@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.asset.gltf import MATTE, write_gltf
+from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
@@ -219,13 +219,13 @@ def write_glb(
         attributes["COLOR_0"] = _colors(mesh)
     if measured is not None:
         attributes["_MEASURED"] = corners_of(mesh.faces, measured, len(mesh.vertices_world))
-    write_gltf(
-        path,
+    data = gltf_of(
         {name: values.detach().cpu().numpy() for name, values in attributes.items()},
         mesh.faces.cpu().numpy(),
         MATTE,
         offset_world=offset_world,
     )
+    Path(path).write_bytes(data)
 
 
 def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from pimper_torch.asset.bake import Textured
-from pimper_torch.asset.make import textured
+from pimper_torch.asset.make import few_enough, textured
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
@@ -23,8 +23,8 @@ from pimper_torch.io.reports import lights_report, summary_report
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
-from pimper_torch.relighting.lights import fit_lights
+from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
+from pimper_torch.relighting.held_out import Relighting, relight
 from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import asset_within, write_page
 from pimper_torch.report.predictions import predictions
@@ -57,7 +57,7 @@ RESULT_NAMES = (
     "turn.webp",
     "report.html",
 )
-_PARTS = 7  # of the bar: simplification, meshes, asset, maps, contact sheet, turning picture, page
+_PARTS = 8  # of the bar: simplification, light, meshes, asset, maps, sheet, turning picture, page
 
 
 def write_result(
@@ -95,7 +95,8 @@ def write_result(
                      (float64 far from the origin), name
     `lights.json`    light of every view, averaged and for each patch, world frame
     `config.yaml`    every setting of the run
-    `summary.json`   counts, times, memory, convergence
+    `summary.json`   counts, times, memory, convergence; materials, and how near the surface comes
+                     to photographs with them and without, in decibels
     `overview.png`   contact sheet, every photograph with its silhouette below
     `turn.webp`      the surface turning once round, its shape beside its albedo
     `report.html`    unless unwanted: all of this to look at in a browser, offline
@@ -132,10 +133,14 @@ def write_result(
             ready = finished(whole.mesh, files or MeshFiles())
         found, whole = whole, whole.replace(mesh=ready.mesh)
         with part(1, _PARTS):
-            _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
+            few = few_enough(whole.mesh)
+            relighting = relight(few, whole.scene, whole.silhouettes, whole.held_out)
         with part(2, _PARTS):
-            asset = textured(found.mesh, ready.mesh)
+            _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
+        with part(3, _PARTS):
+            asset = textured(found.mesh, few, relighting.materials.at_vertices())
             _write_asset(asset, files or MeshFiles(), whole.scene.offset_world, staging)
+            relighting = _with_textures(relighting, asset, whole)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
@@ -143,24 +148,38 @@ def write_result(
             **summary_report(found, about or {}),
             **ready.summary,
             "asset": asset.summary,
+            "relighting": relighting.report(),
         }
         _write_json(summary, staging / "summary.json", indent=2)
-        with part(6, _PARTS):
+        with part(7, _PARTS):
             if report:
-                _write_page(whole, asset, staging, title=folder.absolute().name, summary=summary)
+                title = folder.absolute().name
+                _write_page(whole, few, asset, relighting, staging, title=title, summary=summary)
+
+
+def _with_textures(relighting: Relighting, asset: Textured, result: Reconstruction) -> Relighting:
+    """Judge the asset by the photographs that the mesh was judged by."""
+    if result.held_out is not None:
+        return relighting.with_textures(asset, result.held_out, None)
+    return relighting.with_textures(asset, result.scene, result.silhouettes)
 
 
 def _write_page(
     result: Reconstruction,
+    few: Mesh,
     asset: Textured,
+    relighting: Relighting,
     folder: Path,
     *,
     title: str,
     summary: Mapping[str, Any],
 ) -> None:
-    """Write the page of a result whose other files are in a folder already."""
-    scene, mesh = result.scene, result.mesh
-    lights = fit_lights(mesh, scene, result.silhouettes)
+    """Write the page of a result whose other files are in a folder already.
+
+    Args:
+        few: The mesh that the relighting is of.
+    """
+    scene = result.scene
     write_page(
         folder / "report.html",
         title=title,
@@ -169,7 +188,7 @@ def _write_page(
         scene=scene,
         silhouettes=result.silhouettes,
         reference=result.coarse.reference,
-        predictions=predictions(mesh, scene, lights, None, [""] * scene.views.num_views),
+        predictions=predictions(few, scene, relighting),
         layers=surface_layers(asset.mesh),
         summary=summary,
         settings=(folder / "config.yaml").read_text(encoding="utf-8"),
@@ -198,13 +217,13 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
-    with part(3, _PARTS):
+    with part(4, _PARTS):
         _write_maps(result, folder)
     _write_json(lights_report(result), folder / "lights.json")
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(4, _PARTS):
-        draw_overview(result, folder / "overview.png")
     with part(5, _PARTS):
+        draw_overview(result, folder / "overview.png")
+    with part(6, _PARTS):
         draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
 
 

@@ -1,24 +1,32 @@
-"""Folders of results: all of a result, or nothing, and nothing that somebody else put there."""
+"""Folders of results: all of a result, or nothing, and nothing that somebody else put there.
 
-import secrets
+A result is filled in ``.stages/new`` inside its folder, where the lock of the folder guards it. It
+is whole when its list is there, the last file written. Then the former result's files are removed,
+and those of the new one are renamed to their places, the list last: a folder with its list holds
+a whole result. Where a run is killed in between, the next one goes on from there.
+"""
+
+import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from itertools import count
 from pathlib import Path
 
 from pimper_torch.errors import InputError, OutputError, some
-from pimper_torch.outputs.marker import MARKER, STAGES, Kind, foreign, read_marker, seal
-from pimper_torch.outputs.names import require_name
-from pimper_torch.outputs.stages import is_ours, kept, locked
-from pimper_torch.outputs.workspace import (
-    READY,
-    finish,
-    put_aside,
-    put_in_place,
-    remove_leftovers,
-    restore,
-    workspace,
+from pimper_torch.outputs.marker import (
+    MARKER,
+    STAGES,
+    Kind,
+    Marker,
+    foreign,
+    read_marker,
+    remove_written,
+    seal,
 )
+from pimper_torch.outputs.names import require_name
+from pimper_torch.outputs.stages import NEW, is_ours, kept, locked, resumption
 
 # What this run holds: what it calls may write there.
 _held: ContextVar[frozenset[Path]] = ContextVar("held_outputs", default=frozenset())
@@ -41,16 +49,10 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
         raise OutputError(f"{folder}: is a link to nothing. Remove it, or write elsewhere.")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; needed: a folder that is new or empty.")
-    try:
-        present = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be listed ({error.strerror}).") from error
-    if STAGES in present:
-        present.remove(STAGES)
-        if not is_ours(folder / STAGES):
-            raise OutputError(
-                f"{folder}: holds {STAGES}, which pimper did not make. Write elsewhere."
-            )
+    if os.path.lexists(folder / STAGES) and not is_ours(folder / STAGES):
+        raise OutputError(f"{folder}: holds {STAGES}, which pimper did not make. Write elsewhere.")
+    there = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    present = [name for name in there if name != STAGES]
     if present and not overwrite:
         names = [name for name in present if name != MARKER] or present
         raise OutputError(
@@ -66,11 +68,11 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
 def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
     """Hold a folder of results for a run: no other run writes there.
 
-    What killed runs left is removed. A folder that was made for the block, and in which nothing
-    was kept or written, is removed at its end. A block inside another one is part of it.
+    What a killed run left is removed, or put in its place where it was whole. A folder that was
+    made for the block, and in which nothing was kept or written, is removed at its end. A block
+    inside another one is part of it.
 
     Args:
-        folder: Its parents are made.
         overwrite: As of :func:`prepare_output`.
 
     Yields:
@@ -87,23 +89,16 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
         return
     made = [path for path in (target, *target.parents) if not path.exists()]
     try:
-        with _refused_by_the_disk(folder):
-            restore(target)
-            target.parent.mkdir(parents=True, exist_ok=True)
         with locked(target, folder):
             with _refused_by_the_disk(folder):
-                remove_leftovers(target)
-                finish(target)
+                put_in_place(target)
             prepare_output(folder, kind, overwrite)
             token = _held.set(_held.get() | {target})
             try:
                 yield target
             except BaseException as error:
                 if kept(target):
-                    error.add_note(
-                        f"What was finished is kept in {folder / STAGES}: the same command goes "
-                        f"on from there, and `pimper clean {folder}` removes it."
-                    )
+                    error.add_note(resumption(folder))
                 raise
             finally:
                 _held.reset(token)
@@ -115,11 +110,10 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
 
 @contextmanager
 def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Return a folder to fill, which takes the place of ``folder`` when all went well.
+    """Return a folder to fill, which becomes the result in ``folder`` when all went well.
 
-    It lies beside ``folder``: a folder that is there is whole, and a former result is replaced
-    only when the new one is complete and on the disk. What a run kept for the next one stays; see
-    :func:`pimper_torch.outputs.workspace.put_in_place`.
+    A former result is replaced only when the new one is complete and on the disk. What a run kept
+    for the next one stays.
 
     Args:
         folder: New, or empty but for what a former run kept; its parents are made.
@@ -133,15 +127,59 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
     with (
         held_output(folder, kind, overwrite=overwrite) as target,
         _refused_by_the_disk(folder),
-        workspace(target) as space,
     ):
-        yield space.new
-        seal(space.new, kind)
+        new = target / STAGES / NEW
+        new.mkdir()
         try:
-            prepare_output(folder, kind, overwrite)
+            yield new
+            seal(new, kind)
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)
+            raise
+        try:
+            put_in_place(target)
+        except KeyboardInterrupt:
+            put_in_place(target)  # goes on
+            raise
         except OutputError as error:  # somebody wrote there meanwhile
-            raise OutputError(f"{error} The new result is in {put_aside(space)}.") from error
-        put_in_place(space)
+            names = (target.with_name(f"{target.name}-{number}") for number in count(2))
+            aside = next(path for path in names if not os.path.lexists(path))
+            try:
+                new.rename(aside)
+            except OSError:  # beside a mount point, or where nothing may be written
+                aside = new
+            raise OutputError(f"{error} The new result is in {aside}.") from error
+
+
+def put_in_place(target: Path) -> None:
+    """Put a whole result that waits in the folder of kept stages in its place; remove half a one.
+
+    Goes on where it was cut off: the list of the former result is set aside first, so that the
+    folder is no result until the new one's list comes as the last file.
+
+    Args:
+        target: A folder that this process has locked.
+
+    Raises:
+        OutputError: Files that we did not write are there; nothing is changed then.
+        OSError: The disk refuses.
+    """
+    stages = target / STAGES
+    new = stages / NEW
+    if read_marker(new) is not None:
+        _require_ours(target, _markers(target))
+        if (target / MARKER).exists():
+            (target / MARKER).replace(stages / MARKER)
+        former = read_marker(stages)
+        if former is not None:
+            remove_written(target, former)
+        (stages / MARKER).unlink(missing_ok=True)
+        for path in sorted(new.iterdir()):
+            if path.name != MARKER:
+                path.rename(target / path.name)
+        (new / MARKER).rename(target / MARKER)
+    if new.exists():
+        shutil.rmtree(new)
 
 
 def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None:
@@ -155,15 +193,11 @@ def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None
     """
     target = Path(folder).resolve()
     for name, path in inputs.items():
-        if path is None:
-            continue
-        whole = path.resolve()
-        for one in (whole, *whole.parents):
-            if one == target or (one.exists() and target.exists() and one.samefile(target)):
-                raise InputError(
-                    f"{folder}: {name} ({path}) lies in the folder of the result, which is "
-                    "replaced as a whole. Write elsewhere, or move it."
-                )
+        if path is not None and path.resolve().is_relative_to(target):
+            raise InputError(
+                f"{folder}: {name} ({path}) lies in the folder of the result, which is replaced as "
+                "a whole. Write elsewhere, or move it."
+            )
 
 
 @contextmanager
@@ -177,12 +211,14 @@ def _refused_by_the_disk(folder: Path) -> Iterator[None]:
         ) from error
 
 
+def _markers(folder: Path) -> list[Marker]:
+    """Read the lists of a result, of one that is being removed, and of a new one."""
+    places = (folder, folder / STAGES, folder / STAGES / NEW)
+    return [marker for place in places if (marker := read_marker(place)) is not None]
+
+
 def _require_replaceable(folder: Path, kind: Kind, present: list[str]) -> None:
-    markers = [
-        marker
-        for marker in map(read_marker, (folder, folder / STAGES / READY))
-        if marker is not None
-    ]
+    markers = _markers(folder)
     if not markers:
         raise OutputError(
             f"{folder}: holds {some(present)}, but no list of what a former run wrote ({MARKER}), "
@@ -193,6 +229,10 @@ def _require_replaceable(folder: Path, kind: Kind, present: list[str]) -> None:
         raise OutputError(
             f"{folder}: holds a {others[0]}, and is not overwritten by a {kind}. Write elsewhere."
         )
+    _require_ours(folder, markers)
+
+
+def _require_ours(folder: Path, markers: list[Marker]) -> None:
     strangers = foreign(folder, *markers)
     if strangers:
         raise OutputError(
@@ -202,20 +242,6 @@ def _require_replaceable(folder: Path, kind: Kind, present: list[str]) -> None:
 
 
 def _require_writable(folder: Path) -> None:
-    parent = folder.resolve().parent
-    while not parent.exists():
-        parent = parent.parent
-    # A folder that is there may be written though the one above it may not.
-    places = (parent, folder) if folder.is_dir() else (parent,)
-    for place in places:
-        trial = place / f".pimper-trial-{secrets.token_hex(4)}"
-        try:
-            trial.mkdir()
-            trial.rmdir()
-            return
-        except OSError as error:
-            refused = error
-    raise OutputError(
-        f"{folder}: cannot be written, as {places[-1]} refuses ({refused.strerror}). Write "
-        "elsewhere."
-    ) from refused
+    place = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise OutputError(f"{folder}: cannot be written, as {place} refuses. Write elsewhere.")

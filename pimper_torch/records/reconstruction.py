@@ -42,6 +42,8 @@ class Reconstruction(Record):
         report: One entry a stage, in the order they ran.
         failures: What was left out, as it failed.
         left_out: What guards left out or doubted, in order.
+        held_out: Photographs that took no part but in finding cameras, to judge the surface by;
+            None without any.
     """
 
     mesh: Mesh
@@ -52,6 +54,7 @@ class Reconstruction(Record):
     silhouettes: Silhouettes
     failures: tuple[Failure, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
+    held_out: SparseScene | None = None
 
     @property
     def cameras(self) -> Cameras:

@@ -38,7 +38,7 @@ _PIXELS = 20_000  # of all photographs together, and of one at most
 _PIXELS_OF_ONE = 3000
 
 # A gain counts from this fraction of the loss, and from so many standard errors of its mean.
-_LEAST_GAIN, _SIGNIFICANT = 2e-3, 2.0
+_LEAST_GAIN, _SIGNIFICANT = 2e-3, 1.0
 
 
 def fit_materials(
@@ -74,7 +74,7 @@ def materials_under(
         split = shared.repeat(count, 1)
         for one in range(count):
             split = trial.improved(finer, split, one, _around(split[one], 2.0))
-        if len(split.unique(dim=0)) < count:
+        if len({tuple(row) for row in split.tolist()}) < count:
             break
         cluster, values = finer, split
     return Materials.of(cluster, values)
@@ -110,7 +110,7 @@ class _Trial:
             diffuse = diffuse_color(seen.pixels, material)
             return fit_strengths(seen, diffuse, lit, self.scales[view])[2]
 
-        return torch.stack(list(side_by_side(of_view, range(len(self.observed)))))
+        return torch.stack(list(side_by_side(of_view, range(len(self.observed)), tracked=False)))
 
     def improved(
         self,

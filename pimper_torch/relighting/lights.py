@@ -87,7 +87,7 @@ def lights_of(
         near = None if start is None else start.take([view])
         return _fit(surface, observed[view], material, near)
 
-    fits = side_by_side(fit, range(len(observed)))
+    fits = side_by_side(fit, range(len(observed)), tracked=False)
     return ViewLights.cat(list(fits))
 
 

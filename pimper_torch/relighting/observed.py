@@ -1,6 +1,7 @@
 """A photograph on the pixels that show the surface, small enough to fit a light in moments."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -72,8 +73,8 @@ def observe_all(
     surface: LitSurface, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> list[Observed]:
     """Look at the surface through every photograph; see :func:`observe`."""
-    views = range(scene.cameras.num_views)
-    return list(side_by_side(lambda view: observe(surface, scene, view, silhouettes), views))
+    look = partial(observe, surface, scene, silhouettes=silhouettes)
+    return list(side_by_side(look, range(scene.cameras.num_views), tracked=False))
 
 
 def observe(

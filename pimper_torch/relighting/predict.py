@@ -23,7 +23,6 @@ def predict(
     Args:
         mesh: With albedo; prepared where several pictures are wanted of it.
         camera: One.
-        light: Of one view.
         materials: Of the mesh; matte without.
 
     Returns:
@@ -32,19 +31,16 @@ def predict(
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
     pixels = surface.pixels(camera, 0)
     width, height = (int(side) for side in camera.sizes_px[0])
-    picture = torch.full((height * width, pixels.base_color.shape[1]), torch.nan)
-    picture[pixels.pixel] = shaded(surface, pixels, light, materials)
+    radiance = shaded(surface, pixels, light, materials)
+    picture = torch.full((height * width, radiance.shape[1]), torch.nan)
+    picture[pixels.pixel] = radiance
     return picture.reshape(height, width, -1)
 
 
 def shaded(
     surface: LitSurface, pixels: SurfacePixels, light: ViewLights, materials: Materials | None
 ) -> Float[Tensor, "pixel channel"]:
-    """Return the linear radiance of pixels.
-
-    Args:
-        light: Of one view.
-    """
+    """Return the linear radiance of pixels."""
     material = None if materials is None else materials.at_vertices()[pixels.vertex]
     incidence = surface.incidence(pixels, light.direction_world, light.closeness)
     lit = response(pixels, incidence, material)[0]

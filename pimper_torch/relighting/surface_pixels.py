@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.visibility import RayCaster, cast_view
+from pimper_torch.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.viz.maps import base_color
 
@@ -82,16 +82,25 @@ class LitSurface:
         faces, met = self.mesh.faces, hits.take(seen)
         points = met.interpolate(self.mesh.vertices_world, faces)
         nearest = met.barycentric.argmax(dim=1, keepdim=True)
+        normals_world, base_color = self.appearance(met)
         elsewhere = max_pool2d((~seen)[None].float(), 3, stride=1, padding=1)[0] > 0
         return SurfacePixels(
             pixel=seen.reshape(-1).nonzero()[:, 0],
             points_world=points,
-            normals_world=normalize(met.interpolate(self.normals_world, faces), dim=-1),
+            normals_world=normals_world,
             to_eye=normalize(cameras.centers_world[view] - points, dim=-1),
-            base_color=met.interpolate(self.base_color, faces),
+            base_color=base_color,
             vertex=faces[met.face].gather(1, nearest)[:, 0],
             inner=~elsewhere[seen],
         )
+
+    def appearance(
+        self, met: Hits
+    ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel channel"]]:
+        """Return unit normals, world frame, and base colours where rays meet the mesh."""
+        faces = self.mesh.faces
+        normals = normalize(met.interpolate(self.normals_world, faces), dim=-1)
+        return normals, met.interpolate(self.base_color, faces)
 
     def incidence(
         self,

@@ -1,6 +1,5 @@
 """Photographs as the surface explains them, small enough for a page."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +9,8 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Mesh, Record, SparseScene
+from pimper_torch.relighting.held_out import Relighting
 from pimper_torch.relighting.lights import ViewLights
-from pimper_torch.relighting.materials import Materials
 from pimper_torch.relighting.predict import predict
 from pimper_torch.relighting.surface_pixels import LitSurface
 from pimper_torch.report.pictures import longest_px
@@ -35,28 +34,26 @@ class Prediction(Record):
     figure: str = ""
 
 
-def predictions(
-    mesh: Mesh,
-    scene: SparseScene,
-    lights: ViewLights,
-    materials: Materials | None,
-    figures: Sequence[str],
-) -> list[Prediction]:
+def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[Prediction]:
     """Predict every photograph of a scene under its fitted light.
 
     Args:
         mesh: In the scene's frame, with albedo.
-        materials: Of the mesh; matte without.
-        figures: One a view.
+        relighting: Of the mesh and the scene.
     """
-    surface = LitSurface(mesh)
+    surface, judged = LitSurface(mesh), relighting.judged
     longest = longest_px(scene.views.num_views) // _COARSER
+    worth = dict(zip(judged.names, judged.psnr_db.tolist(), strict=True))
 
     def one(view: int) -> Prediction:
-        light = lights.take([view])
-        seen = predict(surface, _smaller(scene.cameras.take([view]), longest), light, materials)
-        radiance = seen.nan_to_num(0).movedim(-1, 0)
-        return Prediction(radiance=radiance, light=light, figure=figures[view])
+        light, camera = relighting.lights.take([view]), scene.cameras.take([view])
+        seen = predict(surface, _smaller(camera, longest), light, relighting.materials)
+        decibels = worth.get(scene.views.names[view], torch.nan)
+        return Prediction(
+            radiance=seen.nan_to_num(0).movedim(-1, 0),
+            light=light,
+            figure=f"{decibels:.1f} dB" if decibels == decibels else "",
+        )
 
     return list(side_by_side(one, range(scene.views.num_views), tracked=False))
 

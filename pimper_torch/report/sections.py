@@ -36,16 +36,39 @@ def _warnings(summary: Summary) -> Json:
 
 
 def _relighting(summary: Summary) -> Json | None:
-    figures = summary.get("relighting")
-    if not figures:
+    """Tell what predictions of photographs are worth, with materials and without."""
+    found = summary.get("relighting")
+    if not found or found["psnr_db"] is None:
         return None
-    rows = [[name, f"{value:.2f} dB"] for name, value in figures["psnr_db"].items()]
-    columns = [{"title": "prediction", "kind": "text"}, {"title": "PSNR", "kind": "number"}]
+    held_out = found["photographs"] == "held out"
+    rows = [
+        [one["name"], _decibels(one["psnr_db"]), _decibels(one["psnr_matte_db"])]
+        for one in ({"name": "mean", **found}, *found["views"])
+    ]
+    columns = [
+        {"title": "photograph", "kind": "name"},
+        {"title": "PSNR with materials, dB", "kind": "number"},
+        {"title": "matte, dB", "kind": "number"},
+        {"title": "", "kind": "text"},
+    ]
+    materials = "; ".join(
+        f"{100 * one['vertices']:.0f} % metallic {one['metallic']:.2g}, roughness "
+        f"{one['roughness']:.2g}, specular {one['specular']:.2g}"
+        for one in found["materials"]
+    )
+    whose = "held out of the run" if held_out else "that the surface was made from"
+    textured = _decibels(found.get("psnr_textured_db"))
+    whose += f"; with the asset's textures {textured} dB on average" if textured else ""
     return {
         "title": "Photographs predicted from the surface",
-        "text": figures["of"],
-        "table": {"columns": columns, "rows": rows},
+        "folded": True,
+        "text": f"Each under its own fitted light, of photographs {whose}. Materials: {materials}.",
+        "table": {"columns": columns, "rows": [[*row, ""] for row in rows]},
     }
+
+
+def _decibels(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
 
 
 def _stages(summary: Summary) -> Json:

@@ -53,6 +53,7 @@ def _prediction(predicted: Prediction, longest: int) -> Json:
 def _light(light: ViewLights) -> Json:
     return {
         "direction": light.direction_world[0].tolist(),
+        "closeness": float(light.closeness[0]),
         "directed": _three(light.directed[0]),
         "ambient": _three(light.ambient[0]),
     }

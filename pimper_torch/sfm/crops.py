@@ -226,7 +226,6 @@ def cut(
     """Cut the pictures of some views: their lenses and observations follow, as another camera's.
 
     Args:
-        views: Their numbers.
         size: Width and height of what is cut out.
         shift: Its corner, pixels of the pictures.
     """
@@ -366,7 +365,6 @@ def climbed(
     """Step to the best shift round about until none is better.
 
     Args:
-        shift: To begin with.
         step: Pixels.
         best: Chooses one of several.
         bounds: Of shifts, the smallest and the largest.

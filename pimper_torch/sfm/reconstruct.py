@@ -40,7 +40,7 @@ from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, opened, settled
-from pimper_torch.store.code import code_of
+from pimper_torch.store.code import code
 
 # Verified matches below which a pair of photographs does not count; points of the model that a view
 # must see to be added, and to stay in it (COLMAP's own); fraction of the photographs that the
@@ -260,7 +260,7 @@ class Reconstruct(Stage):
         settings = self.config.triangulation
         alone = replace(settings, features=replace(settings.features, threads=0))
         alone = replace(alone, matching=replace(alone.matching, threads=0))
-        hashed = digest(code_of(__name__), views, ways, crops, alone) if self.store else None
+        hashed = digest(code(), views, ways, crops, alone) if self.store else None
         found, _ = kept_model(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
@@ -299,7 +299,7 @@ def find_model(
     Returns:
         The model, and the seconds of wall clock in which it was found.
     """
-    hashed = digest(code_of(__name__), views, replace(config, threads=0)) if store else None
+    hashed = digest(code(), views, replace(config, threads=0)) if store else None
     key = f"reconstruct-{hashed}" if hashed else None
     return kept_model(store, key, lambda: structure_from_motion(views, config))
 
@@ -318,10 +318,11 @@ def kept_model(
     """
     kept = store.find(key, SparseModel) if store and key else None
     if kept is not None:
-        repeat_entries(kept.about["left_out"])
-        for message in kept.about["cautions"]:
+        model, told = kept
+        repeat_entries(told["left_out"])
+        for message in told["cautions"]:
             caution(message, stacklevel=3)
-        return kept.record, float(kept.about["seconds"])
+        return model, float(told["seconds"])
     began = time.perf_counter()
     with overheard() as cautions, noted_entries() as entries:
         model = settled(find())

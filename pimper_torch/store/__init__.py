@@ -1,7 +1,6 @@
 """Records kept on disk under a hash of all that they depend on."""
 
 from pimper_torch.store.digest import digest
-from pimper_torch.store.settled import settled
-from pimper_torch.store.store import Kept, Store, opened
+from pimper_torch.store.store import Store, opened, settled
 
-__all__ = ["Kept", "Store", "digest", "opened", "settled"]
+__all__ = ["Store", "digest", "opened", "settled"]

@@ -46,24 +46,22 @@ def _described(value: object) -> object:
     """Turn a value into what JSON holds, one to one."""
     if value is None or isinstance(value, bool | int | str):
         return value
+    kind = _named(type(value))
     if isinstance(value, Tensor):
-        return {"tensor": _tensor(value)}
-    if isinstance(value, Enum):
-        return {"enum": _named(type(value)), "name": value.name}
-    if isinstance(value, nn.Module):
-        return {"module": _named(type(value)), "holds": _described(_held(value))}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        known = [field.name for field in dataclasses.fields(value) if field.compare]
-        fields = {name: getattr(value, name) for name in known}
-        return {"class": _named(type(value)), "holds": _described(fields)}
-    if isinstance(value, Mapping):
-        return {"map": [[_described(key), _described(inner)] for key, inner in value.items()]}
-    if isinstance(value, tuple | list):
-        return {type(value).__name__: [_described(inner) for inner in value]}
+        return [kind, _tensor(value)]
+    if isinstance(value, float | complex | bytes | Path | Enum):
+        return [kind, repr(value)]
     if isinstance(value, types.FunctionType):
-        return {"function": _named(value)}
-    if isinstance(value, float | complex | bytes | Path):
-        return {type(value).__name__: str(value) if isinstance(value, Path) else repr(value)}
+        return [kind, _named(value)]
+    if isinstance(value, nn.Module):
+        return [kind, _described(_held(value))]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = [field.name for field in dataclasses.fields(value) if field.compare]
+        return [kind, *((name, _described(getattr(value, name))) for name in fields)]
+    if isinstance(value, Mapping):
+        return ["map", *((_described(key), _described(inner)) for key, inner in value.items())]
+    if isinstance(value, tuple | list):
+        return [kind, *map(_described, value)]
     raise _UnknownError
 
 
@@ -74,8 +72,7 @@ def _held(module: nn.Module) -> dict[str, object]:
         for name, value in vars(module).items()
         if not name.startswith("_") and name != "training"
     }
-    parts = (module.named_parameters(recurse=False), module.named_buffers(recurse=False))
-    return own | dict(parts[0]) | dict(parts[1]) | dict(module.named_children())
+    return own | module._parameters | module._buffers | module._modules
 
 
 def _named(thing: type | types.FunctionType) -> str:

@@ -13,7 +13,7 @@ from pimper_torch.outputs.marker import STAGES
 from pimper_torch.records import CoarseMesh, Mesh, Surface
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.store import Store
-from pimper_torch.viewer.results import COARSE, RESULT
+from pimper_torch.viewer.results import COARSE, RESULT, add_lights
 from pimper_torch.viewer.viewer import Viewer
 
 _KEPT: Mapping[str, type[CoarseMesh] | type[Surface]] = {
@@ -49,7 +49,7 @@ def add_result(viewer: Viewer, result: Result, passes: tuple[tuple[str, Mesh], .
     scale = result.summary.get("scale")
     if isinstance(scale, Mapping):
         viewer.unit = str(scale["unit"])
-    viewer.set_lights(names, result.lights_world)
+    add_lights(viewer, result.mesh, scene, result.silhouettes)
     viewer.add_cameras(
         names, scene.cameras, scene.points_world, names.index(result.reference), scene.views
     )
@@ -68,7 +68,10 @@ def _add_without_photographs(viewer: Viewer, path: Path, error: InputError) -> N
         summary = read_json(file, "figures of a result") if file.is_file() else {}
         place = names.index(reference) if reference in names else 0
         points = read_model(path / "sparse").points_world
-        viewer.set_lights(names, estimate.lights_world)
+        if estimate.lights_world is not None:
+            directed = estimate.lights_world[:, 1:]
+            ambient = estimate.lights_world[:, 0].clamp_min(0)
+            viewer.set_lights(names, directed, ambient / (ambient + directed.norm(dim=1)))
         viewer.add_cameras(names, estimate.cameras, points, place)
         for name, mesh in passes_kept(path, summary):
             vertices = mesh.vertices_world.double()
@@ -96,8 +99,9 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
         read = None if cls is None else kept.find(key, cls)
         if read is None:
             continue
-        mesh = read.record.mesh
-        for place in _places(stages, read.about["reports"]):
+        record, about = read
+        mesh = record.mesh
+        for place in _places(stages, about["reports"]):
             error = mesh.expected_error
             found[place] = mesh.replace(
                 vertices_world=factor * mesh.vertices_world,

@@ -11,7 +11,7 @@ from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh, Record
 from pimper_torch.viewer.frame import Frame
 from pimper_torch.viz.heatmap import ErrorScale, error_picture
-from pimper_torch.viz.maps import albedo_scale, normal_colors
+from pimper_torch.viz.maps import base_color, normal_colors
 
 LAYERS = ("lit", "shape", "albedo", "normals", "expected error", "support")
 _FIELDS = {"lit": "albedo", "albedo": "albedo"}
@@ -52,14 +52,11 @@ def painted(mesh: Mesh, name: str, frame: Frame, unit: str = "scene units") -> L
         mesh: On the CPU.
         name: One of :func:`layers_of`.
         frame: In which normals have colours.
-        unit: Of its vertices.
     """
     own = vertex_normals(mesh.vertices_world, mesh.faces)
     carried = own if mesh.normals_world is None else mesh.normals_world
-    albedo = own if mesh.albedo is None else albedo_scale(mesh) * mesh.albedo.clamp_min(0)
-    legend = ""
     if name in ("lit", "albedo"):
-        colors = albedo.nan_to_num(0).clamp(0, 1).expand(-1, 3)
+        colors = base_color(mesh).expand(-1, 3)
         legend = "Albedo under the light." if name == "lit" else "Share of light it reflects."
     elif name == "shape":
         colors = torch.full_like(own, _CLAY)

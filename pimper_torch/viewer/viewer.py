@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.errors import InputError
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
-from pimper_torch.viewer.glb import glb_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 from pimper_torch.viewer.photographs import small_pictures
 from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server
@@ -47,7 +47,7 @@ class Viewer:
         self._frame: Frame | None = None
         self._passes: list[tuple[str, Mesh]] = []
         self._stands: dict[str, Stand] = {}
-        self._lights: dict[str, Float[Tensor, " 4"]] = {}
+        self._lights: dict[str, tuple[Float[Tensor, " 3"], float]] = {}
         scene = server.scene
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
@@ -169,16 +169,20 @@ class Viewer:
                 self._pass.value = last  # paints
 
     def set_lights(
-        self, names: Sequence[str], lights_world: Float[Tensor, "view 4"] | None
+        self,
+        names: Sequence[str],
+        directions_world: Float[Tensor, "view 3"],
+        ambient: Float[Tensor, " view"],
     ) -> None:
         """Know the light of photographs, which choosing one of them sets.
 
         Args:
-            lights_world: First-order harmonics; NaN where unknown.
+            directions_world: Towards it; a photograph of which it is NaN or zero has none.
+            ambient: Share of light that comes from everywhere.
         """
-        for name, light in zip(names, () if lights_world is None else lights_world, strict=False):
-            if bool(light.isfinite().all()) and float(light[1:].norm()) > 0:
-                self._lights[name] = light.detach().cpu().double()
+        for name, towards, share in zip(names, directions_world, ambient.tolist(), strict=True):
+            if float(towards.norm()) > 0:
+                self._lights[name] = (towards, share)
 
     def choose(self, name: str, client: "ClientHandle | None" = None) -> None:
         """Set the light of a photograph, and stand where it was taken.
@@ -201,11 +205,10 @@ class Viewer:
             with one.atomic():
                 _stand_at(one.camera, self._stands[name])
         if name in self._lights and self._frame is not None:
-            ambient = max(0.0, float(self._lights[name][0]))
-            x, y, z = self._frame.directions(self._lights[name][None, 1:])[0].tolist()
+            towards, self._ambient.value = self._lights[name]
+            x, y, z = self._frame.directions(towards[None])[0].tolist()
             self._azimuth.value = math.degrees(math.atan2(y, x))
             self._elevation.value = math.degrees(math.atan2(z, math.hypot(x, y)))
-            self._ambient.value = ambient / (ambient + math.hypot(x, y, z))
 
     def _add_controls(self) -> None:
         gui, scene = self.server.gui, self.server.scene
@@ -249,12 +252,15 @@ class Viewer:
             wanted = self._layer.value
             there = wanted in layers_of(mesh)
             layer = painted(mesh, wanted if there else "shape", self._frame, self.unit)
-            data = glb_of(
-                self._frame.points(mesh.vertices_world),
-                self._frame.directions(layer.normals_world),
-                layer.colors,
-                mesh.faces,
-                lit=layer.lit,
+            attributes = {
+                "POSITION": self._frame.points(mesh.vertices_world),
+                "NORMAL": self._frame.directions(layer.normals_world),
+                "COLOR_0": layer.colors,
+            }
+            data = gltf_of(
+                {key: values.numpy() for key, values in attributes.items()},
+                mesh.faces.numpy(),
+                MATTE if layer.lit else MATTE | {"extensions": {"KHR_materials_unlit": {}}},
             )
             self.server.scene.add_glb("/surface", data, visible=self._surface.value)
             legend = layer.legend if there else f'It has no layer "{wanted}": grey clay.'

@@ -98,8 +98,13 @@ def albedo_scale(mesh: Mesh) -> float:
     return float(0.9 / known.kthvalue(rank).values)
 
 
-def base_color(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
-    """Return a mesh's albedo in [0, 1], linear: glTF's base colour; grey where it has none."""
+def base_color(mesh: Mesh, scale: float | None = None) -> Float[Tensor, "vertex channel"]:
+    """Return a mesh's albedo in [0, 1], linear: glTF's base colour; grey where it has none.
+
+    Args:
+        scale: Of the albedo; :func:`albedo_scale` without.
+    """
     if mesh.albedo is None:
         return torch.full_like(mesh.vertices_world, _GREY)
-    return (albedo_scale(mesh) * mesh.albedo.detach()).nan_to_num(0).clamp(0, 1)
+    scale = albedo_scale(mesh) if scale is None else scale
+    return (scale * mesh.albedo.detach()).nan_to_num(0).clamp(0, 1)

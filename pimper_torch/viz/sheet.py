@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 TITLE = "pimper_torch sheet of markers"
 """Of the PDF; tells that a file was written here."""
 
-_MAX_BYTES = 1 << 20
 _MM_PER_INCH = 25.4
 _RULER_MM = 100
 # White cells are drawn along rows and along columns: viewers leave hairlines between shapes that
@@ -71,15 +70,6 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     for line, text in enumerate(sentences):
         axes.text(width / 2, height / 2 + 14 + 5 * line, text, ha="center", fontsize=8)
     return figure
-
-
-def is_sheet(path: Path | str) -> bool:
-    """Return whether a file is a sheet that was written here."""
-    path = Path(path)
-    try:
-        return path.stat().st_size < _MAX_BYTES and TITLE.encode() in path.read_bytes()
-    except OSError:
-        return False
 
 
 def _draw_marker(axes: Any, code: int, left: float, top: float, side: float) -> None:  # noqa: ANN401

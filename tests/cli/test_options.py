@@ -26,16 +26,17 @@ RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
         "--faces all --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
-        "--preset {preset} --reference view_002 --max-size-px 48 --overwrite "
+        "--hold-out 2 --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
-        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view"
+        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
-        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view",
+        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view "
+        "--hold-out 0",
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -61,6 +62,7 @@ RUNS = {
         "--trimmed-fraction 0.1 --icp-distance point",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
         "{told} {true_mesh} --samples 500 --calibration {out}.png --overwrite",
+        "{result} {scene} --samples 500 --report {out}.html --overwrite",
     ],
     "bench": [
         "--out {out} --scale quick --scenes {scene} --methods smoothed --masks --cameras true "
@@ -108,7 +110,9 @@ def world(tmp_path_factory, dtu):
     lights = [{"name": f"view_{index:03d}.png", "light": [1, 0, 0, 1]} for index in range(6)]
     (result / "lights.json").write_text(json.dumps({"views": lights}))
     (result / "config.yaml").write_text("photographs: {response: srgb}\n")
-    (result / "summary.json").write_text("{}")
+    summary = {"photographs": str(scene / "photos"), "stages": [], "seconds": 1.0}
+    summary |= {"peak_memory_mb": None, "left_out": [], "failures": []}
+    (result / "summary.json").write_text(json.dumps(summary))
     return {
         "result": result,
         "ball": folder / "ball.ply",
@@ -275,7 +279,7 @@ def other_values(leaf):
     elif isinstance(value, str):
         yield from ("SIMPLE_PINHOLE", "other", "2GB")
     elif isinstance(value, int):
-        yield from (value + 1, value - 1)
+        yield from (value + 1, value - 1, value + 2)
     else:
         yield from (0.9 * value, 1.1 * value, 0.25, value + 1)
 

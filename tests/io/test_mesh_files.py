@@ -69,6 +69,7 @@ def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path
     found = read_mesh(tmp_path / "out" / f"mesh.{suffix}")
     corners = found.vertices_world[found.faces]
     assert_close(corners, mesh.vertices_world[mesh.faces].double(), atol=1e-7, rtol=0)
+    assert (tmp_path / "out" / "asset.obj").exists() == (suffix == "obj")
     if suffix == "obj":
         scaled = (mesh.albedo * albedo_scale(mesh)).clamp(0, 1).double().expand(-1, 3)
         assert_close(found.albedo, scaled, atol=0.005, rtol=0)
@@ -93,6 +94,9 @@ def test_far_from_the_origin_an_obj_stands_there_and_an_stl_tells_the_offset(
     vertices = half_ball().vertices_world
     obj = read_mesh(tmp_path / "out" / "mesh.obj").vertices_world
     assert_close(obj - shift, vertices.double(), atol=1e-5, rtol=0)
+    for name in ("asset.obj", "asset.glb"):
+        placed = read_mesh(tmp_path / "out" / name).vertices_world
+        assert_close(placed.mean(dim=0), obj.mean(dim=0), atol=0.05, rtol=0)
     header = (tmp_path / "out" / "mesh.stl").read_bytes()[:80]
     assert header.rstrip() == b"offset 448231.0 5411923.0 312.0"
 

@@ -220,6 +220,8 @@ def half_replaced(out: Path, results: tuple[Path, ...]) -> Iterator[str]:
         if len(results) > 1:
             yield "the former result is gone"
         return
+    if not (out / ".pimper.json").exists() and (out / ".stages/new/.pimper.json").exists():
+        return  # on its way: the next run brings the rest
     if all(unlike(out, result) for result in results):
         yield "what is there is neither the former result nor the new one"
     names = json.loads((out / ".pimper.json").read_text())

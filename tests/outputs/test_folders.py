@@ -11,13 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from pimper_torch.errors import InputError, OutputError, PimperWarning
-from pimper_torch.outputs import exchange as exchange_module
-from pimper_torch.outputs import workspace as workspace_module
-from pimper_torch.outputs.exchange import exchange
+from pimper_torch.errors import InputError, OutputError
+from pimper_torch.outputs.clean import clean_output
 from pimper_torch.outputs.folders import held_output, prepare_output, require_apart, written_whole
-from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written, seal
-from pimper_torch.outputs.workspace import READY, leftovers
+from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
 
 
 def held(folder: Path) -> list[str]:
@@ -74,7 +71,6 @@ def test_the_marker_lists_what_was_written(out):
     marker = read_marker(out)
     assert marker.kind == "result"
     assert set(marker.files) == {"mesh.ply", "sparse/cameras.bin", "masks/a.png"}
-    assert set(marker.folders) == {"sparse", "masks"}
     assert marker.files["mesh.ply"].size == len("first mesh.ply")
     assert foreign(out, marker) == []
     assert held(out) == [MARKER, "masks", "mesh.ply", "sparse"]
@@ -153,16 +149,9 @@ def test_a_folder_of_another_kind_is_not_replaced(out):
         lambda content: content | {"kind": "letters"},
         lambda content: content | {"files": ["mesh.ply"]},
         lambda content: content | {"files": {"mesh.ply": [1]}},
-        lambda content: content | {"files": {"mesh.ply": [1, 2, 3]}},
-        lambda content: content | {"files": {"../mine.txt": content["files"]["mesh.ply"]}},
-        lambda content: content | {"files": {"/etc/passwd": content["files"]["mesh.ply"]}},
-        lambda content: content | {"files": {"a//b": content["files"]["mesh.ply"]}},
-        lambda content: content | {"files": {f"{STAGES}/lock": content["files"]["mesh.ply"]}},
-        lambda content: content | {"folders": [3]},
-        lambda content: content | {"folders": ["sparse/.."]},
     ],
 )
-def test_a_marker_that_is_wrong_or_leads_elsewhere_is_not_believed(out, change):
+def test_a_marker_that_is_wrong_is_not_believed(out, change):
     content = json.loads((out / MARKER).read_text())
     (out / MARKER).write_text(json.dumps(change(content)))
     assert read_marker(out) is None
@@ -174,6 +163,20 @@ def test_a_marker_that_is_wrong_or_leads_elsewhere_is_not_believed(out, change):
 def test_a_marker_that_is_no_json_is_not_believed(out, text):
     (out / MARKER).write_bytes(text.encode("utf-8", "surrogateescape"))
     assert read_marker(out) is None
+
+
+@pytest.mark.parametrize(
+    "name", ["../mine.txt", "sparse/../../mine.txt", "{}/mine.txt", ".stages/lock"]
+)
+def test_a_list_that_leads_elsewhere_removes_nothing_there(out, name):
+    mine, content = out.parent / "mine.txt", json.loads((out / MARKER).read_text())
+    mine.write_text("years of work")
+    about = mine.stat()
+    listed = content["files"] | {name.format(out.parent): (about.st_size, about.st_mtime_ns, "")}
+    (out / MARKER).write_text(json.dumps(content | {"files": listed}))
+    write(out, result("second"), overwrite=True)
+    assert contents(out) == result("second")
+    assert mine.read_text() == "years of work"
 
 
 def test_only_what_the_list_names_is_removed(out):
@@ -188,8 +191,7 @@ def test_kept_stages_survive_a_replacement_without_a_copy(out):
     for overwrite in (False, True):
         folder = out if overwrite else out.with_name("fresh")
         (folder / STAGES).mkdir(parents=True)
-        fill(folder / STAGES, {"mesh.pt": "kept"})
-        seal(folder / STAGES, "stages")
+        fill(folder / STAGES, {"mesh.pt": "kept", "lock": ""})
         number = (folder / STAGES / "mesh.pt").stat().st_ino
         write(folder, result("second"), overwrite=overwrite)
         assert (folder / STAGES / "mesh.pt").stat().st_ino == number
@@ -205,21 +207,6 @@ def test_a_folder_of_stages_that_is_not_ours_is_refused(tmp_path):
     (tmp_path / "linked" / STAGES).symlink_to(tmp_path / "out" / STAGES)
     with pytest.raises(OutputError, match="which pimper did not make"):
         prepare_output(tmp_path / "linked", "result")
-
-
-def test_the_former_result_is_whole_until_the_new_one_is(out, monkeypatch):
-    """Whenever folders change their names, one of the two results stands in the place."""
-    seen, change = [], workspace_module.exchange
-
-    def watched(one, other, spare):
-        seen.append(contents(out))
-        change(one, other, spare)
-        seen.append(contents(out))
-
-    monkeypatch.setattr(workspace_module, "exchange", watched)
-    write(out, result("second"), overwrite=True)
-    first, second = result("first", "masks/a.png"), result("second")
-    assert seen == [first, second, second, second]
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
@@ -246,88 +233,83 @@ def test_a_disk_that_is_full_while_the_list_is_written_changes_nothing(out, monk
     assert held(out.parent) == ["out"]
 
 
-def test_folders_change_their_names_also_one_by_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(exchange_module, "_call", lambda: None)
-    (tmp_path / "one").mkdir()
-    (tmp_path / "other").mkdir()
-    (tmp_path / "one" / "a").touch()
-    exchange(tmp_path / "one", tmp_path / "other", tmp_path / "spare")
-    assert (held(tmp_path / "one"), held(tmp_path / "other")) == ([], ["a"])
-    assert held(tmp_path) == ["one", "other"]
-    with pytest.raises(OSError, match="nowhere"):
-        exchange(tmp_path / "one", tmp_path / "nowhere", tmp_path / "spare")
-    assert held(tmp_path) == ["one", "other"]
+KILLED_AT_EVERY_STEP = """
+import os, shutil, signal, sys
+from pathlib import Path
+from pimper_torch.outputs.folders import held_output, written_whole
+folder, overwrite = Path(sys.argv[1]), len(sys.argv) > 2
+first = {"mesh.ply": "first", "masks/a.png": "the same", "masks/b.png": "first"}
+second = {"mesh.ply": "second", "masks/a.png": "the same", "lights/all/c.json": "second"}
+
+def write(files):
+    with held_output(folder, "result", overwrite=True):
+        (folder / ".stages" / "mesh.pt").write_text("kept")
+        with written_whole(folder, "result", overwrite=True) as filled:
+            for name, text in files.items():
+                (filled / name).parent.mkdir(parents=True, exist_ok=True)
+                (filled / name).write_text(text)
+
+def contents():
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != ".pimper.json"]
+    names = {path: path.relative_to(folder).as_posix() for path in files}
+    return {name: path.read_text() for path, name in names.items() if name[:7] != ".stages"}
+
+def die_before(step):
+    count = 0
+    def hear(event, given):
+        nonlocal count
+        if event in ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "open"):
+            count += 1
+            if count == step:
+                os.kill(os.getpid(), signal.SIGKILL)
+    sys.addaudithook(hear)
+
+status, step, seen = 1, 0, set()
+while status:
+    step += 1
+    shutil.rmtree(folder, ignore_errors=True)
+    if overwrite:
+        write(first)
+    child = os.fork()
+    if child == 0:
+        die_before(step)
+        write(second)
+        os._exit(0)
+    status = os.waitpid(child, 0)[1]
+    assert status in (0, signal.SIGKILL), status
+    if (folder / ".pimper.json").exists():  # whole: the former result, or the new one
+        assert contents() in ([first, second] if overwrite else [second]), step
+        seen.add(contents()["mesh.ply"])
+    elif not (folder / ".stages" / "new" / ".pimper.json").exists():
+        assert not overwrite and contents() == {}, step
+    else:  # whole, and on its way
+        with held_output(folder, "result", overwrite=True):
+            assert contents() == second, step
+        seen.add("on its way")
+    write(second)
+    assert contents() == second, step
+    assert sorted(os.listdir(folder / ".stages")) == ["lock", "mesh.pt"], step
+print(step, *sorted(seen))
+"""
 
 
-def busy(*_):
-    raise OSError(errno.EBUSY, "Device or resource busy")
-
-
-def test_a_folder_that_cannot_be_renamed_is_filled(out, monkeypatch):
-    monkeypatch.setattr(workspace_module, "exchange", busy)
-    number = out.stat().st_ino
-    write(out, result("second", "lights.json"), overwrite=True)
-    assert out.stat().st_ino == number
-    assert contents(out) == result("second", "lights.json")
-    assert held(out) == [MARKER, "lights.json", "mesh.ply", "sparse"]
-    assert held(out.parent) == ["out"]
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_run_killed_before_any_step_leaves_a_whole_result(tmp_path, overwrite):
+    """A folder with its list is whole; where the list is missing, the next run brings the rest."""
+    given = [str(tmp_path / "out"), *["overwrite"] * overwrite]
+    line = [sys.executable, "-c", KILLED_AT_EVERY_STEP, *given]
+    ran = subprocess.run(line, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    steps, *seen = ran.stdout.split(" ", 1)
+    assert int(steps) > 30
+    assert seen == ["first on its way second\n" if overwrite else "on its way second\n"]
 
 
 def test_the_folder_where_one_is_stays_the_folder_where_one_is(out, monkeypatch):
     monkeypatch.chdir(out)
     write(Path(), result("second"), overwrite=True)
     assert contents(Path()) == contents(out) == result("second")
-
-
-def test_a_filling_that_was_cut_off_goes_on(out, monkeypatch):
-    """Whichever renaming was the last one, the next run brings the new result to its place."""
-    monkeypatch.setattr(workspace_module, "exchange", busy)
-    new = result("second", "lights.json", "truth/a.txt")
-    rename, count = Path.rename, 0
-
-    def cut_off(path, target):
-        nonlocal count
-        if path.parent.name == READY:
-            if count == 0:
-                raise KeyboardInterrupt
-            count -= 1
-        return rename(path, target)
-
-    for moved in range(4):
-        folder = out.with_name(f"out{moved}")
-        shutil.copytree(out, folder)
-        count = moved
-        with monkeypatch.context() as patched:
-            patched.setattr(Path, "rename", cut_off)
-            with pytest.raises(KeyboardInterrupt):
-                write(folder, new, overwrite=True)
-        assert (folder / STAGES / READY).is_dir()
-        with held_output(folder, "result", overwrite=True):
-            assert contents(folder) == new
-        assert foreign(folder, read_marker(folder)) == []
-        assert held(folder) == [MARKER, "lights.json", "mesh.ply", "sparse", "truth"]
-
-
-def test_a_folder_that_may_be_written_though_the_one_above_may_not_is_filled(tmp_path, monkeypatch):
-    (tmp_path / "out").mkdir()
-    mkdir = Path.mkdir
-
-    def refuse(path, *given, **named):
-        if path.parent == tmp_path:  # root may write anywhere
-            raise PermissionError(13, "Permission denied")
-        return mkdir(path, *given, **named)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(
-            Path,
-            "mkdir",
-            lambda path, *given, **named: (
-                None if path == tmp_path / "out" else refuse(path, *given, **named)
-            ),
-        )
-        write(tmp_path / "out", result("first"))
-    assert contents(tmp_path / "out") == result("first")
-    assert held(tmp_path / "out") == [MARKER, "mesh.ply", "sparse"]
 
 
 HOLDS = """
@@ -363,15 +345,13 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(out, tmp_path):
                 told = str(refused.value)
                 assert f"process {process.pid} on {os.uname().nodename} since 20" in told
                 assert "sleep" in told  # its command
-                (left,) = [p for p in folder.parent.iterdir() if p.name.startswith(".pimper-")]
-                assert leftovers(folder.resolve()) == []  # it is alive
             finally:
                 process.kill()
-        assert leftovers(folder.resolve()) == [left]
+        assert (folder / STAGES / "new" / "mesh.ply").read_text() == "half"
         write(folder, result("second"), overwrite=True)
         assert contents(folder) == result("second")
         assert (folder / STAGES / "mesh.pt").read_text() == "kept"
-        assert not left.exists()
+        assert held(folder / STAGES) == ["lock", "mesh.pt"]
 
 
 def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):
@@ -392,88 +372,39 @@ def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):
     assert contents(tmp_path / "out") == result("first")
 
 
-def test_a_run_killed_between_two_renamings_leaves_the_new_result(out, monkeypatch):
-    monkeypatch.setattr(exchange_module, "_call", lambda: None)
-    rename, new = Path.rename, result("second")
-    fill(out / STAGES, {"mesh.pt": "kept"})
-    seal(out / STAGES, "stages")
-
-    def cut_off(path, target):
-        if path.name == "new":
-            raise KeyboardInterrupt
-        if path.name == "spare":
-            raise KeyboardInterrupt  # it is not put back: the process is dead
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, "rename", cut_off)
-    monkeypatch.setattr(workspace_module, "_discard", lambda space: None)
-    with pytest.raises(KeyboardInterrupt):
-        write(out, new, overwrite=True)
-    assert not out.exists()
-    monkeypatch.undo()
-    with held_output(out, "result", overwrite=True):
-        assert contents(out) == new
-    assert (out / STAGES / "mesh.pt").read_text() == "kept"
-    assert held(out.parent) == ["out"]
-
-
-def test_a_run_killed_after_the_exchange_leaves_the_new_result_and_what_was_kept(out, monkeypatch):
-    fill(out / STAGES, {"mesh.pt": "kept"})
-    seal(out / STAGES, "stages")
-    change = workspace_module.exchange
-
-    def once(one, other, spare):
-        change(one, other, spare)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(workspace_module, "exchange", once)
-    monkeypatch.setattr(workspace_module, "_discard", lambda space: None)
-    with pytest.raises(KeyboardInterrupt):
-        write(out, result("second"), overwrite=True)
-    monkeypatch.undo()
-    assert contents(out) == result("second")
-    with held_output(out, "result", overwrite=True):
-        assert (out / STAGES / "mesh.pt").read_text() == "kept"
-    assert contents(out) == result("second")
-    assert held(out.parent) == ["out"]
-
-
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
-def test_a_file_that_comes_while_a_result_is_replaced_is_kept(out, monkeypatch):
-    change = workspace_module.exchange
-
-    def meanwhile(one, other, spare):
-        (one / "letter.txt").write_text("dear") if one == out else None
-        change(one, other, spare)
-
-    monkeypatch.setattr(workspace_module, "exchange", meanwhile)
-    with pytest.warns(PimperWarning, match="came into"):
-        write(out, result("second"), overwrite=True)
-    assert contents(out) == result("second")
-    (kept,) = out.parent.rglob("letter.txt")
-    assert kept.read_text() == "dear"
-
-
 def test_a_file_that_comes_during_the_run_does_not_cost_the_result(out):
     (out.parent / "out-2").touch()
     with (
         pytest.raises(OutputError, match=r"letter\.txt.* The new result is in .*out-3\."),
         written_whole(out, "result", overwrite=True) as filled,
     ):
-        fill(filled, result("second") | {"../../out/letter.txt": "dear"})
+        fill(filled, result("second") | {"../../letter.txt": "dear"})
     assert contents(out) == result("first", "masks/a.png") | {"letter.txt": "dear"}
     assert contents(out.parent / "out-3") == result("second")
     write(out.parent / "out-3", result("third"), overwrite=True)  # it has its list
 
 
-def test_a_hidden_folder_of_such_a_name_that_is_not_ours_stays(out):
-    for name, note in ((".pimper-00000000", None), (".pimper-00000001", "{}"), (".pimper-a", None)):
-        (out.parent / name).mkdir()
-        (out.parent / name / "thesis.tex").write_text("years of work")
-        if note is not None:
-            (out.parent / name / "note.json").write_text(note)
-    write(out, result("second"), overwrite=True)
-    assert len(list(out.parent.rglob("thesis.tex"))) == 3
+def test_a_result_that_cannot_be_put_aside_waits_until_its_folder_is_free(out, monkeypatch):
+    rename = Path.rename
+
+    def refuse(path, target):
+        if target == out.parent / "out-2":
+            raise OSError(errno.EXDEV, "Invalid cross-device link")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with (
+        pytest.raises(OutputError, match=rf"letter\.txt.* The new result is in .*{STAGES}/new\."),
+        written_whole(out, "result", overwrite=True) as filled,
+    ):
+        fill(filled, result("second") | {"../../letter.txt": "dear"})
+    with pytest.raises(OutputError, match=r"letter\.txt"):
+        clean_output(out)
+    assert (out / STAGES / "new" / "mesh.ply").exists()
+    (out / "letter.txt").unlink()
+    clean_output(out)
+    assert contents(out) == result("second")
+    assert held(out) == [MARKER, "mesh.ply", "sparse"]
 
 
 def test_a_folder_that_was_made_for_a_run_that_wrote_nothing_is_removed(tmp_path):
@@ -539,11 +470,9 @@ def test_a_full_disk_and_a_mount_point(tmp_path):
 
 
 def test_what_a_run_left_that_was_killed_in_its_first_moment_is_ours(tmp_path):
-    """Before it had marked the folder of stages, and before it had noted whose its folder is."""
-    fill(tmp_path / "out" / STAGES, {"lock": "", f"{MARKER}.new": "{"})
-    bare = tmp_path / ".pimper-0123abcd"
-    fill(bare, {"note.json.new": "{", "lock": ""})
-    os.utime(bare, (0, 0))
+    (tmp_path / "out" / STAGES).mkdir(parents=True)
     write(tmp_path / "out", result("first"))
-    assert held(tmp_path) == ["out"]
-    assert held(tmp_path / "out") == [MARKER, "mesh.ply", "sparse"]
+    fill(tmp_path / "other" / STAGES, {"lock": "", "new/mesh.ply": "half"})
+    write(tmp_path / "other", result("first"))
+    for name in ("out", "other"):
+        assert held(tmp_path / name) == [MARKER, "mesh.ply", "sparse"]

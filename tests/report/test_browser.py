@@ -15,13 +15,14 @@ from pimper_torch.asset.make import textured
 from pimper_torch.asset.write import write_asset
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes
+from pimper_torch.relighting.held_out import Judged, Relighting
 from pimper_torch.relighting.materials import Materials
 from pimper_torch.relighting.predict import predict
 from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.viz.maps import base_color, view_maps
-from tests.relighting.ball import ball_mesh, photographed
+from tests.relighting.ball import SIDE, ball_mesh, photographed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 sync_api = pytest.importorskip("playwright.sync_api")
@@ -49,20 +50,21 @@ def shown(tmp_path_factory):
     mesh = mesh.replace(
         expected_error=0.01 + 0.005 * mesh.vertices_world[:, 2], confidence=torch.ones(count)
     )
-    metallic, roughness, specular = torch.tensor(GLOSSY)[:, None].unbind()
-    materials = Materials(
-        cluster=torch.zeros(count, dtype=torch.long),
-        metallic=metallic,
-        roughness=roughness,
-        specular=specular,
+    materials = Materials.of(torch.zeros(count, dtype=torch.long), torch.tensor([GLOSSY]))
+    worth = Judged(
+        psnr_db=torch.full((scene.views.num_views,), 31.0), lights=lights, names=scene.views.names
+    )
+    relighting = Relighting(
+        lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
     )
     folder = tmp_path_factory.mktemp("page")
     asset = textured(mesh, mesh, materials.at_vertices())
     write_asset(asset, folder / "asset.glb")
     views = scene.views.num_views
-    y, x = torch.meshgrid(torch.arange(120) - 59.5, torch.arange(120) - 59.5, indexing="ij")
+    across = torch.arange(SIDE) + 0.5 - SIDE / 2
+    y, x = torch.meshgrid(across, across, indexing="ij")
     silhouettes = Silhouettes(
-        inside=(torch.hypot(x, y) < 49.5).float().expand(views, 120, 120),
+        inside=(torch.hypot(x, y) < 0.41 * SIDE).float().expand(views, SIDE, SIDE),
         reliable=torch.ones(views, dtype=torch.bool),
         source="found",
     )
@@ -74,7 +76,7 @@ def shown(tmp_path_factory):
         scene=scene,
         silhouettes=silhouettes,
         reference=0,
-        predictions=predictions(mesh, scene, lights, materials, ["31.0 dB"] * views),
+        predictions=predictions(mesh, scene, relighting),
         layers=surface_layers(asset.mesh),
         summary=SUMMARY,
         settings="zeta: 0.5",
@@ -112,7 +114,7 @@ def opened(browser, shown):
 
 def opening(page, path):
     page.goto(path.as_uri())
-    page.wait_for_function("document.documentElement.dataset.ready", timeout=30_000)
+    page.wait_for_selector("html[data-ready]", state="attached", timeout=60_000)
 
 
 def choose(page, layer):
@@ -140,7 +142,7 @@ def photograph_of(picture):
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     square = Image.fromarray(picture[top : top + side, left : left + side].astype(np.uint8))
-    return np.asarray(square.resize((120, 120), Image.Resampling.BOX)).astype(float)
+    return np.asarray(square.resize((SIDE, SIDE), Image.Resampling.BOX)).astype(float)
 
 
 def inner(scene, mesh, view):
@@ -301,7 +303,7 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     page.locator("#trouble").wait_for(state="visible")
     assert "cannot be drawn here" in page.locator("#trouble").inner_text()
     page.locator("#thumbnails button").first.click()
-    assert page.locator("#prediction img").is_visible()
+    page.locator("#prediction img").wait_for(state="visible")
     assert page.get_by_role("heading", name="Stages").is_visible()
     plain.close()
 

@@ -11,7 +11,9 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.relighting.held_out import Judged, Relighting
 from pimper_torch.relighting.lights import ViewLights
+from pimper_torch.relighting.materials import Materials
 from pimper_torch.report.layers import Layer
 from pimper_torch.report.page import write_page
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
@@ -19,6 +21,7 @@ from pimper_torch.report.predictions import Prediction, predictions
 from pimper_torch.report.sections import section_entries
 from pimper_torch.report.views import view_entries
 
+MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
 SUMMARY = {
     "doubt": None,
     "warnings": ["two photographs are blurred; take them again"],
@@ -111,6 +114,7 @@ def test_pinholes_are_those_of_the_run(reconstruction):
 def test_a_prediction_comes_with_its_light(reconstruction):
     light = ViewLights(
         direction_world=torch.tensor([[0.0, 0.6, 0.8]]),
+        closeness=torch.tensor([0.25]),
         ambient=torch.tensor([[0.1]]),
         directed=torch.tensor([[0.5]]),
     )
@@ -120,21 +124,32 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     )
     assert "prediction" not in first
     assert second["figure"] == "30.0 dB"
+    assert second["light"]["closeness"] == 0.25
     assert second["light"]["directed"] == pytest.approx([0.5] * 3)
     assert second["light"]["direction"] == pytest.approx([0.0, 0.6, 0.8])
     picture = decoded(second["prediction"])
     assert abs(picture.mean() - 255 * float(srgb_from_linear(torch.tensor(0.2)))) < 1.5
 
 
+def judged(names, figures, lights):
+    return Judged(psnr_db=torch.tensor(figures), lights=lights, names=names)
+
+
 def test_predictions_are_of_every_photograph(reconstruction):
-    scene = reconstruction.scene
+    scene, mesh = reconstruction.scene, reconstruction.mesh
     lights = ViewLights(
         direction_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3),
+        closeness=torch.zeros(3),
         ambient=torch.tensor([[0.1], [0.2], [0.4]]),
         directed=torch.zeros(3, 1),
     )
-    found = predictions(reconstruction.mesh, scene, lights, None, ["a", "b", "c"])
-    assert [one.figure for one in found] == ["a", "b", "c"]
+    materials = Materials.of(torch.zeros(len(mesh.vertices_world)).long(), torch.tensor([MATTE]))
+    worth = judged(scene.views.names[:2], [30.04, torch.nan], lights)
+    relighting = Relighting(
+        lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
+    )
+    found = predictions(mesh, scene, relighting)
+    assert [one.figure for one in found] == ["30.0 dB", "", ""]
     first, second, third = (one.radiance.sum() for one in found)
     assert first > 0
     assert second > 1.5 * first
@@ -187,6 +202,25 @@ def test_sections_tell_stages_guards_and_warnings():
     assert "repair" in guards["text"]
     assert sections["Settings"]["code"] == "zeta: 0.5\n"
     assert not {"Failed", "Photographs predicted from the surface"} & set(sections)
+
+
+def test_what_predictions_are_worth_is_told_with_the_materials():
+    views = [{"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}]
+    material = {"vertices": 1.0, "metallic": 0.0, "roughness": 0.35, "specular": 1.2}
+    told = {"photographs": "held out", "psnr_db": 31.0, "psnr_matte_db": 29.0, "views": views,
+            "materials": [material]}  # fmt: skip
+    sections = {one["title"]: one for one in section_entries({**SUMMARY, "relighting": told}, "")}
+    found = sections["Photographs predicted from the surface"]
+    assert "held out" in found["text"]
+    assert "roughness 0.35" in found["text"]
+    assert [row[:3] for row in found["table"]["rows"]] == [
+        ["mean", "31.00", "29.00"],
+        ["a.png", "31.00", ""],
+    ]
+    used = section_entries({**SUMMARY, "relighting": {**told, "photographs": "used"}}, "")
+    assert any("made from" in one.get("text", "") for one in used)
+    unknown = {**SUMMARY, "relighting": {**told, "psnr_db": None}}
+    assert "relighting" not in str(section_entries(unknown, "")).lower()
 
 
 def test_a_doubt_stands_first_and_failures_have_their_table():

@@ -39,9 +39,9 @@ def test_a_record_comes_back_bit_for_bit(record, tmp_path):
     store = Store(folder=tmp_path / "new" / "folder")
     assert store.find("a", Cameras) is None
     assert store.keep("a", record, {"seconds": 12.5})
-    found = store.find("a", Cameras)
-    assert found.about == {"seconds": 12.5}
-    assert digest(found.record) == digest(record)
+    found, about = store.find("a", Cameras)
+    assert about == {"seconds": 12.5}
+    assert digest(found) == digest(record)
     assert store.find("b", Cameras) is None
     assert store.find("a", StageReport) is None
 
@@ -77,14 +77,21 @@ def test_a_record_of_other_bits_than_its_hash_is_not_believed(record, tmp_path):
 
 @pytest.mark.parametrize("failing", ["a.safetensors", "a.json"])
 def test_what_was_not_written_whole_is_not_there(record, tmp_path, monkeypatch, failing):
-    store, replace = Store(folder=tmp_path), Path.replace
+    store, replace, write_text = Store(folder=tmp_path), Path.replace, Path.write_text
 
-    def fail(self, target):
+    def full(self, target):
         if Path(target).name == failing:
             raise OSError("disk full")
         return replace(self, target)
 
-    monkeypatch.setattr(Path, "replace", fail)
+    def half(self, text, **given):
+        write_text(self, text[: len(text) // 2], **given)
+        if self.name == failing:
+            assert store.find("a", Cameras) is None
+            raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr(Path, "write_text", half)
     with pytest.raises(OutputError, match="disk full"):
         store.keep("a", record)
     assert store.find("a", Cameras) is None
@@ -123,7 +130,7 @@ def test_afresh_finds_nothing_and_replaces(record, tmp_path):
     assert afresh.find("a", Cameras) is None
     afresh.keep("a", record.replace(cam_from_world=record.cam_from_world + 1))
     assert not torch.equal(
-        Store(folder=tmp_path).find("a", Cameras).record.cam_from_world, record.cam_from_world
+        Store(folder=tmp_path).find("a", Cameras)[0].cam_from_world, record.cam_from_world
     )
 
 

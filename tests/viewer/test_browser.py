@@ -19,6 +19,7 @@ PATIENCE_SECONDS = 120.0
 LARGE = 2_000  # pixels
 
 pytestmark = [
+    pytest.mark.browser,
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
 ]

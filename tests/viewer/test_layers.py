@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -7,7 +5,6 @@ import torch
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh, stand_of
-from pimper_torch.viewer.glb import glb_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 
 
@@ -121,21 +118,3 @@ def test_normals_are_coloured_as_the_reference_camera_sees_them(ball):
     three = Mesh(vertices_world=normals, faces=torch.tensor([[0, 1, 2]]), normals_world=normals)
     colors = painted(three, "normals", frame).colors
     assert colors.argmax(dim=1).tolist() == [2, 0, 1]
-
-
-def test_the_file_is_a_glb_of_the_same_surface(ball):
-    trimesh = pytest.importorskip("trimesh")
-    from io import BytesIO
-
-    colors = torch.rand(len(ball.vertices_world), 3, generator=torch.Generator().manual_seed(0))
-    data = glb_of(ball.vertices_world, ball.normals_world, colors, ball.faces, lit=False)
-    read = trimesh.load(BytesIO(data), file_type="glb", process=False, force="mesh")
-    np.testing.assert_array_equal(read.vertices, ball.vertices_world.numpy())
-    np.testing.assert_array_equal(read.faces, ball.faces.numpy())
-    assert len(data) == int.from_bytes(data[8:12], "little")
-    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
-    span = tree["bufferViews"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    start = 28 + int.from_bytes(data[12:16], "little") + span["byteOffset"]
-    shorts = np.frombuffer(data[start : start + span["byteLength"]], "<u2").reshape(-1, 4)
-    np.testing.assert_allclose(shorts[:, :3] / 65_535, colors.numpy(), atol=1e-5)

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.records import Mesh
+from pimper_torch.relighting.lights import fit_lights
 from pimper_torch.viewer import server as server_module
 from pimper_torch.viewer.results import add_found, add_outcome
 from pimper_torch.viewer.server import open_server, require_viser
@@ -97,10 +99,10 @@ def test_the_light_is_where_the_sliders_are(page):
 
 
 def test_choosing_a_photograph_sets_its_light_and_hides_its_frustum(page, reconstruction):
-    lights = torch.tensor([[0.2, 0.0, 0.0, 0.6], [torch.nan] * 4, [0.0, 0.3, 0.0, 0.3]])
+    towards = torch.tensor([[0.0, 0.0, 0.6], [torch.nan] * 3, [0.3, 0.0, 0.3]])
     names = reconstruction.scene.views.names
     page._lights.clear()
-    page.set_lights(names, lights)
+    page.set_lights(names, towards, torch.tensor([0.25, 0.0, 0.5]))
     page.choose(names[0])
     assert page._ambient.value == pytest.approx(0.25)
     wanted = page._frame.directions(torch.tensor([[0.0, 0.0, 1.0]]))[0].numpy()
@@ -146,6 +148,30 @@ def test_show_takes_what_chains_return(reconstruction):
             assert node(viewer, "/surface").visible
         finally:
             viewer.stop()
+
+
+def test_a_result_that_was_read_begins_in_its_reference_with_its_light_and_unit(reconstruction):
+    scene, mesh = reconstruction.scene, reconstruction.mesh
+    result = Result(
+        mesh=mesh.replace(expected_error=torch.full_like(mesh.confidence, 0.5)),
+        scene=scene,
+        cameras=scene.cameras,
+        silhouettes=reconstruction.silhouettes,
+        lights_world=None,
+        reference=scene.views.names[1],
+        summary={"scale": {"unit": "mm", "factor": 2.0}},
+    )
+    viewer = show(result, port=0)
+    try:
+        assert viewer._chosen.value == scene.views.names[1]
+        lights = fit_lights(mesh, scene, reconstruction.silhouettes)
+        wanted = viewer._frame.directions(lights.direction_world[1:2])[0].numpy()
+        found = np.array(viewer._sun.position)
+        np.testing.assert_allclose(found / np.linalg.norm(found), wanted, atol=1e-4)
+        viewer._layer.value = "expected error"
+        assert "0.5 mm" in viewer._about.content
+    finally:
+        viewer.stop()
 
 
 def test_show_closes_what_it_cannot_fill(tmp_path, monkeypatch):

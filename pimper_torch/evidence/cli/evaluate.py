@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -27,12 +27,14 @@ from pimper_torch.evidence.metrics.evaluate import (
     evaluate,
 )
 from pimper_torch.evidence.metrics.icp import IcpConfig
+from pimper_torch.evidence.metrics.page import write_compared_page
 from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
-from pimper_torch.outputs.files import file_written_whole, is_titled, prepare_file, says_of_itself
-from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
+from pimper_torch.outputs.files import file_written_whole, prepare_file
+from pimper_torch.records import Capture, DtuProtocol, Estimate, Mesh, Truth, Views
+from pimper_torch.report.page import HEAD
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
@@ -109,6 +111,8 @@ class Job:
         out: JSON file for all figures.
         calibration: PNG file for the calibration curve of a result that tells its expected
             error.
+        report: HTML file that shows the result in a browser with its errors; the photographs that
+            it was made from must be where they were.
         overwrite: Replace files that a former evaluation wrote, and no others.
         options: The measuring.
     """
@@ -117,6 +121,7 @@ class Job:
     truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     overwrite: Flag = False
     options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions()
 
@@ -138,18 +143,22 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         )
     truth = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
+    relighting = read_relighting(job.result)
     if not output.as_json:
-        show(evaluation, Console())
+        show(evaluation, Console(), relighting)
     _prepare_files(job)
     if job.out is not None:
-        write_report(evaluation, job)
+        write_report(evaluation, job, relighting)
         output.remark(f"{job.out} has all figures.")
     if job.calibration is not None:
         _draw(evaluation, job.calibration)
         output.remark(f"{job.calibration} is drawn.")
-    files = {"figures": job.out, "calibration": job.calibration}
+    if job.report is not None:
+        _write_page(evaluation, truth.capture.truth, job.result, job.report)
+        output.remark(f"{job.report} shows the errors.")
+    files = {"figures": job.out, "calibration": job.calibration, "report": job.report}
     paths = {name: path for name, path in files.items() if path is not None}
-    output.result(paths, figures=report(evaluation))
+    output.result(paths, figures={**report(evaluation), "relighting": relighting})
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
@@ -262,9 +271,21 @@ def mesh_capture(path: Path) -> Capture:
     )
 
 
-def show(evaluation: Evaluation, console: Console) -> None:
+def read_relighting(result: Path) -> dict[str, Any] | None:
+    """Read how near a result comes to photographs, where it tells."""
+    try:
+        summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    found: dict[str, Any] | None = summary.get("relighting")
+    return found
+
+
+def show(
+    evaluation: Evaluation, console: Console, relighting: dict[str, Any] | None = None
+) -> None:
     """Print the figures section by section, with what each says beside or below it."""
-    sections = rows(evaluation)
+    sections = rows(evaluation, relighting)
     lines = [row for _, found in sections for row in found]
     first = 2 + max(len(row.name) for row in lines)
     second = first + 2 + max(len(row.value) for row in lines)
@@ -281,7 +302,9 @@ def show(evaluation: Evaluation, console: Console) -> None:
             console.print(text, soft_wrap=True)
 
 
-def write_report(evaluation: Evaluation, job: Job) -> None:
+def write_report(
+    evaluation: Evaluation, job: Job, relighting: dict[str, Any] | None = None
+) -> None:
     """Write all figures and the settings they were made with as JSON, whole or not at all.
 
     Raises:
@@ -295,6 +318,7 @@ def write_report(evaluation: Evaluation, job: Job) -> None:
         "truth": str(job.truth),
         "settings": to_mapping(job.options),
         **report(evaluation),
+        "relighting": relighting,
     }
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     with file_written_whole(job.out) as fresh:
@@ -320,6 +344,17 @@ def _draw(evaluation: Evaluation, path: Path) -> None:
         )
 
 
+def _write_page(evaluation: Evaluation, truth: Truth, result: Path, path: Path) -> None:
+    """Write the page of a result with its errors, whole or not at all."""
+    mesh = truth.mesh
+    if mesh is None and truth.points_world is not None:
+        mesh = Mesh(vertices_world=truth.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
+    if mesh is None:
+        raise InputError("the truth has no surface, so there are no errors to show.")
+    with file_written_whole(path) as fresh:
+        write_compared_page(result, mesh, evaluation.alignment.truth_from_world, fresh)
+
+
 def _prepare_files(job: Job) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace.
 
@@ -327,6 +362,8 @@ def _prepare_files(job: Job) -> None:
         OutputError: As :func:`pimper_torch.outputs.files.prepare_file`.
     """
     if job.out is not None:
-        prepare_file(job.out, job.overwrite, lambda file: says_of_itself(file, "format", FORMAT))
+        prepare_file(job.out, job.overwrite, f'"format": "{FORMAT}"')
     if job.calibration is not None:
-        prepare_file(job.calibration, job.overwrite, lambda file: is_titled(file, TITLE))
+        prepare_file(job.calibration, job.overwrite, TITLE)
+    if job.report is not None:
+        prepare_file(job.report, job.overwrite, HEAD)

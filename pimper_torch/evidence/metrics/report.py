@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -42,8 +43,14 @@ def report(evaluation: Evaluation) -> dict[str, object]:
     return plain
 
 
-def rows(evaluation: Evaluation) -> list[tuple[str, list[Row]]]:
-    """Return the figures as a table: its sections with their rows, none of them empty."""
+def rows(
+    evaluation: Evaluation, relighting: Mapping[str, Any] | None = None
+) -> list[tuple[str, list[Row]]]:
+    """Return the figures as a table: its sections with their rows, none of them empty.
+
+    Args:
+        relighting: What ``summary.json`` of the result tells under this name.
+    """
     sections: list[tuple[str, Iterator[Row]]] = [("alignment", _alignment_rows(evaluation))]
     if evaluation.surface is not None:
         sections.append(("surface", _surface_rows(evaluation.surface)))
@@ -54,6 +61,8 @@ def rows(evaluation: Evaluation) -> list[tuple[str, list[Row]]]:
         sections.append(("cameras", _camera_rows(evaluation.cameras)))
     if evaluation.dtu is not None:
         sections.append(("DTU protocol", _dtu_rows(evaluation.dtu)))
+    if relighting is not None:
+        sections.append((f"photographs {relighting['photographs']}", _relit_rows(relighting)))
     return [(title, found) for title, lines in sections if (found := list(lines))]
 
 
@@ -218,6 +227,25 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
             value=f"{cameras.mean_position_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
             meaning="of the diagonal, that exact rays put points off: after the similarity on "
             "cameras; after the best one",
+        )
+
+
+def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[Row]:
+    meaning = "mean over {} photographs of sRGB values on the object, each under its fitted light"
+    meaning = meaning.format(len(relighting["views"]))
+    names = {
+        "psnr_db": "PSNR",
+        "psnr_matte_db": "PSNR, matte",
+        "psnr_textured_db": "PSNR, textured",
+    }
+    for key, name in names.items():
+        if (value := relighting.get(key)) is not None:
+            yield Row(name=name, value=f"{value:.2f} dB", meaning=meaning)
+    for one in relighting["materials"]:
+        yield Row(
+            name="roughness, specular, metallic",
+            value=f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}",
+            meaning=f"glTF's material of {one['vertices']:.0%} of the vertices",
         )
 
 

@@ -4,12 +4,14 @@ import pytest
 import torch
 from PIL import Image
 
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.cli.evaluate import named_as
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.meshes import read_mesh, write_ply
+from pimper_torch.io.results import write_result
 from pimper_torch.records import Capture, Estimate, Mesh, Truth, Views
 
 
@@ -44,6 +46,19 @@ def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     (line,) = [line for line in told.splitlines() if line.split()[:1] == ["accuracy"]]
     assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
     assert "rays" not in told
+
+
+def test_how_near_a_result_comes_to_photographs_is_told(ball, reconstruction, tmp_path, capsys):
+    write_result(reconstruction, CoarseToFineConfig(), tmp_path / "result")
+    out = tmp_path / "report.json"
+    assert run(tmp_path / "result", ball, "--samples", 3000, "-o", out) == 0
+    told = capsys.readouterr().out
+    figures = json.loads(out.read_text())["relighting"]
+    assert "photographs used" in told
+    assert f"{figures['psnr_db']:.2f} dB" in told
+    assert f"{figures['psnr_matte_db']:.2f} dB" in told
+    assert "mean over 3 photographs" in told
+    assert figures["materials"][0]["vertices"] == 1
 
 
 def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsys):

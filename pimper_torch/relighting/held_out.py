@@ -1,0 +1,165 @@
+"""A surface judged by photographs: predicted under their own light, at best held out ones."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.asset.bake import Textured
+from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.relighting.fit_materials import materials_under
+from pimper_torch.relighting.lights import ViewLights, lights_of
+from pimper_torch.relighting.materials import Materials
+from pimper_torch.relighting.observed import Observed, observe_all
+from pimper_torch.relighting.predict import psnr, shaded
+from pimper_torch.relighting.surface_pixels import LitSurface
+from pimper_torch.relighting.textured_surface import TexturedSurface
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Judged(Record):
+    """How near a surface comes to photographs, each under the light that suits it best.
+
+    Attributes:
+        psnr_db: Of sRGB values in [0, 1], over the object's pixels.
+        lights: That it was predicted under.
+        names: Of the photographs.
+    """
+
+    psnr_db: Float[Tensor, " view"]
+    lights: ViewLights
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Relighting(Record):
+    """The lights and materials of a result, and what they are worth.
+
+    Attributes:
+        lights: Of the photographs that the surface was made from.
+        materials: Of the mesh.
+        judged: With materials.
+        matte: Without any.
+        held_out: Whether these photographs were held out, or the surface was made from them.
+        textured: With materials, and the asset's textures in place of values of vertices.
+    """
+
+    lights: ViewLights
+    materials: Materials
+    judged: Judged
+    matte: Judged
+    held_out: bool
+    textured: Judged | None = None
+
+    def with_textures(
+        self, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
+    ) -> "Relighting":
+        """Judge the textured surface, too, under the same lights.
+
+        Args:
+            scene: Of the photographs that are judged by.
+        """
+        surface = TexturedSurface(asset)
+        observed = observe_all(surface, scene, silhouettes)
+        materials = surface.materials(self.materials)
+        found = judge(surface, observed, self.judged.names, self.judged.lights, materials)
+        return self.replace(textured=found)
+
+    def report(self) -> dict[str, object]:
+        """Return what ``summary.json`` tells."""
+        vertices = torch.bincount(self.materials.cluster, minlength=len(self.materials.metallic))
+        shares = (vertices / vertices.sum()).tolist()
+        rows = zip(shares, self.materials.values.tolist(), strict=True)
+        judged = zip(
+            self.judged.names,
+            self.judged.psnr_db.tolist(),
+            self.matte.psnr_db.tolist(),
+            strict=True,
+        )
+        return {
+            "photographs": "held out" if self.held_out else "used",
+            "psnr_db": _mean(self.judged.psnr_db),
+            "psnr_matte_db": _mean(self.matte.psnr_db),
+            "psnr_textured_db": None if self.textured is None else _mean(self.textured.psnr_db),
+            "views": [
+                {"name": name, "psnr_db": _figure(with_one), "psnr_matte_db": _figure(without)}
+                for name, with_one, without in judged
+            ],
+            "materials": [
+                {"vertices": share, "metallic": metal, "roughness": rough, "specular": specular}
+                for share, (metal, rough, specular) in rows
+            ],
+        }
+
+
+def relight(
+    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes, held_out: SparseScene | None = None
+) -> Relighting:
+    """Fit lights and materials, and predict photographs with them.
+
+    Args:
+        mesh: In the scene's frame, with albedo.
+        scene: That the mesh was made from.
+        held_out: What is predicted; without, the scene's own photographs.
+    """
+    surface = LitSurface(mesh)
+    observed = observe_all(surface, scene, silhouettes)
+    matte = lights_of(surface, observed)
+    materials = materials_under(surface, observed, matte)
+    lights = matte
+    if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
+        lights = lights_of(surface, observed, materials, matte)
+    if held_out is None:
+        names = scene.views.names
+        judged = judge(surface, observed, names, lights, materials)
+        plain = judge(surface, observed, names, matte)
+    else:
+        judged, plain = (predicted(surface, held_out, one) for one in (materials, None))
+    return Relighting(
+        lights=lights,
+        materials=materials,
+        judged=judged,
+        matte=plain,
+        held_out=held_out is not None,
+    )
+
+
+def predicted(
+    surface: Mesh | LitSurface, scene: SparseScene, materials: Materials | None = None
+) -> Judged:
+    """Fit the lights of photographs alone, and judge the surface by them.
+
+    Args:
+        surface: A mesh of any kind whose vertices carry albedo and normals, such as texels of an
+            asset.
+        scene: Photographs in the mesh's frame.
+        materials: Of the mesh; matte without.
+    """
+    lit = surface if isinstance(surface, LitSurface) else LitSurface(surface)
+    observed = observe_all(lit, scene, None)
+    lights = lights_of(lit, observed, materials)
+    return judge(lit, observed, scene.views.names, lights, materials)
+
+
+def judge(
+    surface: LitSurface,
+    observed: list[Observed],
+    names: tuple[str, ...],
+    lights: ViewLights,
+    materials: Materials | None = None,
+) -> Judged:
+    """Compare photographs with what the surface shows under lights."""
+    found = [
+        psnr(shaded(surface, seen.pixels, lights.take([view]), materials), seen.radiance)
+        for view, seen in enumerate(observed)
+    ]
+    return Judged(psnr_db=torch.tensor(found), lights=lights, names=names)
+
+
+def _mean(values: Float[Tensor, " view"]) -> float | None:
+    return _figure(float(values.nanmean()))
+
+
+def _figure(value: float) -> float | None:
+    return round(value, 3) if value == value else None

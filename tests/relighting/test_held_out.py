@@ -1,0 +1,95 @@
+import math
+
+import pytest
+import torch
+
+from pimper_torch.asset.make import textured
+from pimper_torch.chains.hold_out import held_apart
+from pimper_torch.errors import ConfigError
+from pimper_torch.records import Silhouettes
+from pimper_torch.relighting.held_out import relight
+from pimper_torch.sfm.surfaces import reduced
+from tests.relighting.ball import ball_mesh, photographed
+
+GLOSSY = (0.0, 0.3, 1.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return photographed(GLOSSY, views=6)[0]
+
+
+def test_every_nth_photograph_by_name_is_held_out(scene):
+    used, held = held_apart(scene, 3)
+    assert held.views.names == ("002", "005")
+    assert used.views.names == ("000", "001", "003", "004")
+    assert used.unregistered == held.unregistered == ()
+    assert torch.equal(held.cameras.cam_from_world, scene.cameras.cam_from_world[[2, 5]])
+    assert torch.equal(used.points_world, scene.points_world)
+
+
+def test_names_and_not_their_order_choose(scene):
+    turned = scene.replace(views=scene.views.replace(names=("5", "4", "3", "2", "1", "0")))
+    assert held_apart(turned, 3)[1].views.names == ("5", "2")
+
+
+def test_without_holding_out_the_scene_is_the_same_object(scene):
+    used, held = held_apart(scene, 0)
+    assert used is scene
+    assert held is None
+
+
+def test_what_is_needed_is_not_held_out(scene):
+    assert held_apart(scene, 3, ["005"])[1].views.names == ("002",)
+    assert held_apart(scene, 6, ["005"])[0] is scene
+
+
+def test_too_few_photographs_are_refused(scene):
+    four = photographed(GLOSSY, views=4)[0]
+    with pytest.raises(ConfigError, match="hold_out is 2; needed: a number that leaves 3 views"):
+        held_apart(four, 2)
+
+
+def test_held_out_photographs_are_predicted_better_with_their_highlights(scene):
+    used, held = held_apart(scene, 3)
+    found = relight(ball_mesh(), used, Silhouettes.everything(used.views), held)
+    report = found.report()
+    assert report["photographs"] == "held out"
+    assert [view["name"] for view in report["views"]] == ["002", "005"]
+    assert all(view["psnr_db"] > view["psnr_matte_db"] + 1 for view in report["views"])
+    assert report["psnr_db"] > 40
+    (material,) = report["materials"]
+    assert material["vertices"] == 1
+    assert abs(material["roughness"] - GLOSSY[1]) < 0.1
+
+
+def test_without_held_out_photographs_those_used_are_predicted():
+    scene = photographed((0.0, 1.0, 0.0), views=3)[0]
+    found = relight(ball_mesh(), scene, Silhouettes.everything(scene.views))
+    report = found.report()
+    assert report["photographs"] == "used"
+    assert report["psnr_db"] == report["psnr_matte_db"]
+    assert len(report["views"]) == 3
+
+
+def test_what_no_photograph_shows_has_no_figure():
+    scene = photographed((0.0, 1.0, 0.0), views=3)[0]
+    nothing = Silhouettes.everything(scene.views).replace(
+        inside=torch.zeros_like(scene.views.images[:, 0])
+    )
+    report = relight(ball_mesh(), scene, nothing).report()
+    assert report["psnr_db"] is None
+    assert not math.isnan(report["materials"][0]["roughness"])
+
+
+def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
+    full = ball_mesh()
+    few = reduced(full, 1200)
+    found = relight(few, scene, None)
+    asset = textured(full, few, found.materials.at_vertices())
+    judged = found.with_textures(asset, scene, None)
+    coarse, fine = found.judged.psnr_db.mean(), judged.textured.psnr_db.mean()
+    assert fine > coarse + 1
+    assert fine > 45  # eight bits a texel
+    assert judged.report()["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
+    assert found.report()["psnr_textured_db"] is None
