@@ -17,6 +17,7 @@ from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
+from pimper_torch.sfm.crops import find_crop
 from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -34,7 +35,6 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import (
     best_of,
     explained,
-    find_crop,
     pinholes_of,
     require_agreement,
     undistorted_pairs,
@@ -118,6 +118,8 @@ def triangulate(
         given = given if crop is None else crop
         assert given is not None, "a crop is found, or refused, where no resize is possible"
         require_agreement(given, verified, limit, where)
+        if crops and not lacks_points(given):
+            return given
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)

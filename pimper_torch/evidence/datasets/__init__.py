@@ -1,6 +1,6 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
-from pimper_torch.evidence.datasets.check import check_capture, require_consistent
+from pimper_torch.evidence.datasets.check import check_capture
 from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
 from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
@@ -39,7 +39,6 @@ __all__ = [
     "read_transforms",
     "read_uw_ps",
     "read_yale_b",
-    "require_consistent",
     "write_colmap",
     "write_idr",
     "write_transforms",
