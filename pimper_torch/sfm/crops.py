@@ -1,8 +1,8 @@
 """Photographs that were cropped since cameras were made of them, or that reach beyond the pictures.
 
 Sizes alone do not tell a crop from a resize, nor do they of camera raw, whose margins JPEG leaves
-out. Points tell a resize: what is round them agrees between views, and less so beside them. Where
-they do not, matches tell: with the right principal point they lie nearest to the epipolar lines.
+out. Points tell a resize and the usual crops: what is round them agrees between views, and less so
+beside them. Else matches tell: with the right principal point they lie nearest to epipolar lines.
 """
 
 import math
@@ -28,11 +28,11 @@ from pimper_torch.sfm.squares import (
     standard_errors,
 )
 
-# Points of each view that must agree less where photographs are shifted by so much: 4 px at least,
-# or a hundredth of the picture. Of photographs of potatoes, mug, jar and balls (8 and 12 views of
-# 240x180 and 320x240) that were cropped to 0.95 to 0.5 of their size, of the shifts about a resize
-# one at least is worse by 1.5 standard errors at most; about the truth all are by 4.9 and more.
-_POINTS, _SHARP_PX, _SHARP = 400, 4.0, 0.01
+# Points of each view that must agree less where photographs are shifted by so much. Of photographs
+# of potatoes, mug, jar and balls (8 and 12 views of 240x180 and 320x240) that were cropped to 0.95
+# to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard errors at
+# most; about the truth all are by 4.9 and more.
+_POINTS, _SHARP_PX = 400, 4.0
 # A crop explains more of the matches than this; photographs that it places beside by so much must
 # explain them worse; the last steps of the search, and how many in a row: choices.
 _EXPLAINED, _BESIDE_PX, _STEP_PX, _MOST_STEPS = 0.95, 8.0, 0.5, 12
@@ -49,25 +49,33 @@ def resize_fits(whole: Size, width: int, height: int) -> bool:
     return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
 
 
-def points_tell_a_resize(model: SparseModel, views: Views) -> bool:
-    """Return whether photographs that are shifted a little agree less round the points.
+def points_tell(
+    model: SparseModel, views: Views, changed: Sequence[int], reach_px: float = _SHARP_PX
+) -> float:
+    """Return how well photographs agree round the points; 0 where they agree as well beside them.
 
     Args:
-        model: In the pixels of the photographs, as if these were resized.
+        model: In the pixels of the photographs.
         views: The photographs.
+        changed: Numbers of those whose place is in question.
+        reach_px: How far they are shifted for comparison; then twice as far.
     """
+    if not len(model.points_world):
+        return 0.0
     chosen = longest_tracks(model, _POINTS)
-    reach = max(_SHARP_PX, _SHARP * float(views.sizes_px.max()))
-    shifts = torch.cat([torch.zeros(1, 2), reach * _around(torch.zeros(1))]).double()
+    ring = _around(torch.zeros(1, dtype=torch.float64))
+    shifts = reach_px * torch.cat([torch.zeros(1, 2), ring, 2 * ring])
     sides = sides_of(chosen, views)
     squares = torch.zeros(len(shifts), len(sides), SAMPLES)
     for view, (width, height) in enumerate(views.sizes_px.tolist()):
         here = (chosen.observation_view == view).nonzero()[:, 0]
-        centers = chosen.observation_pixels[here] + shifts[:, None]
+        centers = chosen.observation_pixels[here] + (view in changed) * shifts[:, None]
         squares[:, here] = squares_in(views.images[view, :, :height, :width], centers, sides[here])
     own = (squares * others_of(squares, chosen.observation_point)[0]).sum(dim=-1)
-    seen = own[0] != 0
-    return min(standard_errors((own[0] - one)[seen]) for one in own[1:]) > ERRORS
+    own = own[:, torch.isin(chosen.observation_view, torch.tensor(changed)) & (own[0] != 0)]
+    errors = [standard_errors(own[0] - one) for one in own[1:]]
+    told = max(min(errors[: len(ring)]), min(errors[len(ring) :])) > ERRORS
+    return float(own[0].mean()) if told else 0.0
 
 
 def possible_crops(model: SparseModel, views: Views, sizes_px: Sequence[Size]) -> list[SparseModel]:
@@ -133,8 +141,7 @@ def find_crop(
         return match_errors(model, strongest).clamp_max(max_error_px)
 
     usual = min(crops, key=lambda model: float(errors(model).mean()))
-    cut = [one != other for one, other in zip(crops[0].lenses, crops[-1].lenses, strict=True)]
-    views = torch.tensor(cut).nonzero()[:, 0].tolist()
+    views = changed_views(crops)
 
     def shifted(shift: Float[Tensor, "2"]) -> SparseModel:
         return _cut(usual, views, None, shift, 0)
@@ -161,25 +168,42 @@ def find_crop(
     crop = shifted(shift)
     beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in _around(shift)]
     sharp = min(standard_errors(one - best) for one in beside) > ERRORS
-    names = some([crop.names[view] for view in views], 4)
-    told = (
-        f"{where} is of pictures of another size than {len(views)} of {crop.num_views} photographs "
-        f"({names}), and what their matches show"
-    )
+    evidence = "what their matches show"
     if agreement(crop, verified, max_error_px) <= _EXPLAINED or not sharp:
         raise InputError(
-            f"{told} fits a crop better than a resize, but does not tell which crop. Give the "
-            "photographs that it was made from, resized if you like, but not cropped."
+            f"{_which(where, usual, crops)}, and {evidence} fits a crop better than a resize, but "
+            "does not tell which crop. Give the photographs that it was made from, resized if you "
+            "like, but not cropped."
         )
-    lens = crop.lenses[views[0]]
+    tell_crop(where, crop, crops, evidence)
+    return crop
+
+
+def tell_crop(where: str, crop: SparseModel, crops: Sequence[SparseModel], evidence: str) -> None:
+    """Warn that photographs are cropped ones, and where the principal point is in the first."""
+    lens = crop.lenses[changed_views(crops)[0]]
     x, y = pinhole_of(lens)[:2, 2].tolist()
     caution(
-        f"{told} tells that these are no resized ones, but cropped: the principal point is at "
-        f"({x:.0f}, {y:.0f}) of {lens.width}x{lens.height}. Cameras and observations follow. If "
-        "that is wrong, give the photographs that it was made from.",
-        stacklevel=5,
+        f"{_which(where, crop, crops)}, and {evidence} tells that these are no resized ones, but "
+        f"cropped: the principal point is at ({x:.0f}, {y:.0f}) of {lens.width}x{lens.height}. "
+        "Cameras and observations follow. If that is wrong, give the photographs that it was made "
+        "from.",
+        stacklevel=6,
     )
-    return crop
+
+
+def _which(where: str, model: SparseModel, crops: Sequence[SparseModel]) -> str:
+    names = [model.names[view] for view in changed_views(crops)]
+    return (
+        f"{where} is of pictures of another size than {len(names)} of {model.num_views} "
+        f"photographs ({some(names, 4)})"
+    )
+
+
+def changed_views(crops: Sequence[SparseModel]) -> list[int]:
+    """Return the numbers of the photographs whose lenses differ between crops."""
+    ends = zip(crops[0].lenses, crops[-1].lenses, strict=True)
+    return [view for view, (one, other) in enumerate(ends) if one != other]
 
 
 def _cut(

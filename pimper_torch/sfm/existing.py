@@ -13,7 +13,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.crops import points_tell_a_resize, possible_crops
+from pimper_torch.sfm.crops import changed_views, points_tell, possible_crops, tell_crop
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
 from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
@@ -69,15 +69,24 @@ def existing_ways(views: Views, path: Path) -> Ways:
     shown = taken(views, model)
     sizes = _whole_sizes(shown)
     crops = possible_crops(model, shown, sizes)
-    fits = all(one.any() for one in allowed_turns(model, shown))
-    plain = possible_turns(model, shown) if fits else []
-    ways = [follow_pictures(model, shown, turns) for turns in plain]
-    if any(len(way.points_world) and points_tell_a_resize(way, shown) for way in ways):
-        crops = []
     if len(model.points_world) and not crops:
-        ways = [follow_pictures(model, shown, find_turns(model, shown, where))]
-    turned = [(one, turns) for one in crops for turns in possible_turns(one, shown)]
-    return Ways(ways, [follow_pictures(one, shown, turns) for one, turns in turned])
+        return Ways([follow_pictures(model, shown, find_turns(model, shown, where))], [])
+    plain, cropped = (
+        [follow_pictures(one, shown, turns) for one in some for turns in possible_turns(one, shown)]
+        for some in ([model] if bool(allowed_turns(model, shown).any(dim=1).all()) else [], crops)
+    )
+    changed = changed_views(crops) if crops else []
+    # That photographs were resized is the plain explanation: it may be told in larger steps.
+    large = float(shown.sizes_px.max()) / 100
+    for one in plain:
+        if points_tell(one, shown, changed) or points_tell(one, shown, changed, large):
+            return Ways([one], [])
+    told = [points_tell(one, shown, changed) for one in cropped]
+    if not any(told):
+        return Ways(plain, cropped)
+    crop = cropped[told.index(max(told))]
+    tell_crop(where, crop, cropped, "what they show round its points")
+    return Ways([crop], [])
 
 
 def _largest(views: Views, folder: Path) -> Path:
