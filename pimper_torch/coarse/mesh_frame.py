@@ -241,7 +241,8 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
         drawn = masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
         point, view = point[drawn], view[drawn]
     centers = cameras.centers_world.detach().double()
-    parts = [(centers[view], scene.points_world[point].detach().double() - centers[view], None)]
+    to_points = scene.points_world[point].detach().double() - centers[view]
+    parts = [(centers[view], to_points, torch.ones_like(to_points[:, 0], dtype=torch.bool))]
     for number in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[number])
         step = -(-max(width, height) // _SIDE)
@@ -253,9 +254,7 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
     return Rays(
         origins=torch.cat(origins).cpu(),
         directions=torch.cat(directions).cpu(),
-        inside=torch.cat(
-            [torch.ones(len(point), dtype=torch.bool), *(mask.cpu() for mask in inside[1:])]
-        ),
+        inside=torch.cat(inside).cpu(),
         to_point=torch.arange(sum(map(len, origins))) < len(point),
     )
 

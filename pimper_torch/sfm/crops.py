@@ -17,7 +17,7 @@ from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel, longest_tracks
-from pimper_torch.sfm.photograph_agreement import agreement, match_errors
+from pimper_torch.sfm.photograph_agreement import explained_fraction, match_errors
 from pimper_torch.sfm.quarter_turns import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.squares import (
     ERRORS,
@@ -169,7 +169,7 @@ def find_crop(
     beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in _around(shift)]
     sharp = min(standard_errors(one - best) for one in beside) > ERRORS
     evidence = "what their matches show"
-    if agreement(crop, verified, max_error_px) <= _EXPLAINED or not sharp:
+    if explained_fraction(crop, verified, max_error_px) <= _EXPLAINED or not sharp:
         raise InputError(
             f"{_which(where, usual, crops)}, and {evidence} fits a crop better than a resize, but "
             "does not tell which crop. Give the photographs that it was made from, resized if you "

@@ -69,24 +69,33 @@ def existing_ways(views: Views, path: Path) -> Ways:
     shown = taken(views, model)
     sizes = _whole_sizes(shown)
     crops = possible_crops(model, shown, sizes)
+
+    def by_points(one: SparseModel) -> Ways:
+        return Ways([follow_pictures(one, shown, find_turns(one, shown, where))], [])
+
     if len(model.points_world) and not crops:
-        return Ways([follow_pictures(model, shown, find_turns(model, shown, where))], [])
+        return by_points(model)
+    fits = bool(allowed_turns(model, shown).any(dim=1).all())
     plain, cropped = (
-        [follow_pictures(one, shown, turns) for one in some for turns in possible_turns(one, shown)]
-        for some in ([model] if bool(allowed_turns(model, shown).any(dim=1).all()) else [], crops)
+        [
+            (one, follow_pictures(one, shown, way))
+            for one in some
+            for way in possible_turns(one, shown)
+        ]
+        for some in ([model] if fits else [], crops)
     )
     changed = changed_views(crops) if crops else []
     # That photographs were resized is the plain explanation: it may be told in larger steps.
     large = float(shown.sizes_px.max()) / 100
-    for one in plain:
+    for _, one in plain:
         if points_tell(one, shown, changed) or points_tell(one, shown, changed, large):
-            return Ways([one], [])
-    told = [points_tell(one, shown, changed) for one in cropped]
-    if not any(told):
-        return Ways(plain, cropped)
-    crop = cropped[told.index(max(told))]
-    tell_crop(where, crop, cropped, "what they show round its points")
-    return Ways([crop], [])
+            return by_points(model)
+    told = [points_tell(one, shown, changed) for _, one in cropped]
+    if any(told):
+        ways = by_points(cropped[told.index(max(told))][0])
+        tell_crop(where, ways.plain[0], crops, "what they show round its points")
+        return ways
+    return Ways([one for _, one in plain], [one for _, one in cropped])
 
 
 def _largest(views: Views, folder: Path) -> Path:

@@ -7,6 +7,8 @@ the model has it. Squares round a point are compared with those of the other vie
 ways that the sizes allow.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -19,7 +21,7 @@ from pimper_torch.sfm.quarter_turns import QUARTERS, turned_pixels, turned_size,
 from pimper_torch.sfm.squares import (
     ERRORS,
     SAMPLES,
-    Squares,
+    others_of,
     sides_of,
     squares_in,
     standard_errors,
@@ -49,8 +51,9 @@ def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
     allowed, exif = allowed_turns(model, views), _exif_turns(views)
     upright, stored = _hypotheses(exif, allowed)
     squares = _squares(model, views, allowed)
-    changed = (upright != stored)[squares.view]
-    errors = standard_errors((_own(squares, stored) - _own(squares, upright))[changed])
+    changed = (upright != stored)[squares.model.observation_view]
+    one, other = (squares.agreement(way)[1][changed] for way in (upright, stored))
+    errors = standard_errors(other - one)
     turns = _each(squares, stored if errors > ERRORS else upright, allowed)
     _require_sides(squares, model, views, turns, exif)
     sure = torch.equal(upright, stored) or abs(errors) > ERRORS or not torch.equal(turns, upright)
@@ -95,8 +98,37 @@ def _hypotheses(
     return torch.where(allowed[:, 0], 0, stored), stored
 
 
-def _own(squares: Squares, turns: Int[Tensor, " view"]) -> Float[Tensor, " observation"]:
-    return squares.agreement(turns)[torch.arange(len(squares.view)), turns[squares.view]]
+@dataclass(frozen=True, slots=True)
+class Squares:
+    """What is round the points in the photographs, each taken in four ways.
+
+    Attributes:
+        model: Of the points with the longest tracks.
+        patterns: Unit vectors without mean; zero where a turn is impossible or nothing is seen.
+    """
+
+    model: SparseModel
+    patterns: Float[Tensor, "observation 4 sample"]
+
+    def agreement(
+        self, turns: Int[Tensor, " view"]
+    ) -> tuple[
+        Float[Tensor, "observation 4"], Float[Tensor, " observation"], Float[Tensor, " observation"]
+    ]:
+        """Correlate each observation with the others of its point, and with those of another.
+
+        Returns:
+            Turned each way; as the turns have it; and so, with another point.
+        """
+        rows = torch.arange(len(self.patterns)), turns[self.model.observation_view]
+        own = self.patterns[rows]
+        others, strangers = others_of(own, self.model.observation_point)
+        each = (self.patterns * others[:, None]).sum(dim=-1)
+        return each, each[rows], (own * strangers).sum(dim=-1)
+
+    def of(self, values: Float[Tensor, "observation 4"], view: int) -> Float[Tensor, "mine 4"]:
+        """Take a view's values."""
+        return values[self.model.observation_view == view]
 
 
 def _each(
@@ -104,9 +136,9 @@ def _each(
 ) -> Int[Tensor, " view"]:
     """Turn single views with which the others agree much better another way round."""
     for _ in range(_SWEEPS):
-        found, scores = turns.clone(), squares.agreement(turns)
+        found, (scores, *_) = turns.clone(), squares.agreement(turns)
         for view, fits in enumerate(allowed):
-            mine = scores[squares.view == view]
+            mine = squares.of(scores, view)
             means = mine.mean(dim=0).masked_fill(~fits, -torch.inf).nan_to_num(-torch.inf)
             best = int(means.argmax())
             gain = standard_errors(mine[:, best] - mine[:, turns[view]])
@@ -126,9 +158,9 @@ def _require_sides(
     exif: Int[Tensor, " view"],
 ) -> None:
     """Refuse a quarter turn that nothing tells the side of: neither EXIF nor the points."""
-    scores = squares.agreement(turns)
+    scores, *_ = squares.agreement(turns)
     for view, turn in enumerate(turns.tolist()):
-        mine = scores[squares.view == view]
+        mine = squares.of(scores, view)
         told = standard_errors(mine[:, turn] - mine[:, (turn + 2) % 4]) > ERRORS
         if turn % 2 and turn != int(exif[view]) and not told:
             lens, (width, height) = model.lenses[view], views.sizes_px[view].tolist()
@@ -171,7 +203,8 @@ def _within(where: str) -> str:
 
 def _tell_strangers(squares: Squares, turns: Int[Tensor, " view"], where: str) -> None:
     """Warn where what is round the points agrees no better than by chance."""
-    excess = _own(squares, turns) - squares.chance(turns)
+    _, own, chance = squares.agreement(turns)
+    excess = own - chance
     told = excess[excess != 0]
     if len(told) < _TELLING or standard_errors(told) > ERRORS:
         return
@@ -199,4 +232,4 @@ def _squares(model: SparseModel, views: Views, allowed: Bool[Tensor, "view 4"]) 
             centers = turned_pixels(some.observation_pixels[here] * scale, *before, quarters)
             across = turned_vectors(sides[here], quarters)
             patterns[here, quarters] = squares_in(picture, centers, across)
-    return Squares(point=some.observation_point, view=some.observation_view, patterns=patterns)
+    return Squares(some, patterns)

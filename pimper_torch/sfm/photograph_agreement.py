@@ -9,15 +9,13 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
 from torch import Tensor
 
 from pimper_torch.camera_files.conventions import camera_mistakes, far_better
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.agreement import undistorted_pixels
-from pimper_torch.sfm.colmap import pinhole_of
+from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pixels
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.static_background import sampson_errors
@@ -33,9 +31,11 @@ _LEFT, _MARGIN = 0.6, 0.05
 _FEWEST = 30
 
 
-def agreement(model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float) -> float:
+def explained_fraction(
+    model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
+) -> float:
     """Return the fraction of matches that the cameras of a model explain."""
-    return _agreement(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
+    return _fraction(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
 
 
 def match_errors(model: SparseModel, verified: Sequence[VerifiedPair]) -> Float[Tensor, " match"]:
@@ -45,7 +45,7 @@ def match_errors(model: SparseModel, verified: Sequence[VerifiedPair]) -> Float[
     return torch.cat([*errors, torch.zeros(0, dtype=torch.float64)])
 
 
-def _agreement(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
+def _fraction(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
     """Return the fraction of undistorted matches that cameras explain."""
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
     return right / max(sum(pair.num_matches for pair in pairs), 1)
@@ -75,23 +75,7 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
 
 def _errors(cameras: Cameras, pair: VerifiedPair) -> Float[Tensor, " match"]:
     """Measure Sampson's distances of matches, in pixels."""
-    motion = [
-        part
-        for view in pair.views
-        for part in (cameras.cam_from_world[view, :3, :3], cameras.cam_from_world[view, :3, 3:])
-    ]
-    one, other = (cameras.intrinsics[view] for view in pair.views)
-    geometry = fundamental_from_essential(essential_from_Rt(*motion), one, other)
-    return sampson_errors(geometry, pair.first, pair.second)
-
-
-def pinholes_of(model: SparseModel) -> Cameras:
-    """Return the pinholes behind a model's lenses."""
-    return Cameras(
-        intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
-        cam_from_world=model.cam_from_world,
-        sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
-    )
+    return sampson_errors(epipolar_geometry(cameras, pair.views), pair.first, pair.second)
 
 
 def undistorted_pairs(
@@ -105,14 +89,6 @@ def undistorted_pairs(
         )
         for pair in verified
     )
-
-
-def best_of(
-    models: Sequence[SparseModel], verified: Sequence[VerifiedPair], max_error_px: float
-) -> int:
-    """Choose the model that explains most matches; the first of equal ones."""
-    scores = [agreement(model, verified, max_error_px) for model in models]
-    return scores.index(max(scores))
 
 
 def require_agreement(
@@ -131,11 +107,11 @@ def require_agreement(
     """
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     total = sum(pair.num_matches for pair in pairs)
-    given = _agreement(pairs, cameras, max_error_px)
+    given = _fraction(pairs, cameras, max_error_px)
     if total < _FEWEST or given > 1 - _MARGIN:
         return
     mistakes = camera_mistakes(cameras)
-    scores = [_agreement(pairs, one.undo(cameras), max_error_px) for one in mistakes]
+    scores = [_fraction(pairs, one.undo(cameras), max_error_px) for one in mistakes]
     best = far_better(given, scores, _LEFT, _MARGIN)
     if given >= MIN_AGREEMENT and best is None:
         return

@@ -88,7 +88,7 @@ def _photographs(
     )
     assert picture_folder is not None
     beside = picture_folder.parent / "masks"
-    mask_of = mask_finder(Path(masks) if masks else beside if beside.is_dir() else None, _KIND)
+    mask_of = mask_finder(masks or (beside if beside.is_dir() else None), _KIND)
     model = read_model(found[0])
     paths = [inside(picture_folder, name, _KIND) for name in model.names]
     photographs = [

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files.layout import expect
+from pimper_torch.camera_files.posed_camera import PosedCamera
 from pimper_torch.errors import InputError, some
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
@@ -18,7 +19,7 @@ from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
 from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
+from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
 
@@ -26,26 +27,31 @@ _HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PosedPhotograph(Record):
+class PosedPhotograph(PosedCamera):
     """Camera and file of one photograph.
 
     Attributes:
-        name: Unique in the set.
-        image: Its file.
+        image: Its file; it may be a smaller copy of what the lens is for.
         mask: File of its mask; ``None`` where there is none. Of any size: it is stretched
             over the photograph.
-        cam_from_world: Rigid, in float64.
-        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own; the file
-            may be a smaller copy.
-        skew_px: ``K[0, 1]``; only a lens without distortion may have one.
     """
 
-    name: str
     image: Path
-    cam_from_world: Float[Tensor, "4 4"]
-    lens: Lens
-    skew_px: float = 0.0
     mask: Path | None = None
+
+    @classmethod
+    def of(
+        cls, camera: PosedCamera, image: Path, mask: Path | None, name: str = ""
+    ) -> "PosedPhotograph":
+        """Put a photograph, called as its file by default, beside its camera."""
+        return cls(
+            name=name or image.name,
+            cam_from_world=camera.cam_from_world,
+            lens=camera.lens,
+            skew_px=camera.skew_px,
+            image=image,
+            mask=mask,
+        )
 
 
 class PosedOptions(TypedDict, total=False):
@@ -221,7 +227,7 @@ def image_files(folder: Path, kind: str) -> list[Path]:
     return paths
 
 
-def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]:
+def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path | None]:
     """Return a function that finds the mask of a photograph in a folder.
 
     A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
@@ -233,7 +239,8 @@ def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]
     """
     if folder is None:
         return lambda photograph: None
-    paths = image_files(folder, kind)
+    place = Path(folder)
+    paths = image_files(place, kind)
 
     def find(photograph: Path) -> Path | None:
         stem = photograph.stem
@@ -242,7 +249,7 @@ def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]
         found = exact or longer
         expect(
             len(found) == 1,
-            folder,
+            place,
             kind,
             f"one mask for {photograph.name}, such as {stem}.png",
             some([path.name for path in found or paths]),
