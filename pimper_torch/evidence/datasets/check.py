@@ -1,9 +1,8 @@
-"""Consistency of a capture: whether cameras, normals and mesh follow this package's conventions.
+"""Consistency of a capture: whether cameras and mesh follow this package's conventions.
 
 The cameras as given, and put right for every usual mistake of
 :func:`~pimper_torch.camera_files.conventions.camera_mistakes`, have one score: the agreement of
-true points with masks, or else of matched features with epipolar lines. Normals have to face the
-camera.
+true points with masks, or else of matched features with epipolar lines.
 """
 
 from collections.abc import Callable, Iterator
@@ -40,7 +39,7 @@ _HOPELESS = 0.1
 _NOT_RIGID = 1e-3
 _WHOLE = 0.98  # a mask that covers more of the photograph is ignored
 _MATCH_ERROR = 0.004  # distance from the epipolar line, a fraction of the longer side: a choice
-_FACING, _ALL_FACING = 0.75, 0.95  # fractions of normals, choices
+_FACING = 0.75  # fraction of normals, a choice
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -86,7 +85,7 @@ class CheckReport(Record):
 
 
 def check_capture(capture: Capture) -> CheckReport:
-    """Find mistakes in the conventions of a capture's cameras, normals and mesh.
+    """Find mistakes in the conventions of a capture's cameras and mesh.
 
     Args:
         capture: Read from a data set or rendered. Up to eight positions are checked.
@@ -94,26 +93,21 @@ def check_capture(capture: Capture) -> CheckReport:
     Returns:
         No findings if all is consistent.
     """
+    truth, given = capture.truth, capture.cameras
+    if given is None:
+        return CheckReport(findings=(), tested=())
+    if not bool(given.intrinsics.isfinite().all() & given.cam_from_world.isfinite().all()):
+        return CheckReport(findings=(_NOT_FINITE,), tested=())
     chosen = _spread(capture)
-    truth, cameras = capture.truth, capture.cameras
-    normals = None if truth.normals_world is None else truth.normals_world[chosen]
-    findings, tested = list[Finding](), list[str]()
-    if cameras is not None:
-        if not bool(cameras.intrinsics.isfinite().all() & cameras.cam_from_world.isfinite().all()):
-            return CheckReport(findings=(_NOT_FINITE,), tested=())
-        findings += _not_rigid(cameras)
-        foreground = None if truth.foreground is None else truth.foreground[chosen]
-        cameras = cameras.take(chosen)
-        name, score = _camera_score(capture.views.take(chosen), cameras, truth, foreground)
-        if score is not None:
-            tested.append(name)
-            of_cameras, cameras = _put_right(cameras, name, score)
-            findings += of_cameras
-        findings += _inward_mesh(truth.mesh, cameras)
-    if normals is not None:
-        tested.append("normals")
-        findings += _normals(normals, cameras)
-    return CheckReport(findings=tuple(findings), tested=tuple(tested))
+    foreground = None if truth.foreground is None else truth.foreground[chosen]
+    cameras = given.take(chosen)
+    name, score = _camera_score(capture.views.take(chosen), cameras, truth, foreground)
+    findings = list(_not_rigid(given))
+    if score is not None:
+        of_cameras, cameras = _put_right(cameras, name, score)
+        findings += of_cameras
+    findings += _inward_mesh(truth.mesh, cameras)
+    return CheckReport(findings=tuple(findings), tested=() if score is None else (name,))
 
 
 _NOT_FINITE = Finding(
@@ -165,8 +159,12 @@ def _put_right(
     evidence = {f"{test}, as given": given}
     if best is not None:
         found, evidence = mistakes[best], {**evidence, f"{test}, set right": values[best]}
-        close = _close([one.name for one in mistakes], values, best)
-        finding = Finding(found.name, found.meaning, found.remedy, evidence, close)
+        close = [
+            one.name
+            for one, value in zip(mistakes, values, strict=True)
+            if value > values[best] - _TIE and one is not found
+        ]
+        finding = Finding(found.name, found.meaning, found.remedy, evidence, tuple(close))
         return [finding], found.undo(cameras)
     if given >= _HOPELESS:
         return [], cameras
@@ -177,14 +175,6 @@ def _put_right(
         evidence,
     )
     return [finding], cameras
-
-
-def _close(names: list[str], values: list[float], best: int) -> tuple[str, ...]:
-    """Return the other mistakes that score about as high as the best."""
-    pairs = zip(names, values, strict=True)
-    return tuple(
-        name for name, value in pairs if value > values[best] - _TIE and name != names[best]
-    )
 
 
 def _points_on_masks(
@@ -242,98 +232,27 @@ def _inward_mesh(mesh: Mesh | None, cameras: Cameras) -> Iterator[Finding]:
     caster, faces, vertices = RayCaster(mesh.vertices_world, mesh.faces), [], []
     normals = unit_face_normals(mesh.vertices_world, mesh.faces)
     for view in range(cameras.num_views):
-        _, rays = _grid(cameras, view)
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        step = ceil(max(width, height) / _GRID_PX)
+        centers = pixel_centers(width, height, like=cameras.intrinsics)
+        pixels = centers[step // 2 :: step, step // 2 :: step].reshape(-1, 2)
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
         hits = caster.cast(cameras.centers_world[view], rays)
         hit = hits.face >= 0
         faces.append((normals[hits.face[hit]].to(rays) * rays[hit]).sum(dim=1) < 0)
         if mesh.normals_world is not None:
             smooth = hits.interpolate(mesh.normals_world.to(rays), mesh.faces)[hit]
             vertices.append((smooth * rays[hit]).sum(dim=1) < 0)
-    for facing, mistake in (
-        (
-            faces,
-            (
-                "mesh_inside_out",
-                "the mesh's faces are clockwise seen from outside",
-                "exchange two corners of every face",
-            ),
-        ),
-        (
-            vertices,
-            ("mesh_normals_inward", "the mesh's vertex normals point inward", "negate them"),
-        ),
-    ):
+    of_faces = (
+        "mesh_inside_out",
+        "the mesh's faces are clockwise seen from outside",
+        "exchange two corners of every face",
+    )
+    of_vertices = "mesh_normals_inward", "the mesh's vertex normals point inward", "negate them"
+    for facing, mistake in ((faces, of_faces), (vertices, of_vertices)):
         fraction = float(torch.cat(facing).float().mean()) if facing else 1.0
         if fraction < 1 - _FACING:
             yield Finding(*mistake, {"fraction facing": fraction})
-
-
-# Mistakes of normal maps: name, meaning, remedy, signs of the axes in the camera's frame, and
-# whether the vectors are in it.
-_NORMAL_MISTAKES = (
-    ("normals_negated", "the normals point the other way", "negate them", (-1, -1, -1), False),
-    (
-        "normals_in_camera_frame",
-        "the normals are in each camera's frame",
-        "turn them into the world: R^T n for cam_from_world's rotation R",
-        (1, 1, 1),
-        True,
-    ),
-    (
-        "normals_in_camera_frame_y_up",
-        "the normals are in each camera's frame with y up and z towards the viewer",
-        "negate y and z, then turn them into the world: R^T diag(1, -1, -1) n",
-        (1, -1, -1),
-        True,
-    ),
-)
-
-
-def _normals(
-    maps: Float[Tensor, "view height width 3"], cameras: Cameras | None
-) -> Iterator[Finding]:
-    """Find normal maps that do not face the camera, and would in another frame.
-
-    Facing alone does not distinguish mirrored normals, and the first of equal mistakes is named.
-    """
-    step = ceil(max(maps.shape[1:3]) / _GRID_PX)
-    samples = []
-    for view, image in enumerate(maps):
-        if cameras is None:
-            normals, rotation = image[::step, ::step].reshape(-1, 3), torch.eye(3)
-            rays = normals.new_tensor([[0, 0, 1]]).expand_as(normals)
-        else:
-            pixels, rays = _grid(cameras, view)
-            normals, rotation = _at(image, pixels), cameras.cam_from_world[view, :3, :3]
-        known = normals.norm(dim=1) > 0
-        samples.append((normals[known].to(rays), rays[known], rotation.to(rays)))
-
-    def score(signs: tuple[int, int, int], in_camera_frame: bool) -> float:
-        facing = []
-        for normals, rays, rotation in samples:
-            vectors = normals if in_camera_frame else normals @ rotation.mT
-            vectors = (vectors * vectors.new_tensor(signs)) @ rotation
-            facing.append((vectors * rays).sum(dim=1) < 0)
-        every = torch.cat(facing).float()
-        return float(every.mean()) if len(every) else 1.0
-
-    given = score((1, 1, 1), False)
-    values = [score(signs, in_camera) for *_, signs, in_camera in _NORMAL_MISTAKES]
-    best = far_better(given, values, _LEFT, _MARGIN)
-    if best is not None and values[best] > _ALL_FACING:
-        name, meaning, remedy, *_ = _NORMAL_MISTAKES[best]
-        evidence = {"fraction facing, as given": given, "fraction facing, set right": values[best]}
-        close = _close([one[0] for one in _NORMAL_MISTAKES], values, best)
-        yield Finding(name, meaning, remedy, evidence, close)
-
-
-def _grid(cameras: Cameras, view: int) -> tuple[Float[Tensor, "pixel 2"], Float[Tensor, "pixel 3"]]:
-    """Return the centres of pixels on a regular grid over a photograph, and their rays."""
-    width, height = (int(side) for side in cameras.sizes_px[view])
-    step = ceil(max(width, height) / _GRID_PX)
-    centers = pixel_centers(width, height, like=cameras.intrinsics)
-    pixels = centers[step // 2 :: step, step // 2 :: step].reshape(-1, 2)
-    return pixels, rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
 
 
 def _at(
@@ -344,14 +263,9 @@ def _at(
 
 
 def _spread(capture: Capture) -> list[int]:
-    """Choose views of different positions, in pairs of successive ones that share most.
-
-    Views of a single viewpoint differ in their lights, and any are chosen.
-    """
-    views = list(range(capture.views.num_views))
-    if capture.cameras is not None:
-        positions = capture.position.tolist()
-        views = sorted(positions.index(position) for position in set(positions))
+    """Choose views of different positions, in pairs of successive ones that share most."""
+    positions = capture.position.tolist()
+    views = sorted(positions.index(position) for position in set(positions))
     if len(views) <= _MAX_VIEWS:
         return views
     starts = np.linspace(0, len(views) - 2, _MAX_VIEWS // 2).round().astype(int)
