@@ -115,24 +115,6 @@ _POSES: tuple[tuple[str, str, str, Callable[[Poses], Poses]], ...] = (
         _from_center,
     ),
     (
-        "flipped_x",
-        "the cameras' x axis, or the photographs, run from right to left",
-        "negate the first row of cam_from_world, or mirror the photographs",
-        lambda pose: _signs(-1, 1, 1, pose) @ pose,
-    ),
-    (
-        "flipped_y",
-        "the cameras' y axis runs up, or the photographs are upside down",
-        "negate the second row of cam_from_world, or turn the photographs over",
-        lambda pose: _signs(1, -1, 1, pose) @ pose,
-    ),
-    (
-        "flipped_z",
-        "the cameras' z axis points backward",
-        "negate the third row of cam_from_world",
-        lambda pose: _signs(1, 1, -1, pose) @ pose,
-    ),
-    (
         "photographs_rotated",
         "the photographs are turned by 180 degrees, or both image axes of the cameras are",
         "negate the first two rows of cam_from_world, or turn the photographs",

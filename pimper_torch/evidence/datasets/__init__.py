@@ -1,7 +1,7 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
 from pimper_torch.evidence.datasets.check import check_capture
-from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
+from pimper_torch.evidence.datasets.colmap import read_colmap
 from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
@@ -20,7 +20,6 @@ __all__ = [
     "check_capture",
     "one_light_per_position",
     "read_colmap",
-    "read_colmap_scene",
     "read_diligent",
     "read_diligent_mv",
     "read_dtu_mvs",

@@ -103,7 +103,7 @@ def check_capture(capture: Capture) -> CheckReport:
     cameras = given.take(chosen)
     name, score = _camera_score(capture.views.take(chosen), cameras, truth, foreground)
     findings = list(_not_rigid(given))
-    if score is not None:
+    if score is not None and not findings:
         of_cameras, cameras = _put_right(cameras, name, score)
         findings += of_cameras
     findings += _inward_mesh(truth.mesh, cameras)
@@ -127,6 +127,14 @@ def _not_rigid(cameras: Cameras) -> Iterator[Finding]:
             "rotations are not orthogonal: scale or shear is mixed in, or the matrix is K [R | t]",
             "split the projection into K and a rotation, or divide by the scale",
             {"largest entry of R R^T - I": off},
+        )
+    elif bool((torch.linalg.det(rotation) < 0).any()):
+        yield Finding(
+            "mirrored",
+            "rotations are reflections: one axis of the cameras runs the other way",
+            "negate the row of cam_from_world whose axis is not x right, y down, z forward, or "
+            "mirror the photographs",
+            {"least determinant": float(torch.linalg.det(rotation).min())},
         )
 
 

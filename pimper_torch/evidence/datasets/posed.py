@@ -12,12 +12,11 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import expect
 from pimper_torch.camera_files.posed_camera import PosedCamera
 from pimper_torch.errors import InputError, some
-from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import shrunk_focals, shrunk_size
-from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
+from pimper_torch.io.radiance import read_pictures, resized_mask
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
@@ -155,40 +154,6 @@ def read_views(
         masks=masks if has_masks else None,
         focals_px=shrunk_focals(headers, sizes),
     )
-
-
-def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cameras]:
-    """Shrink photographs whose longer side is longer, and let their pinholes follow.
-
-    Args:
-        views: Any; padding stays zero.
-        max_size_px: The longest side; 0 leaves all as they are.
-    """
-    full = views.sizes_px.tolist()
-    fractions = [min(1.0, max_size_px / max(size)) if max_size_px else 1.0 for size in full]
-    sizes = [
-        (max(1, round(fraction * width)), max(1, round(fraction * height)))
-        for fraction, (width, height) in zip(fractions, full, strict=True)
-    ]
-    width, height = (max(sides) for sides in zip(*sizes, strict=True))
-    images = views.images.new_zeros(*views.images.shape[:2], height, width)
-    masks = torch.zeros(len(sizes), height, width, dtype=torch.bool)
-    for index, ((wide, high), (w, h)) in enumerate(zip(full, sizes, strict=True)):
-        images[index, :, :h, :w] = resized_radiance(views.images[index, :, :high, :wide], w, h)
-        if views.masks is not None:
-            masks[index, :h, :w] = resized_mask(views.masks[index, :high, :wide].float(), w, h)
-    intrinsics = [
-        scale_intrinsics(K, w / wide, h / high)
-        for K, (wide, high), (w, h) in zip(cameras.intrinsics, full, sizes, strict=True)
-    ]
-    sizes_px = torch.tensor(sizes)
-    small = views.replace(
-        images=images,
-        sizes_px=sizes_px,
-        masks=None if views.masks is None else masks,
-        focals_px=views.focals_px * torch.tensor(fractions).to(views.focals_px),
-    )
-    return small, cameras.replace(intrinsics=torch.stack(intrinsics), sizes_px=sizes_px)
 
 
 def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
