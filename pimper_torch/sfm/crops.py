@@ -32,7 +32,7 @@ from pimper_torch.sfm.squares import (
 # of potatoes, mug, jar and balls (8 and 12 views of 240x180 and 320x240) that were cropped to 0.95
 # to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard errors at
 # most; about the truth all are by 4.9 and more.
-_POINTS, _SHARP_PX = 400, 4.0
+_POINTS, REACHES = 400, (4.0, 8.0)
 # A crop explains more of the matches than this; photographs that it places beside by so much must
 # explain them worse; the last steps of the search, and how many in a row: choices.
 _EXPLAINED, _BESIDE_PX, _STEP_PX, _MOST_STEPS = 0.95, 8.0, 0.5, 12
@@ -50,7 +50,7 @@ def resize_fits(whole: Size, width: int, height: int) -> bool:
 
 
 def points_tell(
-    model: SparseModel, views: Views, changed: Sequence[int], reach_px: float = _SHARP_PX
+    model: SparseModel, views: Views, changed: Sequence[int], reaches_px: Sequence[float] = REACHES
 ) -> float:
     """Return how well photographs agree round the points; 0 where they agree as well beside them.
 
@@ -58,24 +58,24 @@ def points_tell(
         model: In the pixels of the photographs.
         views: The photographs.
         changed: Numbers of those whose place is in question.
-        reach_px: How far they are shifted for comparison; then twice as far.
+        reaches_px: How far they are shifted for comparison, one distance after the other.
     """
-    if not len(model.points_world):
-        return 0.0
     chosen = longest_tracks(model, _POINTS)
-    ring = _around(torch.zeros(1, dtype=torch.float64))
-    shifts = reach_px * torch.cat([torch.zeros(1, 2), ring, 2 * ring])
     sides = sides_of(chosen, views)
-    squares = torch.zeros(len(shifts), len(sides), SAMPLES)
-    for view, (width, height) in enumerate(views.sizes_px.tolist()):
-        here = (chosen.observation_view == view).nonzero()[:, 0]
-        centers = chosen.observation_pixels[here] + (view in changed) * shifts[:, None]
-        squares[:, here] = squares_in(views.images[view, :, :height, :width], centers, sides[here])
-    own = (squares * others_of(squares, chosen.observation_point)[0]).sum(dim=-1)
-    own = own[:, torch.isin(chosen.observation_view, torch.tensor(changed)) & (own[0] != 0)]
-    errors = [standard_errors(own[0] - one) for one in own[1:]]
-    told = max(min(errors[: len(ring)]), min(errors[len(ring) :])) > ERRORS
-    return float(own[0].mean()) if told else 0.0
+    mine = torch.isin(chosen.observation_view, torch.tensor(changed))
+    for reach_px in reaches_px if len(model.points_world) else ():
+        shifts = reach_px * torch.cat([torch.zeros(1, 2), _around(sides)])
+        squares = torch.zeros(len(shifts), len(sides), SAMPLES)
+        for view, (width, height) in enumerate(views.sizes_px.tolist()):
+            here = (chosen.observation_view == view).nonzero()[:, 0]
+            centers = chosen.observation_pixels[here] + (view in changed) * shifts[:, None]
+            picture = views.images[view, :, :height, :width]
+            squares[:, here] = squares_in(picture, centers, sides[here])
+        own = (squares * others_of(squares, chosen.observation_point)[0]).sum(dim=-1)
+        own = own[:, mine & (own[0] != 0)]
+        if min(standard_errors(own[0] - one) for one in own[1:]) > ERRORS:
+            return float(own[0].mean())
+    return 0.0
 
 
 def possible_crops(model: SparseModel, views: Views, sizes_px: Sequence[Size]) -> list[SparseModel]:

@@ -13,7 +13,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.crops import changed_views, points_tell, possible_crops, tell_crop
+from pimper_torch.sfm.crops import REACHES, changed_views, points_tell, possible_crops, tell_crop
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
 from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
@@ -86,10 +86,9 @@ def existing_ways(views: Views, path: Path) -> Ways:
     )
     changed = changed_views(crops) if crops else []
     # That photographs were resized is the plain explanation: it may be told in larger steps.
-    large = float(shown.sizes_px.max()) / 100
-    for _, one in plain:
-        if points_tell(one, shown, changed) or points_tell(one, shown, changed, large):
-            return by_points(model)
+    reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
+    if any(points_tell(one, shown, changed, reaches) for _, one in plain):
+        return by_points(model)
     told = [points_tell(one, shown, changed) for _, one in cropped]
     if any(told):
         ways = by_points(cropped[told.index(max(told))][0])
