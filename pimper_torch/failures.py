@@ -127,7 +127,6 @@ def solved_or(
     Args:
         solve: What may fail.
         otherwise: Gives what stands in for the solution.
-        stage: Named in the failure.
         memory: Whether that also helps where memory does not suffice.
     """
     try:
@@ -182,7 +181,6 @@ def over_patches(
     Args:
         work: Called with a range of patches; gives their record.
         facets: One for each patch.
-        stage: Named in failures.
         lost: Gives the record of a patch that failed.
         done: What that means, for the warning.
 

@@ -45,7 +45,6 @@ def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -
 
     Args:
         limit: Bytes that the process may hold.
-        patches: Of the first round.
         scale: Of the photographs in that round.
         last: Of the photographs in the last one.
 

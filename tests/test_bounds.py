@@ -37,8 +37,8 @@ MAY_BE_INFINITE = {
 # Numbers that say how much there is to compute.
 AMOUNTS = (
     *("DecomposeConfig.samples_per_pixel", "DecomposeConfig.overlap_samples"),
-    *("FuseConfig.samples_per_vertex", "CoarseToFineConfig.scales", "LimConfig.samples_per_pixel"),
-    *("GlobalStereoConfig.samples_per_pixel", "RefineConfig.smoothing_radius_samples"),
+    *("FuseConfig.samples_per_vertex", "CoarseToFineConfig.scales"),
+    "RefineConfig.smoothing_radius_samples",
 )
 
 

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from comparison import compare_in_view
+from photographs import save_masks, save_photographs
 from torch import nn
 from torch.nn.functional import normalize
 
@@ -16,14 +18,12 @@ from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.metrics import compare_in_view, pair_views, similarity_between_cameras
-from pimper_torch.evidence.metrics.relative import ViewComparison, angles_deg
+from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
+from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.evidence.scenes import (
     RenderedScene,
     potato_on_table,
     render_shape,
-    save_masks,
-    save_photographs,
 )
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
@@ -217,7 +217,7 @@ def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
         assert found.confidence[away.argmin()] == 0
 
 
-def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene) -> ViewComparison:
+def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene):
     """Compare along the rays of the reference view, on the object without its table."""
     ours, theirs = pair_views(result.scene.views.names, truth.views.names)
     truth_from_world = similarity_between_cameras(

@@ -12,13 +12,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 import tyro
+from photographs import save_photographs
 from torch.nn.functional import normalize
 
 import pimper_torch
 from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
-from pimper_torch.evidence.scenes import RenderedScene, render_shape, save_photographs, sparse_scene
+from pimper_torch.evidence.scenes import RenderedScene, render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere

@@ -142,45 +142,36 @@ def _one_each(count: int, photographs: Sequence[str], path: Path) -> None:
 def _plain(
     arrays: dict[str, np.ndarray], path: Path
 ) -> tuple[Float[Tensor, "view 3 3"], list[Float[Tensor, "4 4"]]]:
-    def array(*names: str, shape: tuple[int, ...]) -> Tensor | None:
+    def array(names: Sequence[str], *shapes: tuple[int, ...]) -> Tensor | None:
         name = next((name for name in names if name in arrays), None)
         if name is None:
             return None
-        found = arrays[name]
-        ok = found.dtype.kind in "iuf" and found.shape[1:] == shape
-        expect(ok, path, _KIND, f"{_by(shape)} numbers a camera as {name}", _by(found.shape))
+        one = names is _INTRINSICS and arrays[name].shape == (3, 3)
+        found = arrays[name][None] if one else arrays[name]
+        ok = found.dtype.kind in "iuf" and found.shape[1:] in shapes
+        expect(ok, path, _KIND, f"{_by(shapes[0])} numbers a camera as {name}", _by(found.shape))
         expect(bool(np.isfinite(found).all()), path, _KIND, f"finite numbers as {name}", "others")
         return torch.from_numpy(found.astype(np.float64))
 
-    projections = array(*_PROJECTIONS, shape=(3, 4))
+    projections = array(_PROJECTIONS, (3, 4))
     if projections is not None:
         pairs = [
             _decomposed(matrix, f"projection {index}", path, _KIND)
             for index, matrix in enumerate(projections)
         ]
         return torch.stack([K for K, _ in pairs]), [pose for _, pose in pairs]
-    for name in _INTRINSICS:
-        if name in arrays and arrays[name].shape == (3, 3):
-            arrays = {**arrays, name: arrays[name][None]}
-    if "cam_from_world" in arrays and arrays["cam_from_world"].shape[1:] == (4, 4):
-        arrays = {**arrays, "cam_from_world": arrays["cam_from_world"][:, :3]}
-    intrinsics = array(*_INTRINSICS, shape=(3, 3))
-    matrices = array("cam_from_world", shape=(3, 4))
-    if "t" in arrays and arrays["t"].shape[1:] == (3, 1):
-        arrays = {**arrays, "t": arrays["t"][..., 0]}
-    rotations, shifts = array("R", shape=(3, 3)), array("t", shape=(3,))
+    intrinsics = array(_INTRINSICS, (3, 3))
+    matrices = array(["cam_from_world"], (3, 4), (4, 4))
+    rotations, shifts = array(["R"], (3, 3)), array(["t"], (3,), (3, 1))
     if matrices is None and rotations is not None and shifts is not None:
         expect(len(rotations) == len(shifts), path, _KIND, "as many R as t", f"{len(shifts)} t")
-        matrices = torch.cat([rotations, shifts[..., None]], dim=2)
+        matrices = torch.cat([rotations, shifts.reshape(-1, 3, 1)], dim=2)
     if intrinsics is None or matrices is None or not len(matrices):
-        expect(
-            False,
-            path,
-            _KIND,
+        needed = (
             "world_mat_0 and so on; or intrinsics (K) with cam_from_world, or with R and t; or "
-            "projections (P)",
-            some(sorted(arrays)) or "no arrays",
+            "projections (P)"
         )
+        expect(False, path, _KIND, needed, some(sorted(arrays)) or "no arrays")
         raise AssertionError
     several = len(intrinsics) in (1, len(matrices))
     expect(several, path, _KIND, f"1 or {len(matrices)} intrinsics", f"{len(intrinsics)}")
@@ -188,7 +179,7 @@ def _plain(
         ok = bool((K.diagonal() > 0).all()) and K[2].tolist() == [0, 0, 1] and float(K[1, 0]) == 0
         expect(ok, path, _KIND, f"f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 as K {index}", f"{K.tolist()}")
     poses = [
-        rigid_or_refuse(matrix[:, :3], matrix[:, 3], f"cam_from_world {index}", path, _KIND)
+        rigid_or_refuse(matrix[:3, :3], matrix[:3, 3], f"cam_from_world {index}", path, _KIND)
         for index, matrix in enumerate(matrices)
     ]
     return intrinsics.expand(len(poses), 3, 3), poses

@@ -81,6 +81,23 @@ def first_of(candidates: Sequence[Path]) -> Path | None:
     return next((path for path in candidates if path.exists()), None)
 
 
+def file_in(given: Path | str, names: Sequence[str], kind: str) -> Path:
+    """Return a file, or the one of these names, or patterns, in a folder.
+
+    Raises:
+        InputError: There is none, or several fit a pattern.
+    """
+    given = Path(given)
+    if given.is_file():
+        return given
+    found = [given / name for name in names if (given / name).exists()]
+    if names[0].startswith("*"):
+        found = sorted(given.glob(names[0])) if given.is_dir() else []
+        expect(len(found) == 1, given, kind, f"one file named {names[0]}")
+    expect(bool(found), given, kind, f"a file {' or '.join(names)}")
+    return found[0]
+
+
 def read_text(path: Path, kind: str) -> str:
     """Read a text file of a data set.
 

@@ -23,7 +23,6 @@ class Bars:
     Where the output is no terminal, it writes a line when a stage ends instead.
 
     Args:
-        forecast: Tells the time left.
         figures: How many of a stage's figures are shown at its end; ``None`` is all.
     """
 

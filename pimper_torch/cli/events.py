@@ -13,7 +13,6 @@ class Events:
     Args:
         write: Called with every event's name, and what it is about by name.
         seconds: Progress is written no more often; its end always is.
-        forecast: Tells the time left.
     """
 
     def __init__(self, write: Callable[..., None], seconds: float, forecast: Forecast) -> None:

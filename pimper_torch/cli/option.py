@@ -56,7 +56,6 @@ def options_of(
     Args:
         command: Whose parameters are options; or settings, whose fields are.
         between: What stands between several values.
-        section: Of settings: their title.
         path: Of settings: what stands before a field's name.
     """
     said = meanings(type(command) if _is_settings(command) else command)

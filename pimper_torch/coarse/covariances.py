@@ -32,7 +32,6 @@ def point_covariances(
 
     Args:
         scene: Cameras, cloud and tracks.
-        index: Which points.
 
     Returns:
         Scene units squared.

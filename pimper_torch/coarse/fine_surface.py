@@ -299,7 +299,6 @@ def near_points(
     the air beside it by strips along points, which the margin cuts through.
 
     Args:
-        faces: Of the closed surface.
         counts: Of the views that see each.
         pixel: Size of one, scene units.
     """
@@ -354,7 +353,6 @@ def seen_surface(
     strips along the border are dropped.
 
     Args:
-        vertices: Of the closed surface.
         counts: Of the views that see each.
         inside: True for faces in the visual hull.
         pixel: Size of one, scene units.

@@ -1,7 +1,11 @@
-"""Whether a brought mesh is in the frame of the cameras: what points and masks say."""
+"""Whether a brought mesh is in the frame of the cameras: what points and masks say.
+
+Candidates are the mesh with its axes exchanged, turned and scaled as programs do. Their score is
+the part of observed points that is on the mesh, and its overlap with masks.
+"""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -9,11 +13,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.camera_files.conventions import far_better
 from pimper_torch.errors import InputError, caution
-from pimper_torch.geometry.local_frame import Offset
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
 
@@ -41,14 +45,16 @@ class Rays(Record):
     """Rays of the cameras, and what is known of each.
 
     Attributes:
-        origins: Of the cameras.
+        origins: Centres of the cameras.
         directions: To a point, with its distance for length; through a pixel.
-        inside: Of a pixel: whether the mask has it; true for points.
+        inside: Whether a pixel's mask has it; true for points.
+        to_point: Whether it goes to a point.
     """
 
     origins: Float[Tensor, "ray 3"]
     directions: Float[Tensor, "ray 3"]
     inside: Bool[Tensor, " ray"]
+    to_point: Bool[Tensor, " ray"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,18 +66,14 @@ class Fit:
         hits: Observations of points whose ray meets the mesh.
         on_mesh: Fraction of these that are on it; NaN if too few.
         overlap: Of its silhouettes with the masks, intersection over union; NaN without masks.
+        score: Mean of the fractions that are known; NaN if none is.
     """
 
     rays: int
     hits: int
     on_mesh: float
     overlap: float
-
-    @property
-    def score(self) -> float:
-        """The mean of the fractions that are known; NaN if none is."""
-        known = [value for value in (self.on_mesh, self.overlap) if not math.isnan(value)]
-        return sum(known) / len(known) if known else float("nan")
+    score: float
 
 
 def compare_with_scene(
@@ -97,26 +99,40 @@ def compare_with_scene(
     caster = RayCaster(mesh.vertices_world, mesh.faces)
     used = mesh.vertices_world[mesh.faces.flatten()].double()
     diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
-    masks = silhouettes.inside > 0.5 if silhouettes.source == "masks" else None
-    seen = _to_points(scene, masks), _to_pixels(scene.cameras, masks, silhouettes.reliable)
-    here = torch.eye(3, dtype=torch.float64)
+    rays = _rays(scene, silhouettes)
+    offset = used.new_tensor(scene.offset_world)
 
     def fit(world_from_mesh: Float[Tensor, "3 3"], every: int = 1) -> Fit:
-        some = [rays.take(slice(None, None, every)) for rays in seen]
-        return _fit(caster, diagonal, some[0], some[1], world_from_mesh, scene.offset_world)
+        some = rays.take(slice(None, None, every))
+        return _fit(caster, diagonal, some, world_from_mesh, offset)
 
+    here = torch.eye(3, dtype=torch.float64)
     found = fit(here)
-    distance = _median_distance(mesh, caster, seen[0]) / diagonal
-    told = _told(found, len(seen[0].origins), distance, diagonal)
+    points = rays.take(rays.to_point)
+    met = caster.cast(points.origins, points.directions).face >= 0
+    distance, reached = math.nan, (points.origins + points.directions)[met]
+    if len(reached):
+        distance = float(NearestSurface(mesh).query(reached).distance.median()) / diagonal
+    told = _told(found, distance, diagonal)
     if not found.score >= _GOOD:
-        _refuse_other_frame(found, told, fit)
+        frames = [matrix for matrix in _frames() if not torch.equal(matrix, here)]
+        scores = [_score(fit(matrix, _TRIED)) for matrix in frames]
+        matrix = frames[max(range(len(frames)), key=lambda index: scores[index])]
+        best, score = fit(matrix), 0.0 if math.isnan(found.score) else found.score
+        good = best.score >= _GOOD and best.hits >= _MIN_SEEN * best.rays
+        if good and far_better(score, [best.score], _BETTER, 0.0) is not None:
+            raise InputError(
+                f"The given mesh is in another frame than the cameras: {told}. {_named(matrix)}, "
+                f"it would fit by {best.score:.0%} in the place of {score:.0%}. Change the mesh "
+                "so, or export it again in the frame and the unit of the cameras."
+            )
         if found.score < _NOTHING and not distance < _FAR_OFF:
             raise InputError(
                 f"The given mesh is not where the photographs show the object: {told}. It has to "
                 "be in the frame and the unit of the cameras: give the model that it belongs to by "
                 "`--sparse`, or align it first."
             )
-    unknown = math.isnan(found.score) and len(seen[0].origins) >= _MIN_HITS
+    unknown = math.isnan(found.score) and found.rays >= _MIN_HITS
     if unknown or distance > _MAX_DISTANCE or found.score < _GOOD or found.overlap < _MIN_OVERLAP:
         caution(
             f"The given mesh is off what the photographs show: {told}. Look whether it is in the "
@@ -131,9 +147,13 @@ def compare_with_scene(
     return {name: value for name, value in figures.items() if not math.isnan(value)}
 
 
-def _told(found: Fit, num_rays: int, distance: float, diagonal: float) -> str:
+def _score(fit: Fit) -> float:
+    return 0.0 if math.isnan(fit.score) else fit.score
+
+
+def _told(found: Fit, distance: float, diagonal: float) -> str:
     """State how far off a mesh is, in a part of a sentence."""
-    parts = [f"rays to {found.hits} of {num_rays} observed points meet it"]
+    parts = [f"rays to {found.hits} of {found.rays} observed points meet it"]
     if not math.isnan(found.on_mesh):
         parts = [
             f"{found.on_mesh:.0%} of {found.hits} observed points whose rays meet it are within "
@@ -145,37 +165,13 @@ def _told(found: Fit, num_rays: int, distance: float, diagonal: float) -> str:
     return ", and ".join(parts)
 
 
-def _refuse_other_frame(found: Fit, told: str, fit: Callable[..., Fit]) -> None:
-    """Refuse a mesh that fits far better in another frame.
-
-    Raises:
-        InputError: Says which.
-    """
-    tried = [(fit(matrix, _TRIED), matrix) for matrix in _frames()]
-    fitting = [(one, matrix) for one, matrix in tried if one.score >= _GOOD]
-    if not fitting:
-        return
-    _, matrix = max(fitting, key=lambda pair: pair[0].score)
-    best, score = fit(matrix), 0.0 if math.isnan(found.score) else found.score
-    fits = best.score >= _GOOD and best.hits >= _MIN_SEEN * best.rays
-    if not fits or 1 - best.score > _BETTER * (1 - score):
-        return
-    raise InputError(
-        f"The given mesh is in another frame than the cameras: {told}. {_named(matrix)}, it would "
-        f"fit by {best.score:.0%} in the place of {score:.0%}. Change the mesh so, or export it "
-        "again in the frame and the unit of the cameras."
-    )
-
-
 def _frames() -> Iterator[Float[Tensor, "3 3"]]:
-    """List the ways in which programs exchange axes and units, all but the mesh as it is."""
+    """List the ways in which programs exchange axes and units."""
     eye = torch.eye(3, dtype=torch.float64)
-    for scale in _SCALES:
-        for order in permutations(range(3)):
-            for signs in product((1.0, -1.0), repeat=3):
-                matrix = scale * eye.new_tensor(signs)[:, None] * eye[list(order)]
-                if not bool((matrix == eye).all()):
-                    yield matrix
+    for scale, order, signs in product(
+        _SCALES, permutations(range(3)), product((1.0, -1.0), repeat=3)
+    ):
+        yield scale * eye.new_tensor(signs)[:, None] * eye[list(order)]
 
 
 def _named(matrix: Float[Tensor, "3 3"]) -> str:
@@ -189,112 +185,83 @@ def _named(matrix: Float[Tensor, "3 3"]) -> str:
         ("-" if float(row[axis]) < 0 else "") + "xyz"[axis]
         for row, axis in zip(matrix, matrix.abs().argmax(dim=1).tolist(), strict=True)
     ]
-    parts = []
-    if axes != ["x", "y", "z"]:
-        parts.append(f"With ({', '.join(axes)}) in the place of (x, y, z)")
-    if scale != 1:
-        parts.append(f"{scale:.4g} times as large")
-    named = ", ".join(parts)
-    return named[:1].upper() + named[1:]
+    exchanged = f"With ({', '.join(axes)}) in the place of (x, y, z)"
+    parts = [exchanged] if axes != ["x", "y", "z"] else []
+    return ", ".join([*parts, f"{scale:.4g} times as large"] if scale != 1 else parts)
 
 
 def _fit(
     caster: RayCaster,
     diagonal: float,
-    to_points: Rays,
-    to_pixels: Rays,
+    rays: Rays,
     world_from_mesh: Float[Tensor, "3 3"],
-    offset: Offset,
+    offset: Float[Tensor, "3"],
 ) -> Fit:
     """Compare the mesh as another frame has it: rays are carried to the frame that it is in."""
-    scale = float(world_from_mesh.abs().max())
     mesh_from_world = torch.linalg.inv(world_from_mesh)
-    shift = mesh_from_world.new_tensor(offset)
-    shift = mesh_from_world @ shift - shift
-
-    def cast(rays: Rays) -> tuple[Bool[Tensor, " ray"], Float[Tensor, " ray"]]:
-        found = caster.cast(
-            rays.origins @ mesh_from_world.mT + shift, rays.directions @ mesh_from_world.mT
-        )
-        return found.face >= 0, found.distance.double()
-
-    met, reached = cast(to_points)
-    length = to_points.directions.norm(dim=1)
+    shift = mesh_from_world @ offset - offset
+    found = caster.cast(
+        rays.origins @ mesh_from_world.mT + shift, rays.directions @ mesh_from_world.mT
+    )
+    met, length = found.face >= 0, rays.directions.norm(dim=1)
     # Nothing is near in a mesh that the cameras are inside of.
-    near = _NEAR * torch.minimum(length, torch.full_like(length, scale * diagonal))
-    on_mesh = met & ((reached - 1).abs() * length <= near)
-    hits = int(met.sum())
-    overlap = float("nan")
-    if len(to_pixels.inside):
-        shown, _ = cast(to_pixels)
-        union = int((shown | to_pixels.inside).sum())
-        overlap = int((shown & to_pixels.inside).sum()) / max(1, union)
-    enough = hits >= min(_MIN_HITS, max(1, len(met) // 4))
+    near = _NEAR * length.clamp_max(float(world_from_mesh.abs().max()) * diagonal)
+    on_mesh = met & ((found.distance.double() - 1).abs() * length <= near) & rays.to_point
+    hits, count = int(met[rays.to_point].sum()), int(rays.to_point.sum())
+    shown, inside = met[~rays.to_point], rays.inside[~rays.to_point]
+    enough = hits >= min(_MIN_HITS, max(1, count // 4))
+    fractions = (
+        int(on_mesh.sum()) / hits if enough else math.nan,
+        int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
+        if len(inside)
+        else math.nan,
+    )
+    known = [value for value in fractions if not math.isnan(value)]
     return Fit(
-        rays=len(met),
+        rays=count,
         hits=hits,
-        on_mesh=int(on_mesh.sum()) / hits if enough else float("nan"),
-        overlap=overlap,
+        on_mesh=fractions[0],
+        overlap=fractions[1],
+        score=sum(known) / len(known) if known else math.nan,
     )
 
 
-def _median_distance(mesh: Mesh, caster: RayCaster, to_points: Rays) -> float:
-    """Return the median distance from the mesh of points whose rays meet it; NaN if none does."""
-    met = caster.cast(to_points.origins, to_points.directions).face >= 0
-    points = (to_points.origins + to_points.directions)[met]
-    if len(points) == 0:
-        return float("nan")
-    return float(NearestSurface(mesh).query(points).distance.median())
+def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
+    """Return rays to observed points, with masks to those on the object; then through pixels.
 
-
-def _to_points(scene: SparseScene, masks: Bool[Tensor, "view height width"] | None) -> Rays:
-    """Return rays to observed points; with masks, to those on the object."""
+    Of every photograph that has a mask a raster of pixels is taken.
+    """
+    cameras, masked = scene.cameras, silhouettes.source == "masks"
+    masks = silhouettes.inside > 0.5
     step = -(-len(scene.observation_point) // _MAX_RAYS) or 1
     point, view = scene.observation_point[::step], scene.observation_view[::step]
-    centers = scene.cameras.centers_world.detach().double().cpu()
-    points = scene.points_world.detach().double().cpu()[point.cpu()]
-    origins = centers[view.cpu()]
-    kept = torch.ones(len(points), dtype=torch.bool)
-    if masks is not None:
-        pixels, depth = project(
-            scene.points_world[point][:, None],
-            scene.cameras.cam_from_world[view],
-            scene.cameras.intrinsics[view],
-        )
-        column, row = pixels[:, 0].nan_to_num(-1).floor().clamp(-1, 1e6).long().unbind(dim=-1)
+    if masked:
         height, width = masks.shape[-2:]
-        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        inside &= depth[:, 0] > 0
-        kept = inside & masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
-        kept = kept.cpu()
-    return Rays(origins=origins, directions=points - origins, inside=kept).take(kept)
-
-
-def _to_pixels(
-    cameras: Cameras,
-    masks: Bool[Tensor, "view height width"] | None,
-    reliable: Bool[Tensor, " view"],
-) -> Rays:
-    """Return rays through a raster of every photograph that has a mask, and what that says."""
-    poses, intrinsics = cameras.cam_from_world.detach().double(), cameras.intrinsics.detach()
-    none = poses.new_zeros(0, 3)
-    origins, directions = [none], [none]
-    inside = [torch.zeros(0, dtype=torch.bool, device=none.device)]
-    for view in range(cameras.num_views):
-        if masks is None or not bool(reliable[view]):
-            continue
-        width, height = (int(side) for side in cameras.sizes_px[view])
+        column, row = scene.observation_pixels[::step].floor().long().unbind(dim=-1)
+        drawn = masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        point, view = point[drawn], view[drawn]
+    centers = cameras.centers_world.detach().double()
+    to_points = scene.points_world[point].detach().double() - centers[view]
+    parts = [(centers[view], to_points, torch.ones_like(to_points[:, 0], dtype=torch.bool))]
+    for number in range(cameras.num_views):
+        width, height = (int(side) for side in cameras.sizes_px[number])
         step = -(-max(width, height) // _SIDE)
-        mask = masks[view, step // 2 : height : step, step // 2 : width : step].flatten()
-        if float(mask.float().mean()) > _WHOLE:
-            continue
-        pixels = pixel_centers(width, height, like=poses)[step // 2 :: step, step // 2 :: step]
-        rays = rays_through(pixels.reshape(-1, 2), poses[view], intrinsics[view].double())
-        directions.append(rays)
-        origins.append(cameras.centers_world[view].detach().double().expand_as(rays))
-        inside.append(mask.to(none.device))
+        mask = masks[number, step // 2 : height : step, step // 2 : width : step].flatten()
+        if masked and bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= _WHOLE:
+            rays = _through(cameras, number, step)
+            parts.append((centers[number].expand_as(rays), rays, mask))
+    origins, directions, inside = zip(*parts, strict=True)
     return Rays(
         origins=torch.cat(origins).cpu(),
         directions=torch.cat(directions).cpu(),
         inside=torch.cat(inside).cpu(),
+        to_point=torch.arange(sum(map(len, origins))) < len(point),
     )
+
+
+def _through(cameras: Cameras, view: int, step: int) -> Float[Tensor, "ray 3"]:
+    """Return rays through a raster of a photograph's pixels, a step apart."""
+    pose = cameras.cam_from_world[view].detach().double()
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    pixels = pixel_centers(width, height, like=pose)[step // 2 :: step, step // 2 :: step]
+    return rays_through(pixels.reshape(-1, 2), pose, cameras.intrinsics[view].detach().double())

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from pimper_torch.doctor.findings import Finding
+from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.doctor.photograph import Photograph
 
 # Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
@@ -67,19 +67,17 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     seconds, needed = estimate(megapixels, len(photographs))
     told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
     if available_gb is None or needed <= available_gb:
-        yield Finding(check="cost", severity="ok", found=told)
+        yield ok("cost", told)
         return
     longest = max(max(one.width, one.height) for one in photographs)
     fits = max(0.0, (0.9 * available_gb - _GB) / _GB_A_MEGAPIXEL)
     size = int(longest * min(1.0, fits / megapixels) ** 0.5) // 50 * 50
-    yield Finding(
-        check="cost",
-        severity="warning",
-        found=f"{told}; {available_gb:.1f} GB are free",
-        needed="as much memory as the run takes",
-        advice=f"Give `--max-size-px {size}`, or fewer photographs."
-        if size
-        else "Free memory, or take fewer photographs.",
+    smaller = f"Give `--max-size-px {size}`, or fewer photographs."
+    yield warned(
+        "cost",
+        f"{told}; {available_gb:.1f} GB are free",
+        "as much memory as the run takes",
+        smaller if size else "Free memory, or take fewer photographs.",
     )
 
 

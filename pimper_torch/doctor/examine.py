@@ -36,11 +36,7 @@ def examine_folder(
     read = read_all(paths, encoding, max_size_px)
     photographs = [one for one in read if isinstance(one, Photograph)]
     findings = [
-        Finding(
-            check="files",
-            severity="error",
-            found=str(error).rstrip("."),
-        )
+        Finding(check="files", severity="error", found=str(error).rstrip("."))
         for error in read
         if isinstance(error, InputError)
     ]

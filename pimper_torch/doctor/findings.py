@@ -1,11 +1,9 @@
 """What was found, what was needed, and what to do."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 Severity = Literal["ok", "note", "warning", "error"]
-_NAMED = 4  # photographs in a sentence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,11 +32,13 @@ class Finding:
         return f"{self.found}{needed}.{advice}"
 
 
-def listed(names: Sequence[str], at_most: int = _NAMED) -> str:
-    """Name a few of many.
+def ok(check: str, found: str) -> Finding:
+    """Return what a check found where all is well."""
+    return Finding(check=check, severity="ok", found=found)
 
-    >>> listed(["a", "b", "c"], at_most=2)
-    'a, b and 1 more'
-    """
-    more = len(names) - at_most
-    return ", ".join(names[:at_most]) + (f" and {more} more" if more > 0 else "")
+
+def warned(
+    check: str, found: str, needed: str, advice: str, severity: Severity = "warning"
+) -> Finding:
+    """Return what a check found where something is to be done."""
+    return Finding(check=check, severity=severity, found=found, needed=needed, advice=advice)

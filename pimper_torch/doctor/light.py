@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from pimper_torch.doctor.findings import Finding
-from pimper_torch.doctor.overlap import Match
+from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.doctor.photograph import Photograph
 from pimper_torch.radiometry import SATURATED
+from pimper_torch.sfm.matching import VerifiedPair
 
 _WINDOW = 5  # pixels of the small copy round a feature, as blobs are
 _NEIGHBOURS = 9  # features whose median tells shading, which is smooth, from noise, which is not
@@ -49,12 +49,12 @@ def light_variation(
     return _GAUSSIAN * float((smooth - smooth.median()).abs().median())
 
 
-def variations(photographs: Sequence[Photograph], matches: Sequence[Match]) -> list[float]:
+def variations(photographs: Sequence[Photograph], matches: Sequence[VerifiedPair]) -> list[float]:
     """Measure :func:`light_variation` of every pair with enough matches to tell it."""
     found = []
     means = [_mean(one) for one in photographs]
     for match in matches:
-        one, other = (means[index] for index in match.pair.tolist())
+        one, other = (means[index] for index in match.views)
         here, there = _at(one, match.first), _at(other, match.second)
         kept = (here > _DARK) & (there > _DARK)  # NaN where saturated
         if kept.sum() >= _MIN_MATCHES:
@@ -65,27 +65,26 @@ def variations(photographs: Sequence[Photograph], matches: Sequence[Match]) -> l
 def light(found: Sequence[float]) -> Iterator[Finding]:
     """Return whether the light varies from photograph to photograph."""
     if not found:
-        yield Finding(
-            check="light",
-            severity="note",
-            found="no two photographs have enough features in common to compare their light",
-            needed=f"{_MIN_MATCHES} matches",
-            advice="Photographs closer to one another, or with more texture, would tell.",
+        yield warned(
+            "light",
+            "no two photographs have enough features in common to compare their light",
+            f"{_MIN_MATCHES} matches",
+            "Photographs closer to one another, or with more texture, would tell.",
+            "note",
         )
         return
     middle = median(found)
     told = f"shading differs by {middle:.1%} between photographs, in the median of {len(found)} "
-    if middle < _CONSTANT:
-        yield Finding(
-            check="light",
-            severity="warning",
-            found=f"light hardly varies: {told}pairs",
-            needed=f"{_CONSTANT:.0%} or more",
-            advice="Normals come from light that moves. Move the lamp between photographs, or use "
-            "the flash of the camera in a dark room; else texture alone tells the shape.",
-        )
-    else:
-        yield Finding(check="light", severity="ok", found=f"light varies: {told}pairs")
+    if middle >= _CONSTANT:
+        yield ok("light", f"light varies: {told}pairs")
+        return
+    yield warned(
+        "light",
+        f"light hardly varies: {told}pairs",
+        f"{_CONSTANT:.0%} or more",
+        "Normals come from light that moves. Move the lamp between photographs, or use the flash "
+        "of the camera in a dark room; else texture alone tells the shape.",
+    )
 
 
 def _mean(one: Photograph) -> Float[Tensor, "rows columns"]:
@@ -100,6 +99,5 @@ def _mean(one: Photograph) -> Float[Tensor, "rows columns"]:
 def _at(
     mean: Float[Tensor, "rows columns"], pixels: Float[Tensor, "feature 2"]
 ) -> Float[Tensor, " feature"]:
-    rows, columns = mean.shape
     u, v = pixels.long().unbind(dim=1)
-    return mean[v.clamp(0, rows - 1), u.clamp(0, columns - 1)]
+    return mean[v.clamp(0, mean.shape[0] - 1), u.clamp(0, mean.shape[1] - 1)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from pimper_torch.cores import usable_cores
-from pimper_torch.doctor.findings import Finding
+from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.io.version import versions
 
 _GB = 1e9
@@ -21,32 +21,27 @@ def machine() -> Iterator[Finding]:
     """Report versions, device, threads and memory."""
     told = ", ".join(f"{name} {version}" for name, version in versions().items())
     missing = [name for name in _NEEDED if find_spec(name) is None]
-    yield Finding(
-        check="installed",
-        severity="error" if missing else "ok",
-        found=f"{told}{'; without ' + ', '.join(missing) if missing else ''}",
-        needed="all packages that pimper_torch names" if missing else "",
-        advice="Run `pip install pimper_torch` again." if missing else "",
-    )
+    if missing:
+        advice = "Run `pip install pimper_torch` again."
+        found = f"{told}; without {', '.join(missing)}"
+        yield warned("installed", found, "all packages that pimper_torch names", advice, "error")
+    else:
+        yield ok("installed", told)
     cuda = torch.cuda.is_available()
     device = f"CPU and {torch.cuda.get_device_name()}" if cuda else "CPU"
-    yield Finding(
-        check="device",
-        severity="ok",
-        found=f"{device}, {torch.get_num_threads()} threads on {usable_cores()} processors",
+    yield ok(
+        "device", f"{device}, {torch.get_num_threads()} threads on {usable_cores()} processors"
     )
     free, total = available_gb(), total_gb()
     if free is None or total is None:
         yield Finding(check="memory", severity="note", found="the system does not tell its memory")
         return
-    short = free < _LEAST_GB
-    yield Finding(
-        check="memory",
-        severity="warning" if short else "ok",
-        found=f"{free:.1f} of {total:.1f} GB are free",
-        needed=f"{_LEAST_GB} GB" if short else "",
-        advice="Close other programs; the demo takes that much." if short else "",
-    )
+    found = f"{free:.1f} of {total:.1f} GB are free"
+    if free < _LEAST_GB:
+        advice = "Close other programs; the demo takes that much."
+        yield warned("memory", found, f"{_LEAST_GB} GB", advice)
+    else:
+        yield ok("memory", found)
 
 
 def available_gb() -> float | None:

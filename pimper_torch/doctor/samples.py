@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pimper_torch.doctor.findings import Finding, listed
-from pimper_torch.errors import InputError
+from pimper_torch.doctor.findings import Finding, ok
+from pimper_torch.errors import InputError, some
 from pimper_torch.io.decode import read_header
 from pimper_torch.io.file_cautions import find_cautions, responses_told
 from pimper_torch.io.header import Header
@@ -22,7 +22,7 @@ def samples(paths: Sequence[Path | str], encoding: Encoding) -> Iterator[Finding
         yield Finding(
             check="samples",
             severity="warning",
-            found=f"{len(names)} of {len(headers)} photographs ({listed(names)}): {sentence}",
+            found=f"{len(names)} of {len(headers)} photographs ({some(names, 4)}): {sentence}",
         )
     if not cautions:
         given = encoding.response
@@ -30,7 +30,7 @@ def samples(paths: Sequence[Path | str], encoding: Encoding) -> Iterator[Finding
         if given == "auto":
             counts = responses_told(headers)
             taken = "; ".join(f"{what} ({count})" for what, count in counts.items())
-        yield Finding(check="samples", severity="ok", found=f"response {taken}")
+        yield ok("samples", f"response {taken}")
 
 
 def _header(path: Path | str) -> Header | None:

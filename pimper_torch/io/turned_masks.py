@@ -69,33 +69,29 @@ def choose_ways(
     ]
     if not open_ones:
         return False
-    edges = [
+    plain, turned = (
         torch.cat([_changes(masks[way], picture) for masks, picture in open_ones])
         for way in range(2)
-    ]
-    errors = _errors(*edges)
+    )
+    errors = 0.0
+    if min(len(plain), len(turned)) >= 2 * _APART:
+        variance = _APART * (plain.var() / len(plain) + turned.var() / len(turned))
+        errors = float((turned.mean() - plain.mean()) / variance.sqrt().clamp_min(1e-12))
+    stored = errors > _ERRORS
     told = f"{len(open_ones)} of {len(ways)} masks, whose photographs EXIF turns"
-    if errors > _ERRORS:
-        caution(
-            f"{where}: {told}, are drawn on the pixels that the files store, as their outlines "
-            "show; they are turned, too.",
-            stacklevel=4,
+    if stored:
+        told += (
+            ", are drawn on the pixels that the files store, as their outlines show; they are "
+            "turned, too."
         )
-    elif errors > -_ERRORS:
-        caution(
-            f"{where}: of {told}, nothing tells whether they are turned already; they are taken as "
-            "they are. If that is wrong, turn them.",
-            stacklevel=4,
+    else:
+        told = (
+            f"of {told}, nothing tells whether they are turned already; they are taken as they "
+            "are. If that is wrong, turn them."
         )
-    return errors > _ERRORS
-
-
-def _errors(one: Float[Tensor, " pixel"], other: Float[Tensor, " pixel"]) -> float:
-    """Return by how many standard errors the second mean is larger."""
-    if min(len(one), len(other)) < 2 * _APART:
-        return 0.0
-    variance = sum(_APART * part.var() / len(part) for part in (one, other))
-    return float((other.mean() - one.mean()) / torch.as_tensor(variance).sqrt().clamp_min(1e-12))
+    if errors > -_ERRORS:
+        caution(f"{where}: {told}", stacklevel=4)
+    return stored
 
 
 def _changes(

@@ -180,7 +180,6 @@ def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64
     """Compute the worst new shape for every neighbour that a vertex may be collapsed on.
 
     Args:
-        vertex: To be removed.
         ring: Its neighbours in order.
         score: Result, of every neighbour; -1 where a new face is too thin or folded.
     """

@@ -34,14 +34,12 @@ def align(
     """Align one view's patches by Gauss-Newton on the templates' slopes.
 
     Args:
-        log: Of the view's radiance.
         homographies: From steps of the plane to pixels, one a point.
         chosen: The template of each point.
         values: Of the templates, light taken out.
         slopes: By a step along the plane.
         inverse: Of the slopes' normal equations.
         offsets: Steps of the plane, homogeneous, one column a sample.
-        root: Of the window's weights.
         light: Basis of changes of light, orthonormal columns.
         limits: Iterations; the longest step; the step that converges; iterations after which the
             correlation is tested; its minimum; bounds of the contrast; the longest shift.

@@ -45,9 +45,7 @@ def register(
 
     Args:
         finest: Images, one row per view.
-        coarser: Their coarser levels, concatenated.
         unusable_finest: Fraction of every pixel that is unusable, in 255ths.
-        unusable_coarser: Of the coarser levels.
         levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.

@@ -21,7 +21,6 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
     """Estimate the variance from squared residuals, robustly.
 
     Args:
-        squares: Of the observed residuals.
         guess: Where Newton's method starts: the squared scale of an earlier call, or 0.
 
     Returns:

@@ -142,7 +142,6 @@ def costs(
 
     Args:
         finest: Gray images, one row per view.
-        coarser: Their coarser levels, concatenated.
         levels: Height, width and offset of every level.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.

@@ -118,9 +118,7 @@ def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_a
     """Return the Galerkin matrix of the coarse unknowns.
 
     Args:
-        matrix: Of the fine ones.
         prolong: From :func:`prolongation`.
-        restrict: Its transpose.
     """
     if compiled_for():
         from pimper_torch.kernels import aggregation as kernels

@@ -49,7 +49,6 @@ class Level:
     """A level: its matrix, smoother, prolongation and restriction.
 
     Args:
-        inverse_diagonal: Of its dominant diagonal.
         prolong: From the next level's unknowns to this one's; ``None`` on the last.
         restrict: The transpose.
     """
@@ -225,7 +224,6 @@ class Hierarchy:
         """Return a copy for a similar matrix: only the finest level is new.
 
         Args:
-            product: Of the new matrix.
             dominant: As :func:`dominant_diagonal` gives it for the new matrix.
         """
         other = object.__new__(Hierarchy)

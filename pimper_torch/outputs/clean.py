@@ -31,9 +31,6 @@ def clean_output(folder: Path | str) -> int:
 
     A result stays. One whose writing was cut off when it was whole is brought to its place.
 
-    Args:
-        folder: Of a run.
-
     Returns:
         How many bytes were freed.
 

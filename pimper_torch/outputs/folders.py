@@ -73,7 +73,6 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
     inside another one is part of it.
 
     Args:
-        folder: Its parents are made.
         overwrite: As of :func:`prepare_output`.
 
     Yields:

@@ -102,7 +102,6 @@ def integrate_normals(
             ``1 / (1 + (sigma / 8°)^2)``, if ``iterations`` is not 0.
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
-        iterations: Of the weighted refinement.
     """
     slopes = _slopes(normals, valid, steepest).movedim(-1, 1)
     slopes = fill_smoothly(slopes, valid.to(slopes)).double() * spacing[:, None, None, None]

@@ -56,7 +56,6 @@ def solve_poisson(
         source: ``s``. Without anchor no ``z`` can produce its mean, which is ignored; ``z``
             then has mean zero.
         weight_right: Of all steps to the right.
-        weight_down: Of all steps down.
         anchor: ``a`` of all samples, not negative.
 
     Differentiable in ``source``.

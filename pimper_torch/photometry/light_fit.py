@@ -43,7 +43,6 @@ def fit_lights(model: LightModel, samples: ImageSamples, iterations: int) -> Lig
 
     Args:
         model: Soft light or a point light, at the samples.
-        samples: Their radiance.
         iterations: At most, where no gradients are required.
     """
     limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)

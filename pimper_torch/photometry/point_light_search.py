@@ -41,7 +41,6 @@ def search_point_lights(
     direction :math:`d`. The best direction is taken; then weights and albedo are updated.
 
     Args:
-        samples: Their radiance.
         normals: Unit, world.
 
     Returns:

@@ -59,7 +59,6 @@ class Relighting(Record):
 
         Args:
             scene: Of the photographs that are judged by.
-            silhouettes: Of its views.
         """
         surface = TexturedSurface(asset)
         observed = observe_all(surface, scene, silhouettes)
@@ -102,7 +101,6 @@ def relight(
     Args:
         mesh: In the scene's frame, with albedo.
         scene: That the mesh was made from.
-        silhouettes: Of its views.
         held_out: What is predicted; without, the scene's own photographs.
     """
     surface = LitSurface(mesh)

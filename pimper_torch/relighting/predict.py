@@ -23,7 +23,6 @@ def predict(
     Args:
         mesh: With albedo; prepared where several pictures are wanted of it.
         camera: One.
-        light: Of one view.
         materials: Of the mesh; matte without.
 
     Returns:
@@ -41,11 +40,7 @@ def predict(
 def shaded(
     surface: LitSurface, pixels: SurfacePixels, light: ViewLights, materials: Materials | None
 ) -> Float[Tensor, "pixel channel"]:
-    """Return the linear radiance of pixels.
-
-    Args:
-        light: Of one view.
-    """
+    """Return the linear radiance of pixels."""
     material = None if materials is None else materials.at_vertices()[pixels.vertex]
     incidence = surface.incidence(pixels, light.direction_world, light.closeness)
     lit = response(pixels, incidence, material)[0]

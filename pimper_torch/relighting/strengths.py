@@ -42,7 +42,6 @@ def fit_strengths(
     Args:
         diffuse: Radiance under an ambient light of 1, one for all lights or one for each.
         response: Radiance under a directed light of strength 1.
-        scale: Of Cauchy's loss.
 
     Returns:
         Both, neither below 0, and the mean loss.

@@ -33,11 +33,7 @@ class Layer:
 
 
 def surface_layers(mesh: Mesh) -> list[Layer]:
-    """Return the layers of what a result's surface says of itself.
-
-    Args:
-        mesh: Of the asset.
-    """
+    """Return the layers of what a result's surface says of itself."""
     layers = []
     if mesh.expected_error is not None:
         about = "Standard deviation of the surface along its normal, as the run expects it"

@@ -77,11 +77,7 @@ def write_page(
 
 
 def asset_within(asset: Textured, path: Path) -> bytes:
-    """Read an asset's file, or make one with coarser textures where it is too large for a page.
-
-    Args:
-        path: Of the asset's GLB.
-    """
+    """Read an asset's file, or make one with coarser textures where it is too large for a page."""
     if path.stat().st_size <= _MAX_ASSET_BYTES or min(asset.base_color.shape[:2]) < 2:
         return path.read_bytes()
     with TemporaryDirectory(prefix="pimper_page_") as folder:

@@ -10,10 +10,12 @@ do not tell: a third of a carton's disagree with the right model, too, for its s
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
 from torch import Tensor
 
+from pimper_torch.records import Cameras
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
 from pimper_torch.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.sfm.model import SparseModel
@@ -83,15 +85,24 @@ def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> fl
         undistorted_pixels(model, view, pixels)
         for view, pixels in zip(pair.views, (pair.first, pair.second), strict=True)
     ]
-    errors = sampson_errors(epipolar_geometry(model, pair.views), *ends)
+    errors = sampson_errors(epipolar_geometry(pinholes_of(model), pair.views), *ends)
     return float((errors <= max_error_px).double().mean())
 
 
-def epipolar_geometry(model: SparseModel, views: PhotographPair) -> Float[Tensor, "3 3"]:
+def pinholes_of(model: SparseModel) -> Cameras:
+    """Return the pinholes behind a model's lenses."""
+    return Cameras(
+        intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
+        cam_from_world=model.cam_from_world,
+        sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
+    )
+
+
+def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Float[Tensor, "3 3"]:
     """Return ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
-    poses = (model.cam_from_world[view] for view in views)
+    poses = (cameras.cam_from_world[view] for view in views)
     motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))
-    intrinsics = (pinhole_of(model.lenses[view]) for view in views)
+    intrinsics = (cameras.intrinsics[view] for view in views)
     geometry: Tensor = fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
     return geometry
 

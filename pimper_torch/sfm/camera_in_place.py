@@ -62,10 +62,8 @@ def reference_from_photographs(
 
     Args:
         keypoints: Pixels, one tensor a photograph.
-        pairs: Their matches before verification.
         max_error_px: Distance up to which a match follows a map.
         fewest: Matches that tie a photograph.
-        generator: Of random numbers.
 
     Returns:
         ``A`` of each photograph, the identity where one cannot be tied; ``None`` where most
@@ -108,7 +106,6 @@ def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float
 
     Args:
         keypoints: Mapped pixels.
-        pairs: Their matches before verification.
         least_px: Given where more would not be needed.
     """
     lengths = torch.cat(
@@ -144,7 +141,6 @@ def tied_to(
         matched: Pixels in the reference and in each other photograph.
         max_error_px: Distance up to which a match follows a map.
         fewest: Matches that tie a photograph.
-        generator: Of random numbers.
         any_homography: See :func:`fit_map`.
 
     Returns:
@@ -186,7 +182,6 @@ def fit_map(
 
     Args:
         first: Pixels, also of matches that are wrong or of what turns.
-        second: Of the same points.
         centre: Of the picture, where the camera's axis meets it.
         max_error_px: Distance up to which a match follows.
         any_homography: Whether the last fits are of all homographies, which large turns need: a

@@ -13,7 +13,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.crops import follow_crops, possible_crops
+from pimper_torch.sfm.crops import REACHES, changed_views, points_tell, possible_crops, tell_crop
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
 from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
@@ -35,14 +35,14 @@ class Ways(NamedTuple):
     Attributes:
         plain: Resized; in the pixels of photographs as they stand, then as files store them, where
             no points tell. Empty where no resize leads to a photograph's shape.
-        cropped: Cut out in the usual ways, where sizes differ and no points tell.
+        cropped: Cut out in the usual ways, where sizes differ and no points tell of a resize.
     """
 
     plain: list[SparseModel]
     cropped: list[SparseModel]
 
 
-def existing_ways(views: Views, path: Path, *, matched: bool = False) -> Ways:
+def existing_ways(views: Views, path: Path) -> Ways:
     """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
@@ -51,8 +51,6 @@ def existing_ways(views: Views, path: Path, *, matched: bool = False) -> Ways:
         path: Folder of a COLMAP model, or of several in folders, of which the one with most of the
             photographs is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
-        matched: Photographs of another shape are no error yet: matches may tell that they were
-            cropped.
 
     Raises:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
@@ -70,17 +68,33 @@ def existing_ways(views: Views, path: Path, *, matched: bool = False) -> Ways:
         )
     shown = taken(views, model)
     sizes = _whole_sizes(shown)
-    if len(model.points_world):
-        model = follow_crops(model, shown, sizes, where)
-        return Ways([follow_pictures(model, shown, find_turns(model, shown, where))], [])
     crops = possible_crops(model, shown, sizes)
-    turned = [(one, turns) for one in crops for turns in possible_turns(one, shown)]
-    fits = all(one.any() for one in allowed_turns(model, shown))
-    plain = possible_turns(model, shown) if fits or not (matched and crops) else []
-    return Ways(
-        [follow_pictures(model, shown, turns) for turns in plain],
-        [follow_pictures(one, shown, turns) for one, turns in turned],
+
+    def by_points(one: SparseModel) -> Ways:
+        return Ways([follow_pictures(one, shown, find_turns(one, shown, where))], [])
+
+    if len(model.points_world) and not crops:
+        return by_points(model)
+    fits = bool(allowed_turns(model, shown).any(dim=1).all())
+    plain, cropped = (
+        [
+            (one, follow_pictures(one, shown, way))
+            for one in some
+            for way in possible_turns(one, shown)
+        ]
+        for some in ([model] if fits else [], crops)
     )
+    changed = changed_views(crops) if crops else []
+    # That photographs were resized is the plain explanation: it may be told in larger steps.
+    reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
+    if any(points_tell(one, shown, changed, reaches) for _, one in plain):
+        return by_points(model)
+    told = [points_tell(one, shown, changed) for _, one in cropped]
+    if any(told):
+        ways = by_points(cropped[told.index(max(told))][0])
+        tell_crop(where, ways.plain[0], crops, "what they show round its points")
+        return ways
+    return Ways([one for _, one in plain], [one for _, one in cropped])
 
 
 def _largest(views: Views, folder: Path) -> Path:

@@ -106,7 +106,6 @@ def guided_matches(
     """Match features among those that can show the same point.
 
     Args:
-        near: Which can.
         max_ratio: Of the angles between a descriptor and the two most like it.
 
     Returns:

@@ -81,7 +81,6 @@ def find_moved_object(
         sizes_px: Width and height of each.
         verified: Matches of each pair that its geometry explains.
         outside: Matches of the same pairs that it does not.
-        verify: Called for the latter.
         max_error_px: Distance from the epipolar line up to which a match is verified.
         fewest: Matches below which a pair does not count.
     """

@@ -7,21 +7,21 @@ the model has it. Squares round a point are compared with those of the other vie
 ways that the sizes allow.
 """
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import Views
 from pimper_torch.sfm.crops import resize_fits
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.quarter_turns import QUARTERS, turned_pixels, turned_size, turned_vectors
 from pimper_torch.sfm.squares import (
     ERRORS,
     SAMPLES,
-    Squares,
+    others_of,
     sides_of,
     squares_in,
     standard_errors,
@@ -42,32 +42,29 @@ def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
     its neighbourhoods agree much better another way round.
 
     Args:
-        model: Its views are the photographs, in their order.
+        model: Its views are the photographs, in their order, and have their shapes.
         where: The model is, for messages, as a sentence starts.
 
     Raises:
-        InputError: A photograph has another shape than the model's whichever way it is turned, or
-            may be turned either way.
+        InputError: A photograph may be turned by a quarter either way.
     """
-    allowed, exif = _allowed(model, views), _exif_turns(views)
-    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
+    allowed, exif = allowed_turns(model, views), _exif_turns(views)
     upright, stored = _hypotheses(exif, allowed)
     squares = _squares(model, views, allowed)
-    turns, sure = _better(squares, upright, stored)
-    turns = _each(squares, turns, allowed)
-    _require_sides(squares, model, sizes, turns, exif)
-    _tell(model, views, turns, where, sure=sure or not torch.equal(turns, upright))
+    changed = (upright != stored)[squares.model.observation_view]
+    one, other = (squares.agreement(way)[1][changed] for way in (upright, stored))
+    errors = standard_errors(other - one)
+    turns = _each(squares, stored if errors > ERRORS else upright, allowed)
+    _require_sides(squares, model, views, turns, exif)
+    sure = torch.equal(upright, stored) or abs(errors) > ERRORS or not torch.equal(turns, upright)
+    _tell(model, turns, where, sure=sure)
     _tell_strangers(squares, turns, where)
     return tuple(turns.tolist())
 
 
 def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
-    """List the turns that the pictures of a model without points may have, as :func:`find_turns`.
-
-    Raises:
-        InputError: A photograph has another shape than the model's whichever way it is turned.
-    """
-    ways = _hypotheses(_exif_turns(views), _allowed(model, views))
+    """List the turns that pictures may have which no points tell of, as :func:`find_turns`."""
+    ways = _hypotheses(_exif_turns(views), allowed_turns(model, views))
     return [tuple(one) for one in dict.fromkeys(tuple(way.tolist()) for way in ways)]
 
 
@@ -83,16 +80,6 @@ def allowed_turns(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
             for lens, size in zip(model.lenses, sizes, strict=True)
         ]
     ).reshape(-1, 4)
-
-
-def _allowed(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
-    """Find the turns that the shapes of pictures allow; refuse a photograph that has none."""
-    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
-    allowed = allowed_turns(model, views)
-    for name, lens, size, fits in zip(model.names, model.lenses, sizes, allowed, strict=True):
-        if not bool(fits.any()):
-            raise _other_shape(name, lens, size, "whichever way it is turned")
-    return allowed
 
 
 def _exif_turns(views: Views) -> Int[Tensor, " view"]:
@@ -111,20 +98,37 @@ def _hypotheses(
     return torch.where(allowed[:, 0], 0, stored), stored
 
 
-def _better(
-    squares: Squares, upright: Int[Tensor, " view"], stored: Int[Tensor, " view"]
-) -> tuple[Int[Tensor, " view"], bool]:
-    """Take the turns with which more agrees; tell whether that is sure."""
-    changed = (upright != stored)[squares.view]
-    if torch.equal(upright, stored):
-        return upright, True
-    one, other = (_own(squares, turns)[changed] for turns in (upright, stored))
-    errors = standard_errors(other - one)
-    return (stored if errors > ERRORS else upright), abs(errors) > ERRORS
+@dataclass(frozen=True, slots=True)
+class Squares:
+    """What is round the points in the photographs, each taken in four ways.
 
+    Attributes:
+        model: Of the points with the longest tracks.
+        patterns: Unit vectors without mean; zero where a turn is impossible or nothing is seen.
+    """
 
-def _own(squares: Squares, turns: Int[Tensor, " view"]) -> Float[Tensor, " observation"]:
-    return squares.agreement(turns)[torch.arange(len(squares.view)), turns[squares.view]]
+    model: SparseModel
+    patterns: Float[Tensor, "observation 4 sample"]
+
+    def agreement(
+        self, turns: Int[Tensor, " view"]
+    ) -> tuple[
+        Float[Tensor, "observation 4"], Float[Tensor, " observation"], Float[Tensor, " observation"]
+    ]:
+        """Correlate each observation with the others of its point, and with those of another.
+
+        Returns:
+            Turned each way; as the turns have it; and so, with another point.
+        """
+        rows = torch.arange(len(self.patterns)), turns[self.model.observation_view]
+        own = self.patterns[rows]
+        others, strangers = others_of(own, self.model.observation_point)
+        each = (self.patterns * others[:, None]).sum(dim=-1)
+        return each, each[rows], (own * strangers).sum(dim=-1)
+
+    def of(self, values: Float[Tensor, "observation 4"], view: int) -> Float[Tensor, "mine 4"]:
+        """Take a view's values."""
+        return values[self.model.observation_view == view]
 
 
 def _each(
@@ -132,21 +136,14 @@ def _each(
 ) -> Int[Tensor, " view"]:
     """Turn single views with which the others agree much better another way round."""
     for _ in range(_SWEEPS):
-        found, scores = turns.clone(), squares.agreement(turns)
-        gains: dict[int, tuple[float, int]] = {}
+        found, (scores, *_) = turns.clone(), squares.agreement(turns)
         for view, fits in enumerate(allowed):
-            mine = scores[squares.view == view]
-            means = mine.mean(dim=0).masked_fill(~fits, -torch.inf) if len(mine) else None
-            if means is None or int(means.argmax()) == int(turns[view]):
-                continue
+            mine = squares.of(scores, view)
+            means = mine.mean(dim=0).masked_fill(~fits, -torch.inf).nan_to_num(-torch.inf)
             best = int(means.argmax())
-            if (
-                means[best] > _LEAST
-                and standard_errors(mine[:, best] - mine[:, turns[view]]) > ERRORS
-            ):
-                gains[view] = float(means[best] - means[turns[view]]), best
-        for view, (_, best) in gains.items():
-            found[view] = best
+            gain = standard_errors(mine[:, best] - mine[:, turns[view]])
+            if means[best] > _LEAST and gain > ERRORS:
+                found[view] = best
         if torch.equal(found, turns):
             break
         turns = found
@@ -156,52 +153,38 @@ def _each(
 def _require_sides(
     squares: Squares,
     model: SparseModel,
-    sizes: Sequence[tuple[int, int]],
+    views: Views,
     turns: Int[Tensor, " view"],
     exif: Int[Tensor, " view"],
 ) -> None:
     """Refuse a quarter turn that nothing tells the side of: neither EXIF nor the points."""
-    scores = squares.agreement(turns)
+    scores, *_ = squares.agreement(turns)
     for view, turn in enumerate(turns.tolist()):
-        if turn % 2 == 0 or turn == int(exif[view]):
-            continue
-        mine = scores[squares.view == view]
-        if standard_errors(mine[:, turn] - mine[:, (turn + 2) % 4]) <= ERRORS:
-            raise _other_shape(
-                model.names[view],
-                model.lenses[view],
-                sizes[view],
-                "and neither EXIF nor the model's points tell how it was turned",
+        mine = squares.of(scores, view)
+        told = standard_errors(mine[:, turn] - mine[:, (turn + 2) % 4]) > ERRORS
+        if turn % 2 and turn != int(exif[view]) and not told:
+            lens, (width, height) = model.lenses[view], views.sizes_px[view].tolist()
+            raise InputError(
+                f"{model.names[view]} is {width}x{height}, but the COLMAP model's camera for it is "
+                f"{lens.width}x{lens.height}, which is another shape, and neither EXIF nor the "
+                "model's points tell how it was turned. Give the photographs the model was made "
+                "from, resized if you like, but neither cropped nor turned."
             )
 
 
-def _other_shape(name: str, lens: Lens, size: tuple[int, int], why: str) -> InputError:
-    return InputError(
-        f"{name} is {size[0]}x{size[1]}, but the COLMAP model's camera for it is "
-        f"{lens.width}x{lens.height}, which is another shape, {why}. Give the photographs the "
-        "model was made from, resized if you like, but neither cropped nor turned."
-    )
-
-
-def _tell(
-    model: SparseModel, views: Views, turns: Int[Tensor, " view"], where: str, *, sure: bool
-) -> None:
+def _tell(model: SparseModel, turns: Int[Tensor, " view"], where: str, *, sure: bool) -> None:
     """State which way round was taken for how many photographs."""
-    turned = {
-        90 * quarters: [model.names[view] for view in (turns == quarters).nonzero()[:, 0].tolist()]
-        for quarters in (1, 2, 3)
-    }
-    told = "; ".join(
-        f"{len(names)} by {degrees} degrees clockwise ({some(names, 4)})"
-        for degrees, names in turned.items()
-        if names
-    )
-    if told:
-        number = int((turns > 0).sum())
+    parts = []
+    for quarters in (1, 2, 3):
+        names = [model.names[view] for view in (turns == quarters).nonzero()[:, 0].tolist()]
+        if names:
+            parts.append(f"{len(names)} by {90 * quarters} degrees clockwise ({some(names, 4)})")
+    if parts:
         caution(
-            f"{where} was made of pictures that stand otherwise than the "
-            "photographs, such as the pixels that files store before EXIF turns them. Its cameras "
-            f"and observations are turned for {number} of {model.num_views} photographs: {told}.",
+            f"{where} was made of pictures that stand otherwise than the photographs, such as the "
+            "pixels that files store before EXIF turns them. Its cameras and observations are "
+            f"turned for {int((turns > 0).sum())} of {model.num_views} photographs: "
+            f"{'; '.join(parts)}.",
             stacklevel=5,
         )
     if not sure:
@@ -220,7 +203,8 @@ def _within(where: str) -> str:
 
 def _tell_strangers(squares: Squares, turns: Int[Tensor, " view"], where: str) -> None:
     """Warn where what is round the points agrees no better than by chance."""
-    excess = _own(squares, turns) - squares.chance(turns)
+    _, own, chance = squares.agreement(turns)
+    excess = own - chance
     told = excess[excess != 0]
     if len(told) < _TELLING or standard_errors(told) > ERRORS:
         return
@@ -248,4 +232,4 @@ def _squares(model: SparseModel, views: Views, allowed: Bool[Tensor, "view 4"]) 
             centers = turned_pixels(some.observation_pixels[here] * scale, *before, quarters)
             across = turned_vectors(sides[here], quarters)
             patterns[here, quarters] = squares_in(picture, centers, across)
-    return Squares(point=some.observation_point, view=some.observation_view, patterns=patterns)
+    return Squares(some, patterns)

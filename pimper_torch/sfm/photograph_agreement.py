@@ -3,27 +3,21 @@
 Matches that an epipolar geometry of their own explains are found without the cameras. With the
 right cameras most of them lie on these cameras' epipolar lines and before both; with wrong ones a
 few do by chance. Cameras of another convention are put right in every usual way, and tried again.
-Cameras of whole photographs beside cropped ones are cropped until matches lie nearest to the lines.
 """
 
-import math
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.epipolar import essential_from_Rt, fundamental_from_essential
 from torch import Tensor
 
-from pimper_torch.camera_files.conventions import CameraMistake, camera_mistakes
+from pimper_torch.camera_files.conventions import camera_mistakes, far_better
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.agreement import undistorted_pixels
-from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.crops import around, climbed, refused_crop, shifted_lenses, tell_crop
+from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pixels
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.squares import ERRORS, standard_errors
 from pimper_torch.sfm.static_background import sampson_errors
 
 # Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the
@@ -35,15 +29,23 @@ MIN_AGREEMENT = 0.5
 _LEFT, _MARGIN = 0.6, 0.05
 # Matches below which nothing is said: a choice.
 _FEWEST = 30
-# Cameras whose crop is off by so much must explain matches worse: a choice.
-_BESIDE_PX = 8.0
-# The last steps of the search for a crop: a choice.
-_STEP_PX = 0.5
-# Pairs that are looked at, those with most matches. A choice: enough, and a second.
-_PAIRS = 200
 
 
-def _agreement(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
+def explained_fraction(
+    model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
+) -> float:
+    """Return the fraction of matches that the cameras of a model explain."""
+    return _fraction(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
+
+
+def match_errors(model: SparseModel, verified: Sequence[VerifiedPair]) -> Float[Tensor, " match"]:
+    """Measure Sampson's distances of matches from the epipolar lines of a model, in pixels."""
+    cameras = pinholes_of(model)
+    errors = [_errors(cameras, pair) for pair in undistorted_pairs(model, verified)]
+    return torch.cat([*errors, torch.zeros(0, dtype=torch.float64)])
+
+
+def _fraction(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
     """Return the fraction of undistorted matches that cameras explain."""
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
     return right / max(sum(pair.num_matches for pair in pairs), 1)
@@ -73,23 +75,7 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
 
 def _errors(cameras: Cameras, pair: VerifiedPair) -> Float[Tensor, " match"]:
     """Measure Sampson's distances of matches, in pixels."""
-    motion = [
-        part
-        for view in pair.views
-        for part in (cameras.cam_from_world[view, :3, :3], cameras.cam_from_world[view, :3, 3:])
-    ]
-    one, other = (cameras.intrinsics[view] for view in pair.views)
-    geometry = fundamental_from_essential(essential_from_Rt(*motion), one, other)
-    return sampson_errors(geometry, pair.first, pair.second)
-
-
-def pinholes_of(model: SparseModel) -> Cameras:
-    """Return the pinholes behind a model's lenses."""
-    return Cameras(
-        intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
-        cam_from_world=model.cam_from_world,
-        sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
-    )
+    return sampson_errors(epipolar_geometry(cameras, pair.views), pair.first, pair.second)
 
 
 def undistorted_pairs(
@@ -103,82 +89,6 @@ def undistorted_pairs(
         )
         for pair in verified
     )
-
-
-def best_of(
-    models: Sequence[SparseModel], verified: Sequence[VerifiedPair], max_error_px: float
-) -> int:
-    """Choose the model that explains most matches; the first of equal ones."""
-    scores = [
-        _agreement(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
-        for model in models
-    ]
-    return scores.index(max(scores))
-
-
-def find_crop(
-    plain: SparseModel | None,
-    crops: Sequence[SparseModel],
-    verified: Sequence[VerifiedPair],
-    max_error_px: float,
-    where: str,
-) -> SparseModel | None:
-    """Find where photographs were cut out of the pictures that cameras are of, by their matches.
-
-    From the best of the usual crops on, all of them are shifted together until matches lie nearest
-    to the epipolar lines.
-
-    Args:
-        plain: Cameras of resized photographs, if such a shape is possible: the plain explanation.
-        crops: Cameras of photographs that were cropped in the usual ways; at least two.
-        verified: Matches that an epipolar geometry of their own explains.
-        max_error_px: Distance from epipolar lines that is not told from a larger one.
-        where: The cameras are, for messages.
-
-    Returns:
-        ``None`` where a resize explains the matches as well.
-
-    Raises:
-        InputError: A crop explains them better, but none explains them, or several do.
-    """
-    strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:_PAIRS]
-
-    def errors(model: SparseModel) -> Float[Tensor, " match"]:
-        cameras = pinholes_of(model)
-        found = [_errors(cameras, pair) for pair in undistorted_pairs(model, strongest)]
-        return torch.cat([*found, torch.zeros(0, dtype=torch.float64)]).clamp_max(max_error_px)
-
-    usual = min(crops, key=lambda model: float(errors(model).mean()))
-    cut = [one != other for one, other in zip(crops[0].lenses, crops[-1].lenses, strict=True)]
-    views = torch.tensor(cut).nonzero()[:, 0].tolist()
-
-    def shifted(shift: Float[Tensor, "2"]) -> SparseModel:
-        return shifted_lenses(usual, views, shift)
-
-    def nearest(shifts: Float[Tensor, "way 2"]) -> Float[Tensor, "2"]:
-        means = [errors(shifted(shift)).mean() for shift in shifts]
-        return shifts[torch.stack(means).argmin()]
-
-    middle, corner = (pinhole_of(model.lenses[views[0]])[:2, 2] for model in (crops[0], crops[-1]))
-    room = 2 * (middle - corner).abs()
-    shift, step = torch.zeros_like(room), float(room.max()) / 4
-    while step >= _STEP_PX:
-        shift = climbed(shift, step, nearest, torch.stack([-room, room]))
-        step /= 2
-    if standard_errors(errors(usual) - errors(shifted(shift))) <= ERRORS:
-        shift = torch.zeros_like(shift)
-    best = errors(shifted(shift))
-    better = math.inf if plain is None else standard_errors(errors(plain) - best)
-    if better <= ERRORS:
-        return None
-    crop, evidence = shifted(shift), "what their matches show"
-    beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]
-    sharp = min(standard_errors(one - best) for one in beside) > ERRORS
-    fraction = _agreement(undistorted_pairs(crop, verified), pinholes_of(crop), max_error_px)
-    if fraction <= 1 - _MARGIN or not sharp:
-        raise refused_crop(where, usual, views, evidence)
-    tell_crop(where, crop, views, evidence)
-    return crop
 
 
 def require_agreement(
@@ -197,30 +107,27 @@ def require_agreement(
     """
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     total = sum(pair.num_matches for pair in pairs)
-    given = _agreement(pairs, cameras, max_error_px)
+    given = _fraction(pairs, cameras, max_error_px)
     if total < _FEWEST or given > 1 - _MARGIN:
         return
-    tried = [
-        (_agreement(pairs, one.undo(cameras), max_error_px), one)
-        for one in camera_mistakes(cameras)
-    ]
-    best, mistake = max(tried, key=lambda one: one[0])
-    better = best > given + _MARGIN and 1 - best < _LEFT * (1 - given)
-    if given >= MIN_AGREEMENT and not better:
+    mistakes = camera_mistakes(cameras)
+    scores = [_fraction(pairs, one.undo(cameras), max_error_px) for one in mistakes]
+    best = far_better(given, scores, _LEFT, _MARGIN)
+    if given >= MIN_AGREEMENT and best is None:
         return
+    advice = _NOTHING_FITS
+    if best is not None:
+        advice = (
+            f"{scores[best]:.0%} do if {mistakes[best].meaning}. Put them right: "
+            f"{mistakes[best].remedy}. Needed here: cam_from_world, camera axes x right, y down, z "
+            "forward."
+        )
     raise InputError(
         f"{where}: these cameras and the photographs do not belong together: {given:.0%} of "
         f"{total} matches in {len(pairs)} pairs of photographs lie within "
         f"{max_error_px:g} px of the cameras' epipolar lines and before both cameras; needed: at "
         f"least {MIN_AGREEMENT:.0%}, and more than under other conventions. "
-        f"{_advice(best, mistake) if better else _NOTHING_FITS}"
-    )
-
-
-def _advice(fraction: float, mistake: CameraMistake) -> str:
-    return (
-        f"{fraction:.0%} do if {mistake.meaning}. Put them right: {mistake.remedy}. Needed here: "
-        "cam_from_world, camera axes x right, y down, z forward."
+        f"{advice}"
     )
 
 

@@ -39,8 +39,6 @@ def turned_pixels(
 
     Args:
         pixels: In the picture before.
-        width: Of the picture before.
-        height: Of the picture before.
         quarters: Any whole number.
 
     >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
@@ -90,7 +88,6 @@ def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]
     """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
 
     Args:
-        lens: Of the whole picture.
         width: Of what is cut out.
         height: Of what is cut out.
         corner: Its pixel in the whole picture.

@@ -243,9 +243,9 @@ class Reconstruct(Stage):
 
     def _given(self, views: Views, path: Path) -> SparseModel:
         """Read cameras, and triangulate points where they come without."""
-        plain, cropped = existing_ways(views, path, matched=True)
+        plain, cropped = existing_ways(views, path)
         first = (plain or cropped)[0]
-        if not lacks_points(first):
+        if not cropped and not lacks_points(first):
             return first
         return self._triangulated(taken(views, first), plain, place(path), cropped)
 

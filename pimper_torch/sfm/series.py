@@ -59,7 +59,6 @@ def with_series(
 
     Args:
         model: In the object's frame; of all photographs or some.
-        numbers: Of its views' series.
     """
     kept = torch.nonzero(torch.bincount(numbers)[numbers] >= FEWEST_VIEWS)[:, 0]
     small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS

@@ -4,8 +4,6 @@ A square lies on the plane across a point's mean viewing direction. It is correl
 of those of the point's other views.
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -24,34 +22,6 @@ SAMPLES = (2 * _REACH + 1) ** 2
 
 # Standard errors by which one way must be better than another, and observations it takes: choices.
 ERRORS, _FEWEST = 4.0, 8
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Squares:
-    """What is round the points in the photographs, each taken in four ways.
-
-    Attributes:
-        point: That each observation sees.
-        view: It is made in.
-        patterns: Unit vectors without mean; zero where a turn is impossible or nothing is seen.
-    """
-
-    point: Int[Tensor, " observation"]
-    view: Int[Tensor, " observation"]
-    patterns: Float[Tensor, "observation 4 sample"]
-
-    def agreement(self, turns: Int[Tensor, " view"]) -> Float[Tensor, "observation 4"]:
-        """Correlate each observation, turned each way, with the mean of the others of its point."""
-        others, _ = others_of(self._taken(turns), self.point)
-        return (self.patterns * others[:, None]).sum(dim=-1)
-
-    def chance(self, turns: Int[Tensor, " view"]) -> Float[Tensor, " observation"]:
-        """Correlate each observation with the mean of another point."""
-        own = self._taken(turns)
-        return (own * others_of(own, self.point)[1]).sum(dim=-1)
-
-    def _taken(self, turns: Int[Tensor, " view"]) -> Float[Tensor, "observation sample"]:
-        return self.patterns[torch.arange(len(self.view)), turns[self.view]]
 
 
 def others_of(

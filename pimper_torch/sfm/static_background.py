@@ -105,7 +105,6 @@ def find_static_background(
 
     Args:
         keypoints: Pixels, one tensor a photograph.
-        pairs: Their matches before verification.
         verify: Gives those matches of each pair that one epipolar geometry explains; called for
             moving matches only.
         still_px: Distance between the features of a still match, less than.
@@ -196,7 +195,6 @@ def fundamental_matrix(
 
     Args:
         first: Pixels, 8 or more.
-        second: Of the same points.
         weight: Of the squared residuals.
 
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.

@@ -171,7 +171,6 @@ def sight(
     taken. In the other views it is where the same patch is found.
 
     Args:
-        pictures: Of the undistorted photographs.
         cameras: Theirs, float64.
         settings: When a point counts as found.
 

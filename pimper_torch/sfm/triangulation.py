@@ -14,9 +14,10 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.agreement import epipolar_geometry, undistorted_pixels
+from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pixels
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
+from pimper_torch.sfm.crops import find_crop
 from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -32,10 +33,8 @@ from pimper_torch.sfm.matching import (
 )
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import (
-    best_of,
     explained,
-    find_crop,
-    pinholes_of,
+    explained_fraction,
     require_agreement,
     undistorted_pairs,
 )
@@ -118,6 +117,8 @@ def triangulate(
         given = given if crop is None else crop
         assert given is not None, "a crop is found, or refused, where no resize is possible"
         require_agreement(given, verified, limit, where)
+        if crops and not lacks_points(given):
+            return given
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
@@ -143,7 +144,10 @@ def _way(
     """Choose between cameras of photographs as they stand, and as their files store them."""
     if len(models) == 1:
         return models[0]
-    best = best_of(models, verified, settings.matching.max_error_px)
+    scores = [
+        explained_fraction(model, verified, settings.matching.max_error_px) for model in models
+    ]
+    best = scores.index(max(scores))
     if sum(pair.num_matches for pair in verified) < settings.matching.min_inliers:
         caution(
             f"{where}: EXIF turns photographs, and neither sizes nor matches tell whether its "
@@ -169,7 +173,7 @@ def _match_along_lines(
 ) -> None:
     """Replace what was verified by matches along the cameras' epipolar lines."""
     matching = settings.matching
-    pairs = _pairs(model, verified, settings)
+    pairs, cameras = _pairs(model, verified, settings), pinholes_of(model)
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
@@ -182,18 +186,18 @@ def _match_along_lines(
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = Near(epipolar_geometry(model, pair), matching.max_error_px, planar=False)
+            near = Near(epipolar_geometry(cameras, pair), matching.max_error_px, planar=False)
             found = guided_matches(first, second, near, matching.max_ratio)
             ends = VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
             )
-            return found[explained(pinholes_of(model), ends, matching.max_error_px)]
+            return found[explained(cameras, ends, matching.max_error_px)]
 
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
             geometry = loaded().TwoViewGeometry()
             geometry.config = kinds.CALIBRATED
-            geometry.F = epipolar_geometry(model, pair).numpy()
+            geometry.F = epipolar_geometry(cameras, pair).numpy()
             geometry.inlier_matches = found.numpy().astype(np.uint32)
             stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
 

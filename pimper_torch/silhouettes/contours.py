@@ -90,9 +90,6 @@ class TraceContours(Stage):
     def forward(self, silhouettes: Silhouettes, cameras: Cameras) -> Contours:
         """Cast rays through the silhouettes and build their visual hull.
 
-        Args:
-            cameras: Of the same views.
-
         Returns:
             Contours that constrain nothing where silhouettes leave nothing out, and, with a
             warning, where they have no place in common.

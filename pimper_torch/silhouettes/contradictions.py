@@ -73,7 +73,6 @@ def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> Bool[Tensor, " 
 
     Args:
         silhouettes: At least one pixel in every reliable view.
-        cameras: Of the same views.
 
     Returns:
         All of them where fewer than three, or no more than half, would agree.

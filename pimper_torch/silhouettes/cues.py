@@ -103,7 +103,6 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
     """Gather what is known of the object from photographs, cameras and cloud.
 
     Args:
-        scene: Of the photographs' size.
         details: Settings that are the same for all photographs.
     """
     scene = scene.to("cpu", torch.float32)

@@ -177,7 +177,6 @@ def visual_hull(
 
     Args:
         silhouettes: Where the views show the object.
-        cameras: Of the same views.
         box_world: Smallest and largest corner of the region to look in; the grid is fitted to
             what it holds.
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
@@ -312,7 +311,6 @@ def _vote(
 
     Args:
         maps: Distances to the silhouettes in pixels, one a view.
-        cameras: Of the same views.
         projected: Homogeneous pixels of the first voxel, and what a step along each axis adds.
         reach: Numbers of the voxels along each axis.
         fractions: Of views that may disagree, and that must look.

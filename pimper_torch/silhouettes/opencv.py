@@ -53,7 +53,6 @@ def warped(
     """Look up a picture through a homography, bilinearly; NaN beyond its border.
 
     Args:
-        picture: To look up.
         homography: From pixels of the result to those of ``picture``.
         size_px: Width and height of the result.
     """

@@ -66,7 +66,6 @@ def contour_points(
     the surface is tangent there, so that this matters little across it.
 
     Args:
-        hull: Of the same silhouettes.
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
             any, positions are in the centre of what is in the hull.
         normals_world: Theirs, unit, outward.

@@ -15,7 +15,6 @@ def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit =
 
     Args:
         bars: One at least.
-        unit: Of their lengths.
 
     Raises:
         InputError: A place cannot be found, see :func:`~pimper_torch.size.marks.place_of`.
@@ -38,7 +37,6 @@ def scale_of_cameras(
 
     Args:
         distances: One at least.
-        unit: Of their lengths.
 
     Raises:
         InputError: A photograph has no camera.

@@ -75,7 +75,6 @@ def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
 
     Args:
         lengths: One at least.
-        unit: Of the known ones.
         source: What they come from.
 
     Raises:

@@ -50,7 +50,6 @@ def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
     """Put markers along the border of a sheet; the object stands in the middle.
 
     Args:
-        side_mm: Of the black squares.
         paper: Upright.
 
     Raises:

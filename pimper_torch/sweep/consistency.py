@@ -32,7 +32,6 @@ def inconsistency(
         seen: Views that take part; the same for all hypotheses, as costs of different sets
             could not be compared.
         scale: ``c``, in units of radiance.
-        iterations: Of the albedo.
 
     Differentiable in radiance, shading and scale, through the iterations of the albedo.
     """

@@ -46,7 +46,6 @@ def posterior_variance(
     its variance, and further minima that are nearly as low add their spread.
 
     Args:
-        cost: Of evenly spaced hypotheses.
         position: Of the minimum, in steps from the first hypothesis.
         curvature: Second derivative there; where it is 0 the variance is infinite.
 

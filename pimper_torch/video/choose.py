@@ -64,10 +64,6 @@ def scanned(frames: Iterable[UInt8[Tensor, "height width"]]) -> Scan:
 def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
     """Choose the sharpest frame of each of equal stretches of the way.
 
-    Args:
-        scan: Of all frames.
-        count: Of frames to choose.
-
     Returns:
         Numbers of frames, ascending; fewer where others show what these do.
 

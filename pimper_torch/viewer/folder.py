@@ -99,8 +99,9 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
         read = None if cls is None else kept.find(key, cls)
         if read is None:
             continue
-        mesh = read.record.mesh
-        for place in _places(stages, read.about["reports"]):
+        record, about = read
+        mesh = record.mesh
+        for place in _places(stages, about["reports"]):
             error = mesh.expected_error
             found[place] = mesh.replace(
                 vertices_world=factor * mesh.vertices_world,

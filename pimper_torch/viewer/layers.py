@@ -52,7 +52,6 @@ def painted(mesh: Mesh, name: str, frame: Frame, unit: str = "scene units") -> L
         mesh: On the CPU.
         name: One of :func:`layers_of`.
         frame: In which normals have colours.
-        unit: Of its vertices.
     """
     own = vertex_normals(mesh.vertices_world, mesh.faces)
     carried = own if mesh.normals_world is None else mesh.normals_world

@@ -104,7 +104,6 @@ def frame(
 
     Args:
         points_world: At least one of them before the camera.
-        longer_side_px: Of the new picture.
         margin: Round the box, as a fraction of its longer side.
     """
     return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
@@ -118,7 +117,6 @@ def crop(
     Args:
         low: Upper left corner, pixels; may lie outside the picture, as all of it may.
         high: Lower right corner.
-        longer_side_px: Of the new picture.
     """
     factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()

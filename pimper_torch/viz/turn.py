@@ -87,7 +87,6 @@ def circling(
         up: Unit, world frame.
         start: Place above or below which the first one stands, world.
         number: Of cameras, equally far apart.
-        side_px: Of their pictures.
     """
     low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
     center = (low + high) / 2

@@ -13,7 +13,7 @@ from pimper_torch.doctor.each import blur, exposure, lenses, number, saturation
 from pimper_torch.doctor.examine import examine_folder, examine_views
 from pimper_torch.doctor.light import light, light_variation
 from pimper_torch.doctor.machine import available_gb, machine, total_gb
-from pimper_torch.doctor.overlap import Match, match_copies, overlap
+from pimper_torch.doctor.overlap import match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, summarize
 from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.evidence.scenes.meshes import icosphere
@@ -21,6 +21,7 @@ from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Mesh
+from pimper_torch.sfm.matching import VerifiedPair
 
 
 @pytest.fixture
@@ -151,7 +152,7 @@ def test_light_that_does_not_vary_is_warned_of():
 
 def test_photographs_that_nothing_connects_are_named():
     def match(*pair):
-        return Match(pair=torch.tensor(pair), first=torch.zeros(1, 2), second=torch.zeros(1, 2))
+        return VerifiedPair(views=pair, first=torch.zeros(1, 2), second=torch.zeros(1, 2))
 
     names = ("a", "b", "c", "d")
     assert severities(overlap(names, [match(0, 1), match(1, 2), match(2, 3)])) == ["ok"]
@@ -228,7 +229,7 @@ def test_matches_lie_on_the_same_points(scenes):
     (match,) = match_copies([one.small, shifted.small])
     assert len(match.first) > 50
     off = (match.second - match.first).median(dim=0).values
-    torch.testing.assert_close(off, torch.tensor([5.0, 3.0]), atol=0.1, rtol=0)
+    torch.testing.assert_close(off, torch.tensor([5.0, 3.0]).to(off), atol=0.1, rtol=0)
 
 
 def test_what_files_say_about_their_samples_is_told(scenes, tmp_path):

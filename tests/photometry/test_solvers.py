@@ -14,7 +14,6 @@ from pimper_torch.photometry.sample_estimates import refine_on_manifold
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.alternation import solve_alternation
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
-from pimper_torch.single_view.factorization.descent import solve_descent
 
 
 def solve_projection(problem, max_iterations, tolerance):
@@ -22,9 +21,7 @@ def solve_projection(problem, max_iterations, tolerance):
     return solve_variable_projection(problem, max_iterations, tolerance**2)
 
 
-SOLVERS = pytest.mark.parametrize(
-    "solve", [solve_alternation, solve_balm, solve_descent, solve_projection]
-)
+SOLVERS = pytest.mark.parametrize("solve", [solve_alternation, solve_balm, solve_projection])
 
 
 def error(found, truth, weight, least=7):
@@ -51,11 +48,11 @@ def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
         away = (torch.arange(150) - 7 * view) % 150 < 75
         weight[:, view, away] = 0
     given = given.replace(weight=weight, radiance=weight * given.radiance)
-    found = solve_descent(given, 800, 1e-8)
+    found = solve_projection(given, 800, 1e-8)
     assert error(found.shading, shading, weight) < 1e-3
 
 
-def test_balm_and_descent_agree_on_clean_data(problem):
+def test_balm_and_variable_projection_agree_on_clean_data(problem):
     given, _, _ = problem(missing=0.3)
     regularization = torch.full_like(
         given.regularization, 3.0
@@ -64,10 +61,12 @@ def test_balm_and_descent_agree_on_clean_data(problem):
     given = given.replace(
         regularization=regularization, prior=0.1 * given.manifold.normal_prior(normals.mT)
     )
-    balm, descent = solve_balm(given, 800, 1e-8), solve_descent(given, 800, 1e-8)
-    assert_close(balm.shading, descent.shading, rtol=0, atol=2e-4)
-    assert_close(balm.lights, descent.lights, rtol=0, atol=2e-4)
-    costs = [objective(given, each.lights, each.shading, given.weight) for each in (balm, descent)]
+    balm, projection = solve_balm(given, 800, 1e-8), solve_projection(given, 800, 1e-8)
+    assert_close(balm.shading, projection.shading, rtol=0, atol=2e-4)
+    assert_close(balm.lights, projection.lights, rtol=0, atol=2e-4)
+    costs = [
+        objective(given, each.lights, each.shading, given.weight) for each in (balm, projection)
+    ]
     assert_close(*costs, rtol=1e-4, atol=1e-8)
     assert (costs[0] < objective(given, given.lights, given.shading, given.weight)).all()
 
@@ -148,7 +147,7 @@ def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it
     given = given.replace(radiance=noisy)
     found = solve_balm(given, 300, 1e-7)
     reached = refine_on_manifold(given, found)
-    again = solve_descent(given.replace(shading=found.shading), 500, 1e-12)
+    again = solve_projection(given.replace(shading=found.shading), 500, 1e-12)
     assert_close(reached.albedo, again.shading[:, 0], rtol=0, atol=1e-5)
 
     radiance = given.radiance.clone().requires_grad_()
@@ -158,7 +157,7 @@ def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it
     for sign in (1, -1):
         moved = noisy.clone()
         moved[0, 5, 3] += sign * step
-        there.append(solve_descent(given.replace(radiance=moved), 500, 1e-12).shading[0, 0, 3])
+        there.append(solve_projection(given.replace(radiance=moved), 500, 1e-12).shading[0, 0, 3])
     slope = (there[0] - there[1]) / (2 * step)
     assert_close(radiance.grad[0, 5, 3], slope, rtol=0.05, atol=1e-4)  # Gauss-Newton's part
     assert (radiance.grad[0, :, :3] == 0).all()

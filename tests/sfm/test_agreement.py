@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.agreement import agreement, epipolar_geometry, judged
+from pimper_torch.sfm.agreement import agreement, epipolar_geometry, judged, pinholes_of
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
@@ -55,7 +55,7 @@ def test_the_epipolar_geometry_is_that_of_the_cameras(generator):
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     ones = torch.ones(20, 1, dtype=torch.float64)
     first, second = (torch.cat([pixels[view], ones], dim=1) for view in (1, 4))
-    F = epipolar_geometry(model, (1, 4))
+    F = epipolar_geometry(pinholes_of(model), (1, 4))
     assert_close((second * (first @ F.mT)).sum(dim=1) / F.norm(), torch.zeros(20).double())
 
 

@@ -175,15 +175,6 @@ def test_a_mirrored_photograph_beside_a_model_of_stored_pixels_is_refused_by_nam
         existing_model(views, sparse)
 
 
-def test_a_photograph_of_another_shape_is_refused(stored, sparse):
-    blank = stored.replace(
-        images=torch.full_like(stored.images, 0.3),
-        sizes_px=stored.sizes_px - torch.tensor([40, 0]),
-    )
-    with pytest.raises(InputError, match=r"440x360.*480x360.*whichever way it is turned"):
-        existing_model(blank, sparse)
-
-
 def test_poses_of_other_photographs_are_warned_of(stored, sparse):
     order = [3, 5, 4, 0, 2, 1]
     shuffled = stored.replace(images=stored.images[order])

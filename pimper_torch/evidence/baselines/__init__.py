@@ -1,8 +1,6 @@
 """Baselines, run on the same scene as the method."""
 
 from pimper_torch.evidence.baselines.colmap_dense import ColmapDense, ColmapDenseConfig
-from pimper_torch.evidence.baselines.global_stereo import GlobalStereo, GlobalStereoConfig
-from pimper_torch.evidence.baselines.lim import Lim, LimConfig
 from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
 from pimper_torch.evidence.baselines.pmvs import Pmvs, PmvsConfig
 from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
@@ -10,10 +8,6 @@ from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
 __all__ = [
     "ColmapDense",
     "ColmapDenseConfig",
-    "GlobalStereo",
-    "GlobalStereoConfig",
-    "Lim",
-    "LimConfig",
     "OpenMvs",
     "OpenMvsConfig",
     "Pmvs",

@@ -100,7 +100,6 @@ class ColmapDense(Stage):
 
         Args:
             scene: Its cloud chooses pairs of views and ranges of depth.
-            coarse: Only names the reference view.
 
         Returns:
             A mesh in the scene's frame, or points with normals.

@@ -126,9 +126,7 @@ def run_program(
     It and all that it started are stopped at the deadline or when we are interrupted.
 
     Args:
-        command: Executable and arguments.
         folder: Working directory. What the program prints is kept there too.
-        deadline: When to stop it.
         threads: For programs that ask OpenMP.
 
     Returns:

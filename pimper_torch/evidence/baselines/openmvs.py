@@ -87,7 +87,6 @@ class OpenMvs(Stage):
 
         Args:
             scene: Its cloud chooses pairs of views.
-            coarse: Only names the reference view.
 
         Returns:
             A mesh in the scene's frame.

@@ -87,7 +87,6 @@ class Pmvs(Stage):
 
         Args:
             scene: Its cloud is not used.
-            coarse: Only names the reference view.
 
         Returns:
             Points with outward normals, without faces, in the scene's frame.

@@ -63,7 +63,6 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
     """Read a rendered scene and find its cameras, from the files as a user would.
 
     Args:
-        folder: Of the scene.
         cache: Folder where models are kept; the seconds of one from there are those that it
             took to find.
 

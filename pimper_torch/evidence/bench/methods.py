@@ -9,8 +9,6 @@ from torch import nn
 from pimper_torch.chains.presets import load_config, make_chain
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.baselines.colmap_dense import ColmapDense
-from pimper_torch.evidence.baselines.global_stereo import GlobalStereo
-from pimper_torch.evidence.baselines.lim import Lim
 from pimper_torch.evidence.baselines.openmvs import OpenMvs
 from pimper_torch.evidence.baselines.pmvs import Pmvs
 from pimper_torch.evidence.baselines.smoothed import Smoothed
@@ -50,8 +48,6 @@ Method = Callable[[SparseScene, CoarseMesh], Outcome]
 
 _BASELINES: dict[str, Callable[[], nn.Module]] = {
     "smoothed": Smoothed,
-    "global-stereo": GlobalStereo,
-    "lim": Lim,
     "pmvs": Pmvs,
     "openmvs": OpenMvs,
     "colmap-dense": ColmapDense,

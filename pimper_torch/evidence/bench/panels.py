@@ -35,7 +35,6 @@ def method_panels(
     Args:
         mesh: In the frame of the truth.
         met: Where the rays of the reference view meet it; ``None`` if none does.
-        inputs: What it was made from.
         heatmap: Where the errors are drawn, as PNG.
     """
     truth = inputs.maps

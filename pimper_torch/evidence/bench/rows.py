@@ -124,46 +124,27 @@ class Table(Record):
     settings: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
-def _published(scene: str, **figures: int | float) -> Row:
-    return Row(scene=scene, method="PiMPeR", published=True, **figures)  # type: ignore[arg-type]
-
-
+_PRINTED = (
+    # scene, mesh points, triangles, samples, missing %, minutes, 3D error %
+    ("mug", 115, 198, 6_690_000, 24.7, 24.4, 7.1),
+    ("jar", 130, 206, 22_600_000, 57.8, 33.1, 9.34),
+    ("balls", 250, 362, 42_400_000, 69.5, 62.6, 9.69),
+    ("potatoes", 150, 276, 36_700_000, 62.7, 50.8, 11.15),
+)
 PUBLISHED = (
-    _published(
-        "mug",
-        mesh_points=115,
-        triangles=198,
-        samples=6_690_000,
-        missing_percent=24.7,
-        minutes=24.4,
-        relative_error=7.1,
-    ),
-    _published(
-        "jar",
-        mesh_points=130,
-        triangles=206,
-        samples=22_600_000,
-        missing_percent=57.8,
-        minutes=33.1,
-        relative_error=9.34,
-    ),
-    _published(
-        "balls",
-        mesh_points=250,
-        triangles=362,
-        samples=42_400_000,
-        missing_percent=69.5,
-        minutes=62.6,
-        relative_error=9.69,
-    ),
-    _published(
-        "potatoes",
-        mesh_points=150,
-        triangles=276,
-        samples=36_700_000,
-        missing_percent=62.7,
-        minutes=50.8,
-        relative_error=11.15,
+    *(
+        Row(
+            scene=scene,
+            method="PiMPeR",
+            mesh_points=points,
+            triangles=triangles,
+            samples=samples,
+            missing_percent=missing,
+            minutes=minutes,
+            relative_error=error,
+            published=True,
+        )
+        for scene, points, triangles, samples, missing, minutes, error in _PRINTED
     ),
     Row(
         scene="potatoes",

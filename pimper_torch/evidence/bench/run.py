@@ -74,10 +74,8 @@ def run_bench(
     first scene, the scenes that are complete are written.
 
     Args:
-        config: Scenes and methods.
         folder: New or empty.
         observer: Hears of every scene and method.
-        overwrite: Replace a former result.
         cache: Folder where the models of structure from motion are kept from run to run.
 
     Raises:

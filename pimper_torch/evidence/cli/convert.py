@@ -32,8 +32,10 @@ from pimper_torch.evidence.datasets import (
     write_idr,
     write_transforms,
 )
-from pimper_torch.evidence.datasets.posed import assemble, shrink
+from pimper_torch.evidence.datasets.posed import assemble
 from pimper_torch.exchange.nerfstudio import thinned
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.radiance import resized_mask, resized_radiance
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
@@ -192,8 +194,21 @@ def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
         raise InputError(f"--max-size-px is {max_size_px}; needed: 0, or the longest side.")
     capture = read_rendered(folder, maps=False)
     assert capture.cameras is not None
-    views, cameras = shrink(capture.views, capture.cameras, max_size_px)
-    return capture.replace(views=views, cameras=cameras)
+    views, whole = capture.views, capture.cameras.sizes_px[0].tolist()
+    if not 0 < max_size_px < max(whole):
+        return capture
+    width, height = (max(1, round(side * max_size_px / max(whole))) for side in whole)
+    small = torch.tensor([[width, height]] * views.num_views)
+    images = torch.stack([resized_radiance(image, width, height) for image in views.images])
+    masks = views.masks
+    if masks is not None:
+        masks = torch.stack([resized_mask(mask.float(), width, height) for mask in masks])
+    factors = width / whole[0], height / whole[1]
+    intrinsics = scale_intrinsics(capture.cameras.intrinsics, *factors)
+    return capture.replace(
+        views=views.replace(images=images, masks=masks, sizes_px=small),
+        cameras=capture.cameras.replace(intrinsics=intrinsics, sizes_px=small),
+    )
 
 
 def read(job: Job) -> Capture:

@@ -1,20 +1,18 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
-from pimper_torch.evidence.datasets.check import check_capture, require_consistent
-from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
+from pimper_torch.evidence.datasets.check import check_capture
+from pimper_torch.evidence.datasets.colmap import read_colmap
 from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
 from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, write_idr
 from pimper_torch.evidence.datasets.llff import read_llff
-from pimper_torch.evidence.datasets.meshroom import read_meshroom
-from pimper_torch.evidence.datasets.metashape import read_metashape
 from pimper_torch.evidence.datasets.middlebury import read_middlebury
 from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
+from pimper_torch.evidence.datasets.programs import read_meshroom, read_metashape, read_transforms
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.datasets.sampling import one_light_per_position
-from pimper_torch.evidence.datasets.transforms import read_transforms
 from pimper_torch.exchange.colmap_workspace import write_colmap
 from pimper_torch.exchange.nerfstudio import write_transforms
 
@@ -22,7 +20,6 @@ __all__ = [
     "check_capture",
     "one_light_per_position",
     "read_colmap",
-    "read_colmap_scene",
     "read_diligent",
     "read_diligent_mv",
     "read_dtu_mvs",
@@ -39,7 +36,6 @@ __all__ = [
     "read_transforms",
     "read_uw_ps",
     "read_yale_b",
-    "require_consistent",
     "write_colmap",
     "write_idr",
     "write_transforms",

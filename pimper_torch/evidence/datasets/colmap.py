@@ -9,12 +9,9 @@ from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
     mask_finder,
-    read_views,
 )
-from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Capture, SparseScene
+from pimper_torch.records import Capture
 from pimper_torch.sfm.colmap import read_model
-from pimper_torch.sfm.reconstruct import Reconstruct
 
 _KIND = "a COLMAP model with its photographs"
 _SUBFOLDERS = (".", "sparse/0", "sparse", "model", "0")
@@ -31,7 +28,7 @@ def read_colmap(
 
     COLMAP counts pixels as we do (centre of the top-left one at (0.5, 0.5), "Camera models"
     in its documentation) and has our camera axes. Lenses with distortion are undistorted.
-    Its cloud was found, not measured, so it is no truth; see :func:`read_colmap_scene`.
+    Its cloud was found, not measured, so it is no truth; ``Reconstruct`` reads it.
 
     Args:
         folder: With ``cameras``, ``images`` and ``points3D``, or with them in ``sparse/0``,
@@ -46,28 +43,6 @@ def read_colmap(
     """
     model_folder, photographs = _photographs(Path(folder), images, masks)
     return assemble(photographs, model_folder, _KIND, **options)
-
-
-def read_colmap_scene(
-    folder: Path | str,
-    *,
-    images: Path | str | None = None,
-    masks: Path | str | None = None,
-    encoding: Encoding = FROM_FILES,
-    max_size_px: int = 0,
-) -> SparseScene:
-    """Read a COLMAP model with its cloud and tracks, as structure from motion gives it.
-
-    See :func:`read_colmap` for the folder and the arguments.
-
-    Raises:
-        InputError: As :func:`read_colmap`.
-    """
-    model_folder, photographs = _photographs(Path(folder), images, masks)
-    missing = [one.name for one in photographs if not one.image.is_file()]
-    expect(not missing, model_folder, _KIND, "all its photographs", f"no {', '.join(missing[:5])}")
-    views = read_views(photographs, encoding=encoding, max_size_px=max_size_px)
-    return Reconstruct()(views, model_folder)
 
 
 def _photographs(
@@ -88,7 +63,7 @@ def _photographs(
     )
     assert picture_folder is not None
     beside = picture_folder.parent / "masks"
-    mask_of = mask_finder(Path(masks) if masks else beside if beside.is_dir() else None, _KIND)
+    mask_of = mask_finder(masks or (beside if beside.is_dir() else None), _KIND)
     model = read_model(found[0])
     paths = [inside(picture_folder, name, _KIND) for name in model.names]
     photographs = [

@@ -1,6 +1,6 @@
 """Captures of the two DTU sets: one calibrated camera, several point lights a position."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
+from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Capture, Truth
@@ -15,34 +16,55 @@ from pimper_torch.records import Cameras, Capture, Truth
 CALIBRATED_WIDTH = 1600  # of 1600 x 1200; copies of half the size exist
 
 
+Positions = Sequence[int]
+
+
 def dtu_capture(
-    paths: Sequence[Path],
-    positions: Sequence[int],
-    point_lights: Sequence[int],
-    cameras: tuple[Float[Tensor, "position 3 3"], Float[Tensor, "position 4 4"]],
+    photographs: Path,
+    named: Sequence[tuple[int, int, Path]],
+    kind: str,
+    cameras: Callable[
+        [Positions], tuple[Float[Tensor, "position 3 3"], Float[Tensor, "position 4 4"]]
+    ],
     truth: Truth,
     *,
+    positions: Positions | None,
+    lights: Sequence[int] | None,
+    light_seed: int | None,
     encoding: Encoding,
     max_size_px: int,
 ) -> Capture:
-    """Read photographs and give each the camera of its position.
+    """Choose and read photographs, and give each the camera of its position.
 
     Args:
-        cameras: Intrinsics, whose pixels count from the centre of the first one, and poses of
-            the different positions in ascending order.
+        photographs: Their folder, for messages.
+        named: Position, light and file of each photograph there is.
+        kind: The set's name, for messages.
+        cameras: Reads intrinsics, whose pixels count from the centre of the first one, and poses
+            of positions in ascending order.
         truth: Of the scene.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+
+    Other arguments are those of the readers.
 
     Raises:
-        InputError: A photograph cannot be read, or their sizes differ.
+        InputError: A position or light that is not there, or a photograph that cannot be read or
+            has another size.
     """
-    order = sorted(set(positions))
-    index = torch.tensor([order.index(position) for position in positions])
-    views = read_photographs(
-        paths, [path.name for path in paths], encoding=encoding, max_size_px=max_size_px
+    table = [position for position, _, _ in named], [light for _, light, _ in named]
+    chosen = choose_photographs(
+        *table,
+        positions=positions,
+        lights=lights,
+        light_seed=light_seed,
+        path=photographs,
+        kind=kind,
     )
-    K, cam_from_world = cameras
+    kept, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
+    order = sorted(set(kept))
+    index = torch.tensor([order.index(position) for position in kept])
+    K, cam_from_world = cameras(order)
+    names = [path.name for path in paths]
+    views = read_photographs(paths, names, encoding=encoding, max_size_px=max_size_px)
     factor = float(views.sizes_px[0, 0]) / CALIBRATED_WIDTH
     K = scale_intrinsics(intrinsics_from_indices(K), factor, factor)
     return Capture(
@@ -53,6 +75,6 @@ def dtu_capture(
             sizes_px=views.sizes_px,
         ),
         truth=truth,
-        position=torch.tensor(positions),
+        position=torch.tensor(kept),
         light=torch.tensor(point_lights),
     )

@@ -12,7 +12,6 @@ from pimper_torch.camera_files.layout import contents, expect, numbers, read_tex
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.dtu import CALIBRATED_WIDTH, dtu_capture
 from pimper_torch.evidence.datasets.matlab import read_matlab
-from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import LINEAR, Encoding
@@ -78,22 +77,15 @@ def read_dtu_mvs(
     if lights is None:
         named = [entry for entry in named if entry[1] != ALL_LIGHTS]
     expect(bool(named), photographs, KIND, "photographs such as rect_001_0_r5000.png")
-    chosen = choose_photographs(
-        [position for position, _, _ in named],
-        [point_light for _, point_light, _ in named],
+    return dtu_capture(
+        photographs,
+        named,
+        KIND,
+        lambda kept: _read_cameras(root, kept),
+        Truth(points_world=_scan(root, scan)),
         positions=positions,
         lights=lights,
         light_seed=light_seed,
-        path=photographs,
-        kind=KIND,
-    )
-    kept_positions, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
-    return dtu_capture(
-        paths,
-        kept_positions,
-        point_lights,
-        _read_cameras(root, sorted(set(kept_positions))),
-        Truth(points_world=_scan(root, scan)),
         encoding=encoding,
         max_size_px=max_size_px,
     )

@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.layout import expect, file_in, first_of
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.dtu import dtu_capture
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
-from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Capture, Truth
 
@@ -74,26 +73,16 @@ def read_dtu_points(
         if (match := _NAME.fullmatch(path.name))
     )
     expect(bool(named), photographs, KIND, "photographs such as Img001_01.bmp (position, LED)")
-    chosen = choose_photographs(
-        [position for position, _, _ in named],
-        [point_light for _, point_light, _ in named],
+    calibration = file_in(root, _CALIBRATIONS, KIND)
+    return dtu_capture(
+        photographs,
+        named,
+        KIND,
+        lambda kept: decompose_projections(read_toolbox_projections(calibration, kept, KIND)),
+        Truth(points_world=_scan(root, scan)),
         positions=positions,
         lights=lights,
         light_seed=light_seed,
-        path=photographs,
-        kind=KIND,
-    )
-    kept_positions, point_lights, paths = zip(*(named[index] for index in chosen), strict=True)
-    calibration = first_of([root / name for name in _CALIBRATIONS])
-    expect(calibration is not None, root, KIND, f"the calibration {' or '.join(_CALIBRATIONS)}")
-    assert calibration is not None
-    projections = read_toolbox_projections(calibration, sorted(set(kept_positions)), KIND)
-    return dtu_capture(
-        paths,
-        kept_positions,
-        point_lights,
-        decompose_projections(projections),
-        Truth(points_world=_scan(root, scan)),
         encoding=encoding,
         max_size_px=max_size_px,
     )

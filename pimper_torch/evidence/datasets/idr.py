@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.camera_files.camera_arrays import IDR, numbered_matrices, read_world_mats
-from pimper_torch.camera_files.layout import expect, first_of
+from pimper_torch.camera_files.layout import expect, file_in
 from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.posed import (
@@ -207,11 +207,7 @@ def _reach(
 
 
 def _camera_file(folder: Path, name: str | None) -> Path:
-    names = _CAMERA_FILES if name is None else (name,)
-    path = first_of([folder / one for one in names])
-    expect(path is not None, folder, IDR, f"a file {' or '.join(names)}")
-    assert path is not None
-    return path
+    return file_in(folder, _CAMERA_FILES if name is None else (name,), IDR)
 
 
 def _photograph(

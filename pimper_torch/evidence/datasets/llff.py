@@ -72,8 +72,7 @@ def read_llff(
         "did not register to another folder)",
         f"{len(files)}",
     )
-    drawn = Path(masks) if masks else first_of([folder / name for name in _MASK_FOLDERS])
-    mask_of = mask_finder(drawn, _KIND)
+    mask_of = mask_finder(masks or first_of([folder / name for name in _MASK_FOLDERS]), _KIND)
     photographs = [
         PosedPhotograph(
             name=path.name,

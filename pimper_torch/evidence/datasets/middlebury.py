@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from pimper_torch.camera_files.layout import expect, inside, numbers, read_text
+from pimper_torch.camera_files.layout import expect, file_in, inside, numbers, read_text
 from pimper_torch.camera_files.posed_camera import pinhole_lens, rigid_or_refuse
 from pimper_torch.evidence.datasets.posed import (
     PosedOptions,
@@ -41,7 +41,7 @@ def read_middlebury(
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
-    path = _parameter_file(Path(folder))
+    path = file_in(folder, ("*_par.txt",), _KIND)
     lines = [line.split() for line in read_text(path, _KIND).splitlines() if line.strip()]
     expect(
         len(lines) > 1 and lines[0] == [str(len(lines) - 1)],
@@ -50,20 +50,11 @@ def read_middlebury(
         "the number of photographs in the first line, and a line for each",
         f"{len(lines)} lines, the first {' '.join(lines[0])[:60] if lines else ''!r}",
     )
-    mask_of = mask_finder(Path(masks) if masks else None, _KIND)
+    mask_of = mask_finder(masks, _KIND)
     photographs = [
         _photograph(line, path).replace(mask=mask_of(path.parent / line[0])) for line in lines[1:]
     ]
     return assemble(photographs, path, _KIND, one_light=True, **options)
-
-
-def _parameter_file(given: Path) -> Path:
-    if given.is_file():
-        return given
-    expect(given.is_dir(), given, _KIND, "the folder of the set")
-    found = sorted(given.glob("*_par.txt"))
-    expect(len(found) == 1, given, _KIND, "one file named *_par.txt")
-    return found[0]
 
 
 def _photograph(line: Sequence[str], path: Path) -> PosedPhotograph:

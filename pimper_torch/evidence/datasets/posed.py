@@ -10,15 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files.layout import expect
+from pimper_torch.camera_files.posed_camera import PosedCamera
 from pimper_torch.errors import InputError, some
-from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import SUFFIXES, decode, read_header
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import shrunk_focals, shrunk_size
-from pimper_torch.io.radiance import read_pictures, resized_mask, resized_radiance
+from pimper_torch.io.radiance import read_pictures, resized_mask
 from pimper_torch.radiometry import FROM_FILES, Encoding
-from pimper_torch.records import Cameras, Capture, Lens, Record, Truth, Views
+from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
 
@@ -26,26 +26,31 @@ _HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PosedPhotograph(Record):
+class PosedPhotograph(PosedCamera):
     """Camera and file of one photograph.
 
     Attributes:
-        name: Unique in the set.
-        image: Its file.
+        image: Its file; it may be a smaller copy of what the lens is for.
         mask: File of its mask; ``None`` where there is none. Of any size: it is stretched
             over the photograph.
-        cam_from_world: Rigid, in float64.
-        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own; the file
-            may be a smaller copy.
-        skew_px: ``K[0, 1]``; only a lens without distortion may have one.
     """
 
-    name: str
     image: Path
-    cam_from_world: Float[Tensor, "4 4"]
-    lens: Lens
-    skew_px: float = 0.0
     mask: Path | None = None
+
+    @classmethod
+    def of(
+        cls, camera: PosedCamera, image: Path, mask: Path | None, name: str = ""
+    ) -> "PosedPhotograph":
+        """Put a photograph, called as its file by default, beside its camera."""
+        return cls(
+            name=name or image.name,
+            cam_from_world=camera.cam_from_world,
+            lens=camera.lens,
+            skew_px=camera.skew_px,
+            image=image,
+            mask=mask,
+        )
 
 
 class PosedOptions(TypedDict, total=False):
@@ -151,40 +156,6 @@ def read_views(
     )
 
 
-def shrink(views: Views, cameras: Cameras, max_size_px: int) -> tuple[Views, Cameras]:
-    """Shrink photographs whose longer side is longer, and let their pinholes follow.
-
-    Args:
-        views: Any; padding stays zero.
-        max_size_px: The longest side; 0 leaves all as they are.
-    """
-    full = views.sizes_px.tolist()
-    fractions = [min(1.0, max_size_px / max(size)) if max_size_px else 1.0 for size in full]
-    sizes = [
-        (max(1, round(fraction * width)), max(1, round(fraction * height)))
-        for fraction, (width, height) in zip(fractions, full, strict=True)
-    ]
-    width, height = (max(sides) for sides in zip(*sizes, strict=True))
-    images = views.images.new_zeros(*views.images.shape[:2], height, width)
-    masks = torch.zeros(len(sizes), height, width, dtype=torch.bool)
-    for index, ((wide, high), (w, h)) in enumerate(zip(full, sizes, strict=True)):
-        images[index, :, :h, :w] = resized_radiance(views.images[index, :, :high, :wide], w, h)
-        if views.masks is not None:
-            masks[index, :h, :w] = resized_mask(views.masks[index, :high, :wide].float(), w, h)
-    intrinsics = [
-        scale_intrinsics(K, w / wide, h / high)
-        for K, (wide, high), (w, h) in zip(cameras.intrinsics, full, sizes, strict=True)
-    ]
-    sizes_px = torch.tensor(sizes)
-    small = views.replace(
-        images=images,
-        sizes_px=sizes_px,
-        masks=None if views.masks is None else masks,
-        focals_px=views.focals_px * torch.tensor(fractions).to(views.focals_px),
-    )
-    return small, cameras.replace(intrinsics=torch.stack(intrinsics), sizes_px=sizes_px)
-
-
 def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
     """Let each lens follow its photograph to the size it was read at.
 
@@ -221,7 +192,7 @@ def image_files(folder: Path, kind: str) -> list[Path]:
     return paths
 
 
-def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]:
+def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path | None]:
     """Return a function that finds the mask of a photograph in a folder.
 
     A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
@@ -233,7 +204,8 @@ def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]
     """
     if folder is None:
         return lambda photograph: None
-    paths = image_files(folder, kind)
+    place = Path(folder)
+    paths = image_files(place, kind)
 
     def find(photograph: Path) -> Path | None:
         stem = photograph.stem
@@ -242,7 +214,7 @@ def mask_finder(folder: Path | None, kind: str) -> Callable[[Path], Path | None]
         found = exact or longer
         expect(
             len(found) == 1,
-            folder,
+            place,
             kind,
             f"one mask for {photograph.name}, such as {stem}.png",
             some([path.name for path in found or paths]),

@@ -1,14 +1,13 @@
 """Rendered scenes, as :func:`pimper_torch.evidence.scenes.render_scene` writes them."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect, inside
+from pimper_torch.camera_files.layout import expect, inside, read_json
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.config import SceneConfig
@@ -79,7 +78,7 @@ def read_rendered(
 
 def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
     path = folder / "truth" / "scene.json"
-    report = _read_json(path, folder)
+    report = read_json(path, _KIND)
     expect(
         report.get("format") == FORMAT and report.get("format_version") == FORMAT_VERSION,
         path,
@@ -197,7 +196,7 @@ def _read_lights(
     folder: Path, names: Sequence[str], chosen: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "view 4"]]:
     path = folder / "truth" / "lights.json"
-    report = _read_json(path, folder)
+    report = read_json(path, _KIND)
     try:
         point_lights = torch.tensor(report["positions_world"], dtype=torch.float64)
         lights = torch.tensor(report["harmonics_world"], dtype=torch.float64)
@@ -214,18 +213,6 @@ def _read_lights(
         f"{tuple(point_lights.shape)} and {tuple(lights.shape)}",
     )
     return point_lights[list(chosen)], lights[list(chosen)]
-
-
-def _read_json(path: Path, folder: Path) -> Mapping[str, object]:
-    expect(path.is_file(), folder, _KIND, f"{path.relative_to(folder)} in it")
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: is no JSON that can be read ({error}). Render the scene again."
-        ) from error
-    expect(isinstance(report, dict), path, _KIND, "a JSON object", type(report).__name__)
-    return report
 
 
 def _file(folder: Path, name: str) -> Path:

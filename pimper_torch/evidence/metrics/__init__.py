@@ -10,12 +10,7 @@ from pimper_torch.evidence.metrics.lights import LightFigures, compare_lights
 from pimper_torch.evidence.metrics.maps import mean_absolute_depth_error, mean_angular_error_deg
 from pimper_torch.evidence.metrics.poses import CameraFigures, compare_cameras
 from pimper_torch.evidence.metrics.reflectance import AlbedoFigures, compare_albedo
-from pimper_torch.evidence.metrics.relative import (
-    ViewComparison,
-    angles_deg,
-    compare_in_view,
-    relative_error,
-)
+from pimper_torch.evidence.metrics.relative import angles_deg, relative_error
 from pimper_torch.evidence.metrics.report import Row, report, rows
 from pimper_torch.evidence.metrics.sampling import SurfaceSamples, sample_surface
 from pimper_torch.evidence.metrics.similarity import (
@@ -41,14 +36,12 @@ __all__ = [
     "Row",
     "SurfaceComparison",
     "SurfaceSamples",
-    "ViewComparison",
     "ViewFigures",
     "align_estimate",
     "angles_deg",
     "compare_albedo",
     "compare_along_rays",
     "compare_cameras",
-    "compare_in_view",
     "compare_lights",
     "dtu_figures",
     "evaluate",

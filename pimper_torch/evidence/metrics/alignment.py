@@ -135,11 +135,7 @@ def _told(
     method: str,
     description: str,
     truth_from_world: Float[Tensor, "4 4"],
-    *,
-    cameras: int = 0,
-    trimmed_fraction: float | None = None,
-    residual: float | None = None,
-    converged: bool | None = None,
+    **known: int | float | None,
 ) -> Alignment:
     scale, rotation = split_similarity(truth_from_world)
     return Alignment(
@@ -148,8 +144,5 @@ def _told(
         truth_from_world=truth_from_world,
         scale=scale,
         rotation_deg=float(rotation_angles_deg(rotation)),
-        cameras=cameras,
-        trimmed_fraction=trimmed_fraction,
-        residual=residual,
-        converged=converged,
+        **known,  # type: ignore[arg-type]
     )

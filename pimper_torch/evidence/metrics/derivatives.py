@@ -93,10 +93,8 @@ def check_derivatives(
     Args:
         function: From named tensors to named tensors; deterministic.
         inputs: In float64. Entries that are zero throughout a tensor of ``scales`` are moved, too.
-        generator: Of directions and weights.
         scales: Length of a unit step of each input, per element; the root mean square of its
             elements where not given.
-        directions: Random ones for each input.
         weights: Random sums of each output's elements.
         steps: The two sizes, in scales. Derivatives are those of the smaller one.
 

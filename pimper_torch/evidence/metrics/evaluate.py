@@ -1,12 +1,13 @@
 """A result against the truth: every figure that the truth allows."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.alignment import (
     Alignment,
@@ -57,19 +58,15 @@ class EvaluateConfig:
     alignment: Method = "auto"
     views: tuple[str, ...] = ()
     thresholds_percent: tuple[float, ...] = (0.25, 0.5, 1.0)
-    seen_from: int = 3
-    samples: int = 200_000
-    seed: int = 0
+    seen_from: Annotated[int, Range(least=1, most=100_000)] = 3
+    samples: Annotated[int, Range(least=1, most=10_000_000)] = 200_000  # 100 bytes each
+    seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0  # 32 bits
     icp: IcpConfig = field(default_factory=IcpConfig)
 
     def __post_init__(self) -> None:
         within = all(0 < percent <= 100 for percent in self.thresholds_percent)
         require(within, "thresholds_percent", self.thresholds_percent, "above 0, at most 100 each")
-        require(self.seed >= 0, "seed", self.seed, "0 or more")
-        require(self.seen_from >= 1, "seen_from", self.seen_from, "at least 1")
-        require(self.samples >= 1, "samples", self.samples, "at least 1")
-        # A seed has 32 bits; a sample takes 100 bytes.
-        require_at_most(self, seen_from=100_000, seed=2**32 - 1, samples=10_000_000)
+        require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,13 +1,13 @@
 """Trimmed iterative closest points with scale: a similarity between two surfaces."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.evidence.metrics.sampling import sample_surface
 from pimper_torch.evidence.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.frames import rigid, transform
@@ -37,20 +37,14 @@ class IcpConfig:
             spread.
     """
 
-    trimmed_fraction: float = 0.2
+    trimmed_fraction: Annotated[float, Range(least=0, below=1)] = 0.2
     distance: Literal["plane", "point"] = "plane"
-    samples: int = 8000
-    iterations: int = 60
-    tolerance: float = 1e-7
+    samples: Annotated[int, Range(least=100, most=10_000_000)] = 8000  # 100 bytes each
+    iterations: Annotated[int, Range(least=1, most=100_000)] = 60
+    tolerance: Annotated[float, Range(above=0, most=1)] = 1e-7
 
     def __post_init__(self) -> None:
-        fraction = self.trimmed_fraction
-        require(0 <= fraction < 1, "trimmed_fraction", fraction, "at least 0, less than 1")
-        require(self.samples >= 100, "samples", self.samples, "at least 100")
-        require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        require(self.tolerance > 0, "tolerance", self.tolerance, "more than 0")
-        # A sample takes 100 bytes; it has converged, or never will.
-        require_at_most(self, samples=10_000_000, iterations=100_000, tolerance=1.0)
+        require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -75,7 +75,6 @@ def compare_cameras(
         views: How many photographs there are in all.
         centre: Of the object, frame of the truth.
         diagonal: Of the object's bounding box.
-        points_true: Some of the object's points.
     """
     truth_from_ours = truth_from_world.double().cpu()
     _, rotation = split_similarity(truth_from_ours)

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import rotate, transform
+from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 
@@ -32,71 +31,6 @@ def relative_error(
     """
     spread = (points_true - points_true.mean(dim=0)).norm()
     return 100 * (points - points_true).norm() / spread
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ViewComparison(Record):
-    """How a mesh compares with the truth along the rays of one view.
-
-    Attributes:
-        relative_error: :func:`relative_error` over the rays that meet both, in per cent.
-        coverage: Fraction of the true pixels whose ray meets the mesh.
-        mean_angle_deg: Between the normals, over the same rays; NaN without true normals.
-        median_angle_deg: The same.
-        num_pixels: Rays that meet the truth.
-    """
-
-    relative_error: float
-    coverage: float
-    mean_angle_deg: float
-    median_angle_deg: float
-    num_pixels: int
-
-
-def compare_in_view(
-    mesh: Mesh,
-    truth_from_world: Float[Tensor, "4 4"],
-    cameras_true: Cameras,
-    view: int,
-    depth_true: Float[Tensor, "height width"],
-    *,
-    normals_true: Float[Tensor, "height width 3"] | None = None,
-    where: Bool[Tensor, "height width"] | None = None,
-) -> ViewComparison:
-    """Compare a mesh with true depth along the rays of one true camera.
-
-    A point and its estimate are where the same ray first meets the truth and the mesh,
-    after the mesh was put in the frame of the truth. Rays that miss the mesh count against
-    the coverage, not the error; state both.
-
-    Args:
-        mesh: The result. Its own vertex normals are compared if it has some.
-        truth_from_world: Similarity; see :mod:`pimper_torch.evidence.metrics.similarity`.
-        cameras_true: World frame and scene units of the truth.
-        depth_true: Along that camera's z; infinite where there is nothing.
-        normals_true: Unit, outward, frame of the truth.
-        where: Restricts the comparison, to the object without its table for instance.
-
-    Raises:
-        InputError: No pixel is left to compare, or no ray meets the mesh.
-    """
-    met = meet_in_view(mesh, truth_from_world, cameras_true, view, depth_true, where)
-    angles = torch.full((1,), torch.nan)
-    if normals_true is not None:
-        own = mesh.normals_world
-        if own is None:
-            own = vertex_normals(mesh.vertices_world, mesh.faces)
-        rotated = rotate(truth_from_world.to(own), own)
-        angles = angles_deg(
-            normalize(met.interpolate(rotated).double(), dim=-1), normals_true[met.both].double()
-        )
-    return ViewComparison(
-        relative_error=float(relative_error(met.points, met.points_true)),
-        coverage=met.coverage,
-        mean_angle_deg=float(angles.mean()),
-        median_angle_deg=float(angles.median()),
-        num_pixels=int(met.valid.sum()),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -159,7 +93,6 @@ def meet_in_view(
         truth_from_world: Similarity.
         cameras_true: World frame and scene units of the truth.
         depth_true: Along that camera's z; infinite where there is nothing.
-        where: Restricts the comparison.
 
     Raises:
         InputError: No pixel is left to compare, or no ray meets the mesh.

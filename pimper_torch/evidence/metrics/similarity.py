@@ -105,7 +105,6 @@ def camera_correlation(
     Args:
         ours: World frame of the result.
         truth: The same views in the same order.
-        chosen: Which of the axes.
     """
     source, target = ours.centers_world.double(), truth.centers_world.double()
     axes = ours.cam_from_world[:, chosen, :3].double()  # rows are the axes in the world

@@ -9,7 +9,6 @@ from pimper_torch.evidence.scenes.compositions import potato_on_table
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.frame import Frame, render_frame
 from pimper_torch.evidence.scenes.objects import RECIPES
-from pimper_torch.evidence.scenes.photographs import save_masks, save_photographs
 from pimper_torch.evidence.scenes.render import render_objects, render_shape
 from pimper_torch.evidence.scenes.rendered import RenderedScene
 from pimper_torch.evidence.scenes.scene import Scene, build_scene
@@ -36,7 +35,5 @@ __all__ = [
     "render_objects",
     "render_scene",
     "render_shape",
-    "save_masks",
-    "save_photographs",
     "sparse_scene",
 ]

@@ -92,9 +92,6 @@ def arc_cameras(
     The defaults face the flat shapes of :mod:`pimper_torch.evidence.scenes.shapes` from above.
 
     Args:
-        width: Pixels.
-        height: Pixels.
-        focal_px: Pixels.
         distance: From the target, scene units.
         span_deg: From the first camera to the last, about ``up``.
         elevation_deg: Mean height of the arc over the plane across ``up``.
@@ -177,10 +174,6 @@ def distance_to_fit(
 
     Args:
         toward_world: Unit, from the target to the cameras, which look at it.
-        target_world: What the cameras look at.
-        focal_px: Pixels.
-        width: Pixels.
-        height: Pixels.
         fill: Fraction of the picture, along its tighter side, that the points may take.
     """
     up_world = points_world.new_tensor(UP)
@@ -205,9 +198,6 @@ def aim_to_fit(
 
     Args:
         toward_world: Unit, from the target to the cameras.
-        focal_px: Pixels.
-        width: Pixels.
-        height: Pixels.
         fill: Fraction of the picture, along its tighter side, that the points may take.
 
     Returns:

@@ -32,12 +32,8 @@ def potato_on_table(
     Args:
         seed: Decides form, texture, lights and noise.
         num_views: On an arc at about 35 degrees over the table.
-        width: Pixels.
-        height: Pixels.
         flash: Irradiance of a point light on the camera itself.
         gloss: Fraction of light that the potato mirrors; 0.04 is varnish.
-        contrast: Of the texture; see :func:`random_speckle`.
-        sensor: ``None`` is the default one.
     """
     generator = torch.Generator().manual_seed(seed)
     objects = (

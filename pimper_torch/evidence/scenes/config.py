@@ -71,14 +71,14 @@ class SceneConfig:
     """
 
     num_views: Annotated[int, Range(least=1, most=100_000)] = 30
-    width: int = 1600
-    height: int = 1200
+    width: Annotated[int, Range(least=8, most=65_535)] = 1600  # as of a JPEG
+    height: Annotated[int, Range(least=8, most=65_535)] = 1200
     seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0
     path: Literal["arc", "turntable", "handheld"] = "arc"
-    span_deg: float = 50.0
+    span_deg: Annotated[float, Range(above=0, most=360)] = 50.0
     elevation_deg: float = 30.0
     sway_deg: float = 4.0
-    fill: float = 0.94
+    fill: Annotated[float, Range(least=0.1, most=1)] = 0.94
     fixed_point_light: bool = False
     constant_light: bool = False
     fixed_room: bool = False
@@ -88,10 +88,10 @@ class SceneConfig:
     crop_jitter_px: float = 0.0
     light: Literal["point", "directional"] = "point"
     point_light_distance: Annotated[float, Range(least=1, most=1000)] = 2.5
-    irradiance: float = 0.85
-    ambient: float = 0.1
-    flash: float = 0.0
-    bounces: int = 0
+    irradiance: Annotated[float, Range(least=0, most=1e12)] = 0.85
+    ambient: Annotated[float, Range(least=0, most=1e12)] = 0.1
+    flash: Annotated[float, Range(least=0, most=1e12)] = 0.0
+    bounces: Annotated[int, Range(least=0, most=8)] = 0
     exposure: float = 1.0
     read_noise: float = 0.002
     shot_noise: float = 0.0001
@@ -102,16 +102,14 @@ class SceneConfig:
     up: Literal["x", "y", "z"] = "z"
     rotation_deg: float = 0.0
     albedo: tuple[float, float, float] | None = None
-    specular: float | None = None
-    roughness: float | None = None
+    specular: Annotated[float | None, Range(least=0, most=1)] = None
+    roughness: Annotated[float | None, Range(least=0, most=1)] = None
     conductor: Literal["none", "copper", "gold", "silver"] = "none"
     environment: Literal["none", "constant", "changing"] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
         require_ranges(self)
-        require(8 <= self.width <= 65_535, "width", self.width, "8 to 65,535, as of a JPEG")
-        require(8 <= self.height <= 65_535, "height", self.height, "8 to 65,535, as of a JPEG")
         # Rays of a photograph take 100 bytes each.
         most = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
         require(
@@ -121,10 +119,6 @@ class SceneConfig:
             f"{most} at most with {self.width} x {self.height} pixels; or fewer of these",
         )
         require(math.isfinite(self.rotation_deg), "rotation_deg", self.rotation_deg, "finite")
-        for name in ("specular", "roughness"):
-            value = getattr(self, name)
-            require(value is None or 0 <= value <= 1, name, value, "between 0 and 1")
-        require(0 < self.span_deg <= 360, "span_deg", self.span_deg, "above 0, at most 360")
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
         require(
             self.sway_deg >= 0 and lowest >= 2 and highest <= 85,
@@ -132,7 +126,6 @@ class SceneConfig:
             self.elevation_deg,
             f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
         )
-        require(0.1 <= self.fill <= 1, "fill", self.fill, "between 0.1 and 1")
         for name in ("fixed_point_light", "fixed_room", "fixed_table"):
             fixed = getattr(self, name)
             require(
@@ -160,9 +153,6 @@ class SceneConfig:
             self.constant_light,
             "no fixed_point_light, under which the light goes round the object",
         )
-        for name in ("irradiance", "ambient", "flash"):
-            value = getattr(self, name)
-            require(0 <= value < float("inf"), name, value, "0 or more")
         require(
             self.irradiance + self.ambient + self.flash > 0,
             "irradiance",
@@ -178,7 +168,6 @@ class SceneConfig:
             self.conductor,
             "none with albedo or specular: a metal has no matte part, and its own reflectance",
         )
-        require(0 <= self.bounces <= 8, "bounces", self.bounces, "between 0 and 8")
 
     @property
     def surrounded(self) -> Literal["none", "constant", "changing"]:

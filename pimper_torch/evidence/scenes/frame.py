@@ -62,8 +62,6 @@ def render_frame(
     rays over its area instead.
 
     Args:
-        view: Which to take.
-        generator: Of the sensor's noise.
         interreflection: Light that comes by way of other surfaces.
     """
     look = _Look(stage, cameras, lights, view, sensor.exposure, interreflection)

@@ -30,7 +30,6 @@ def mesh_level_set(
     Args:
         level: Negative inside, differentiable, with a gradient of about 1.
         lowest: Corner of a box that holds the solid with room to spare.
-        highest: The opposite corner.
         cell: Side of the cubes, scene units.
     """
     start = torch.tensor(lowest, dtype=torch.float64)
@@ -88,10 +87,6 @@ def rounded_cylinder(
     """Return the signed distance to an upright cylinder about the z axis with round edges.
 
     Args:
-        points: World.
-        radius: Scene units.
-        low: Height of its foot.
-        high: Height of its top.
         rounding: Radius of its edges.
     """
     # Kept off the axis, where the root has no gradient.

@@ -25,7 +25,6 @@ def potato(generator: torch.Generator, *, subdivisions: int = 6, bumps: float = 
     """Grow a closed, bumpy solid about 2.4 long that rests on ``z = 0``.
 
     Args:
-        generator: Decides its form.
         subdivisions: Of the sphere it starts from; 6 gives 81920 faces.
         bumps: Root mean square of the fine height field, scene units; 0 leaves it smooth.
     """
@@ -58,7 +57,6 @@ def lathe(profile: Float[Tensor, "level 2"], around: int = 192) -> Mesh:
     Args:
         profile: Radius and height of each level, upwards; the first and the last radius are
             0, no other is.
-        around: Vertices on each ring.
     """
     rotation = 2 * torch.pi * torch.arange(around, dtype=profile.dtype) / around
     radius, height = profile[1:-1].unbind(dim=-1)

@@ -46,7 +46,6 @@ def random_waves(
     """Draw waves of about one length in random directions.
 
     Args:
-        generator: Decides everything.
         wavelength: Scene units; drawn between 0.7 and 1.4 of this.
         root_mean_square: Of the function's values.
         axes: 3 in space, 2 over a plane.
@@ -127,13 +126,9 @@ def random_speckle(
     """Draw a texture.
 
     Args:
-        generator: Decides everything.
         cells: Sizes of its features in scene units.
-        darkest: Lowest albedo.
-        brightest: Highest albedo.
         contrast: 0 is uniform; 2.5 gives plenty of features to structure from motion.
         colour: 0 is gray; 1 gives the channels nothing in common.
-        channels: Of the albedo.
         offset: Positive leaves rare dark spots, negative rare light ones; the values it is
             added to have a standard deviation of about half the root of the octaves.
         tint: Multiplies the channels; one number, or one for each.

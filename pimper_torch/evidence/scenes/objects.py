@@ -146,12 +146,7 @@ def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
 
 
 def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
-    """Make the jar's surface of revolution; closed.
-
-    Args:
-        levels: Vertices along the profile.
-        around: Vertices on each ring.
-    """
+    """Make the jar's surface of revolution; closed."""
     corners = torch.tensor(_JAR_PROFILE, dtype=torch.float64)
     along = torch.cat([corners.new_zeros(1), corners.diff(dim=0).norm(dim=1).cumsum(dim=0)])
     # Highlights show where curvature jumps, so the curve is twice differentiable.

@@ -80,9 +80,6 @@ def render_objects(
     Args:
         objects: Those that are no surroundings are the foreground.
         cameras: Of one image size.
-        generator: Of the sensor's noise.
-        sensor: ``None`` is the default one.
-        bounces: Of light between the objects.
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = Stage(objects)

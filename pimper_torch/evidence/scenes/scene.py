@@ -118,7 +118,6 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file, which is scaled to the size of the others. Its vertex colours are its texture;
             without any it gets one. Its normals are those of its faces, averaged at the vertices.
-        config: How it is photographed.
 
     Raises:
         InputError: No such scene and no such file, or a mesh that has no surface.

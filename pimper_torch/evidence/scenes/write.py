@@ -71,10 +71,8 @@ def render_scene(
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file.
         folder: New or empty; its parents are made.
-        config: ``None`` is the default one.
         processes: That render at the same time. More than 1 start Python anew, so that a
             script that calls this must guard its top level by ``__name__ == "__main__"``.
-        overwrite: Replace a former rendering.
 
     Returns:
         The folder.

@@ -36,8 +36,6 @@ def solve_alternation(problem: Bilinear, max_iterations: int, tolerance: float) 
     """Factorize a batch of patches by alternating least squares.
 
     Args:
-        problem: With its initial values.
-        max_iterations: Steps at most.
         tolerance: A patch has converged when a step lowers its objective by less than this
             fraction.
 

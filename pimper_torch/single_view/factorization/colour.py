@@ -57,7 +57,6 @@ def solve_in_colour(
         problem: The same patches in gray, the mean of the channels, with initial values; the
             prior of its lights, times the channel's tint, is that of each channel's.
         radiance: In colour; zero where missing.
-        solve: One of the solvers.
         max_iterations: Steps at most in each iteration.
         iterations: Alternations of factors and chroma; more are needed where the light's colour
             changes between views.

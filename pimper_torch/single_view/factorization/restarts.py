@@ -51,7 +51,6 @@ def factorize_from_many(
         weight: 0 where missing.
         generator: On the CPU.
         repeats: How many starts must end in the best minimum.
-        max_starts: Starts at most.
         closeness: Residuals that differ by less than this fraction are of the same minimum.
         tolerance: See
             :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.

@@ -1,128 +1,45 @@
-"""Initial factors from the data alone: singular vectors, upgraded to the photometric cone."""
-
-from dataclasses import dataclass
+"""Rank-four factors upgraded to the photometric cone."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import diagonal, outer, solve_packed
-from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.ambiguity import minkowski
-
-# Imputations of missing entries, and steps of the weighted alternation after them: choices.
-FILL_STEPS = 20
-ALTERNATIONS = 30
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Upgraded(Record):
-    """Factors with the same product, near the cone up to a Lorentz transformation.
-
-    Attributes:
-        lights: ``L``.
-        shading: ``N``, with albedo positive for most samples.
-        lorentzian: Whether the quadric has the cone's signature; if not, the factors are not
-            near a cone.
-    """
-
-    lights: Float[Tensor, "patch view 4"]
-    shading: Float[Tensor, "patch 4 sample"]
-    lorentzian: Bool[Tensor, " patch"]
-
-
-def factorize_rank_four(
-    radiance: Float[Tensor, "patch view sample"], weight: Float[Tensor, "patch view sample"]
-) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch 4 sample"]]:
-    """Return the rank-four factors that minimize the weighted residual, the cone ignored.
-
-    Missing entries are imputed by a sample's albedo times a view's brightness, then
-    iteratively by the rank-four part of the imputed matrix (eigenvectors of the small
-    view-by-view matrix); weighted alternation follows. A view or sample with fewer than four
-    entries gets the minimum-norm solution. Factors are unique up to a 4 x 4 matrix.
-    """
-    count = weight.sum(dim=1, keepdim=True).clamp_min(1)
-    gain = (weight * radiance).sum(dim=2, keepdim=True) / weight.sum(dim=2, keepdim=True).clamp_min(
-        1
-    )
-    albedo = (weight * radiance).sum(dim=1, keepdim=True) / (
-        (weight * gain).sum(dim=1, keepdim=True).clamp_min(1e-12)
-    )
-    filled = torch.where(weight > 0, radiance, gain * albedo * (count > 0))
-    basis = _leading(filled)
-    for _ in range(FILL_STEPS):
-        filled = torch.where(weight > 0, radiance, basis @ (basis.mT @ filled))
-        basis = _leading(filled)
-    # A nearly flat patch is of lower rank but for its noise: float32 normal equations would
-    # amplify their own rounding without limit.
-    lights, mask, seen = basis.double(), weight.double(), (weight * radiance).double()
-    for _ in range(ALTERNATIONS):
-        shading = _solve(outer(lights.mT) @ mask, lights.mT @ seen)
-        packed = (mask @ outer(shading).mT).mT
-        lights = _solve(packed, (seen @ shading.mT).mT).mT
-    return lights.to(radiance), shading.to(radiance)
+from pimper_torch.photometry.quadratics import diagonal, outer, unpacked
 
 
 def upgrade_to_cone(
-    lights: Float[Tensor, "patch view 4"],
-    shading: Float[Tensor, "patch 4 sample"],
-    weight: Float[Tensor, "patch sample"],
-) -> Upgraded:
+    lights: Float[Tensor, "view 4"],
+    shading: Float[Tensor, "4 sample"],
+    weight: Float[Tensor, " sample"],
+) -> tuple[Float[Tensor, "view 4"], Float[Tensor, "4 sample"]]:
     r"""Find the linear map that takes the shading vectors nearest to the cone, and apply it.
 
     All lie on a quadric :math:`s^\top Q s = 0`; ``Q`` is the least eigenvector of their quadratic
     monomials, and :math:`Q = H^\top \eta H` gives the matrix ``H``. With noise, or normals
-    that vary too little, Q may not have the signature (1, 3), which ``lorentzian`` reports; the
-    eigenvalue of the rarer sign is then that of albedo.
+    that vary too little, Q may not have the signature (1, 3); the eigenvalue of the rarer sign is
+    then that of albedo.
+
+    Returns:
+        Factors with the same product, near the cone up to a Lorentz transformation; albedo is
+        positive for most samples.
     """
     S, L = shading.double(), lights.double()
-    moment = (S * weight[:, None]) @ S.mT
-    values, vectors = torch.linalg.eigh(moment)
-    whiten = vectors * values.clamp_min(1e-12 * values[:, -1:] + 1e-300).rsqrt()[:, None, :]
+    values, vectors = torch.linalg.eigh((S * weight) @ S.mT)
+    whiten = vectors * values.clamp_min(1e-12 * values[-1] + 1e-300).rsqrt()
     S, L = whiten.mT @ S, L @ torch.linalg.pinv(whiten).mT
-    size = S.norm(dim=1, keepdim=True)
-    unit = S / size.clamp_min(1e-12)
-    monomials = outer(unit) * (weight > 0)[:, None]
-    double = torch.full_like(monomials[0, :, :1], 2.0)
+    unit = S / S.norm(dim=0).clamp_min(1e-12)
+    double = torch.full((10, 1), 2.0).to(S)
     double[diagonal(4)] = 1
-    monomials = monomials * double
-    least = torch.linalg.eigh(monomials @ monomials.mT).eigenvectors[..., 0]
-    rows, columns = torch.triu_indices(4, 4)
-    Q = least.new_zeros(len(least), 4, 4)
-    Q[:, rows, columns] = least
-    Q[:, columns, rows] = least
-    values, vectors = torch.linalg.eigh(Q)
+    monomials = double * outer(unit) * (weight > 0)
+    least = torch.linalg.eigh(monomials @ monomials.mT).eigenvectors[:, :1]
+    values, vectors = torch.linalg.eigh(unpacked(least, 4)[0])
     # Ascending: one positive at the end, or one negative at the front.
-    front = values[:, 1] > 0
-    flipped = front | ((values[:, 2] > 0) & (values[:, 0].abs() > values[:, 3]))
-    values = torch.where(flipped[:, None], -values.flip(1), values)
-    vectors = torch.where(flipped[:, None, None], vectors.flip(2), vectors)
-    lorentzian = (values[:, 3] > 0) & (values[:, 2] < 0)
+    if values[1] > 0 or (values[2] > 0 and values[0].abs() > values[3]):
+        values, vectors = -values.flip(0), vectors.flip(1)
     order = [3, 0, 1, 2]
-    roots = values[:, order].abs().clamp_min(1e-6).sqrt()
-    H = roots[..., None] * vectors[:, :, order].mT
+    roots = values[order].abs().clamp_min(1e-6).sqrt()
+    H = roots[:, None] * vectors[:, order].mT
     S, L = H @ S, L @ torch.linalg.inv(H)
-    sign = torch.where((weight * S[:, 0].sign()).sum(dim=1) < 0, -1.0, 1.0)[:, None, None]
-    eta = minkowski(S)
-    # A negative time axis is mirrored by -1; space axes are left to the alignment.
-    mirror = torch.where(sign < 0, -torch.eye(4, dtype=S.dtype, device=S.device), eta @ eta)
-    return Upgraded(
-        lights=(L @ mirror).to(lights), shading=(mirror @ S).to(shading), lorentzian=lorentzian
-    )
-
-
-def _leading(filled: Float[Tensor, "patch view sample"]) -> Float[Tensor, "patch view 4"]:
-    rows = filled.double()
-    vectors = torch.linalg.eigh(rows @ rows.mT).eigenvectors
-    lead = vectors[..., -4:]
-    padding = lead.new_zeros(*lead.shape[:-1], 4 - lead.shape[-1])
-    return torch.cat([lead, padding], dim=-1).to(filled.dtype)
-
-
-def _solve(
-    packed: Float[Tensor, "patch 10 item"], rhs: Float[Tensor, "patch 4 item"]
-) -> Float[Tensor, "patch 4 item"]:
-    ridge = 1e-9 * packed[:, diagonal(4)].sum(dim=1, keepdim=True).amax(dim=2, keepdim=True)
-    damped = packed.clone()
-    damped[:, diagonal(4)] += ridge
-    return solve_packed(damped, rhs)
+    # A negative time axis is mirrored with the others; space axes are left to the alignment.
+    sign = torch.where((weight * S[0].sign()).sum() < 0, -1.0, 1.0)
+    return (sign * L).to(lights), (sign * S).to(shading)

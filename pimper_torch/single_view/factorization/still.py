@@ -23,10 +23,6 @@ def camera_moved(
 
     Details are those of the logarithm of the values, between pixel noise and shading, so that
     light hardly changes them. False where the photographs have none.
-
-    Args:
-        encoded: As the files hold them.
-        where: Pixels to look at.
     """
     logs = encoded.mean(dim=1, keepdim=True).clamp_min(_DARKEST).log()
     smooth = _mean(logs, _NARROW)

@@ -106,11 +106,8 @@ def find_discontinuities(
     """Find the continuous steps.
 
     Args:
-        steps: Predicted by the normals.
         weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
         anchor: Of pixels whose unknown is given.
-        config: When a step is rejected.
-        method: Of the linear systems.
 
     Constant to autograd.
     """

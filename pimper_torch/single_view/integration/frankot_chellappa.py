@@ -24,7 +24,6 @@ def integrate_fourier(
     """Return the heights, of mean zero, whose slopes are nearest to those given.
 
     Args:
-        slope_right: At every pixel.
         pixel_width: Distance of neighbouring pixels in a row.
         pixel_height: Distance of rows.
 

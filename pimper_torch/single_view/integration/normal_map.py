@@ -84,7 +84,6 @@ def integrate_normal_map(
             ``"cosine"`` and ``"frankot-chellappa"`` integrate the bounding rectangle of the mask,
             normals outside it inpainted: published, fast, and for rectangles without mask and
             weights.
-        config: When a step is rejected.
         solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
 
     Raises:

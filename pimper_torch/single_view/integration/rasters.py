@@ -116,7 +116,6 @@ class RasterSystem:
 
         Args:
             right: Target steps to the right; ignored, NaN included, without weight.
-            down: Target steps down.
             heights: Known heights, likewise where there is no anchor; None for zero.
         """
         weight_right, weight_down, anchor = self._given
@@ -133,7 +132,6 @@ class RasterSystem:
         """Solve once, and give the iterations; not differentiable.
 
         Args:
-            source: As for :meth:`solve`.
             start: Initial heights, such as those of the iteration before.
         """
         with torch.no_grad():
@@ -163,7 +161,6 @@ class RasterSystem:
         other weights are positive.
 
         Args:
-            weight_right: As for a new system.
             keep: Keep the coarse levels whatever the weights. The solution is the same, but may
                 take many more cycles.
         """

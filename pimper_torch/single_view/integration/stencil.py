@@ -113,7 +113,6 @@ class CosineRaster:
     """Division by frequencies, for equal weights on a full rectangle.
 
     Args:
-        stencil: Its diagonal is ignored.
         anchor: Of every pixel.
     """
 
@@ -142,7 +141,6 @@ class MultigridRaster:
     """Conjugate gradients with a hierarchy, on the stencil's device.
 
     Args:
-        stencil: What to solve with.
         tolerance: Of the error, in the energy norm, relative.
         what: Names the system in errors.
     """

@@ -86,7 +86,6 @@ def orthographic_steps(
     Args:
         normals: Unit, ``n_z < 0``; where they are not finite or face away, inside the mask,
             slopes are inpainted and the steps not reliable.
-        mask: Pixels of the surface.
         spacing: Distance of neighbouring pixels in a row and in a column.
 
     Differentiable in the normals. Fourth order in the spacing where the surface is smooth.
@@ -113,7 +112,6 @@ def perspective_steps(
 
     Args:
         normals: As for :func:`orthographic_steps`, in the camera's frame.
-        mask: Pixels of the surface.
         intrinsics: Without skew.
 
     Source: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung, Discontinuity-aware normal

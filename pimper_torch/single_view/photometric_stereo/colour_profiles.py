@@ -61,7 +61,6 @@ def resolve_by_colour_profiles(
 
     Args:
         images: Linear radiance, of two channels or more. Point lights may have different colours.
-        mask: True on the surface.
         shading: Albedo times normal of the pixels inside the mask, right up to a bas-relief
             transformation. Vectors that are zero or not finite are left out.
         lights: Of the same factorization; its views must be those of the images.

@@ -82,7 +82,6 @@ def resolve_by_diffuse_maxima(
 
     Args:
         images: Linear radiance.
-        mask: Where the surface is.
         shading: Albedo times normal of the pixels inside the mask, right up to a bas-relief
             transformation.
         lights: Of the same factorization.

@@ -63,7 +63,7 @@ def factorize_photographs(
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        rank: 3 for point lights, 4 or 9 for harmonics.
+        rank: 3 for point lights, 4 for harmonics.
         robust: Whether to reweight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
         shadows: Of lights from behind, see there. For harmonics, ``none``.

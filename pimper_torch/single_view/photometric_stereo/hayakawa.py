@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.quadratics import diagonal, outer
+from pimper_torch.photometry.quadratics import diagonal, outer, unpacked
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
@@ -86,7 +86,6 @@ def relief_from_albedo(
     Args:
         shading: Albedo times normal up to a bas-relief transformation, raster order.
         weight: Not negative.
-        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four pixels.
@@ -122,8 +121,6 @@ def relief_from_strength(
         lights: Of the same factorization as the shading; zero rows are ignored.
         shading: Albedo times normal up to a bas-relief transformation, raster order; it
             distinguishes convex from concave.
-        weight: Of the pixels.
-        mask: True at the pixels.
 
     Raises:
         InputError: Fewer than four point lights.
@@ -179,11 +176,7 @@ def _form(
             residual = entries @ monomials - 1
             scale = CAUCHY_TUNING * median_deviation(residual, given > 0)
             heavy = given * cauchy_weights(residual, scale)
-        rows, columns = torch.triu_indices(3, 3)
-        form = vectors.new_zeros(3, 3, dtype=torch.float64)
-        form[rows, columns] = entries
-        form[columns, rows] = entries
-        return form.to(vectors) / size**2
+        return unpacked(entries[:, None], 3)[0].to(vectors) / size**2
 
 
 def _root(form: Float[Tensor, "3 3"], what: str) -> Float[Tensor, "3 3"]:

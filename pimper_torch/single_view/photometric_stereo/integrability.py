@@ -94,7 +94,6 @@ def curls(
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
         weight: Of the pixels; 0 leaves one out.
-        mask: True at the pixels.
         noise: Covariance of ``s``, up to a factor; by default noise is white, as after a singular
             value decomposition.
 
@@ -161,7 +160,6 @@ def integrable(
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
         weight: Of the pixels; 0 leaves one out.
-        mask: True at the pixels.
         noise: Covariance of ``s``; see :func:`curls`.
 
     Raises:
@@ -198,7 +196,6 @@ def rotation_to_surface(
     Args:
         shading: Albedo times normal of the pixels inside the mask, in an unknown frame.
         weight: Of the pixels; 0 leaves one out.
-        mask: True at the pixels.
         noise: Covariance of the shading; see :func:`curls`.
 
     Raises:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.factorization.manifolds import second_order
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
 from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
@@ -29,11 +28,7 @@ from pimper_torch.single_view.photometric_stereo.perspective import factorize_in
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.single_view.photometric_stereo.regression import determined
 from pimper_torch.single_view.photometric_stereo.relief import bulge, convex, rounded_relief
-from pimper_torch.single_view.photometric_stereo.spherical_harmonics import (
-    Harmonic,
-    four_harmonic_stereo,
-    nine_harmonic_stereo,
-)
+from pimper_torch.single_view.photometric_stereo.spherical_harmonics import four_harmonic_stereo
 from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
 
 
@@ -166,20 +161,12 @@ def _perspective(given: Problem, resolve: str) -> Solution:
 
 
 def _four_harmonics(given: Problem, resolve: str) -> Solution:
-    return _by_harmonics(given, four_harmonic_stereo, harmonics)
-
-
-def _nine_harmonics(given: Problem, resolve: str) -> Solution:
-    return _by_harmonics(given, nine_harmonic_stereo, second_order)
-
-
-def _by_harmonics(
-    given: Problem, stereo: Callable[..., Harmonic], basis: Callable[[Tensor], Tensor]
-) -> Solution:
-    found = stereo(given.gray, given.weight, given.mask, given.generator, robust=given.robust)
+    found = four_harmonic_stereo(
+        given.gray, given.weight, given.mask, given.generator, robust=given.robust
+    )
     albedo = found.shading[0]
     normals = found.shading[1:] / torch.where(albedo > 0, albedo, 1)
-    shade = found.lights @ basis(normals.mT).mT
+    shade = found.lights @ harmonics(normals.mT).mT
     return _scaled(
         Solution(
             normals=normals,
@@ -253,5 +240,4 @@ METHODS = {
     "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
     "perspective": Method(solve=_perspective, unknowns=3, perspective=True),
     "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),
-    "nine_harmonics": Method(solve=_nine_harmonics, unknowns=9, robust=False),
 }

@@ -22,13 +22,8 @@ from torch.nn.functional import conv2d, pad
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.photometry.bilinear import equations_of_samples
-from pimper_torch.photometry.quadratics import solve_packed
-from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem
+from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
 
-# Columns by which the lights are estimated where entries are missing: a choice.
-_COLUMNS = 4000
 # Minimum number of equations, for nine unknowns up to scale: a choice.
 _FEWEST = 50
 _REWEIGHTINGS = 4
@@ -71,8 +66,9 @@ def factorize_in_perspective(
     noise, but may not be without.
 
     Raises:
-        InputError: Fewer than three views, ``seen`` or intrinsics that do not fit, fewer than 50
-            squares inside the mask, or a second surface that explains the images.
+        InputError: Fewer than three views, ``seen`` or intrinsics that do not fit, three pixels
+            or fewer seen in four views, fewer than 50 squares inside the mask, or a second
+            surface that explains the images.
 
     Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, normalization and
     the noise model are ours.
@@ -81,7 +77,8 @@ def factorize_in_perspective(
     with torch.no_grad():
         radiance = images.double().sum(dim=1)[:, mask]
         weight = torch.ones_like(radiance) if seen is None else seen.double()
-        left, right = _rank_three(radiance, weight)
+        found = factorize_photographs(radiance, weight, 3, robust=False)
+        left, right = found.lights, found.shading
         known = (weight > 0).sum(dim=0) >= 3
         known = known & (right.norm(dim=0) > 0)
         right = torch.where(known, right, 0)
@@ -107,34 +104,12 @@ def integrability_equations(
     Args:
         vectors: Along normals, up to an invertible matrix.
         along_x: Their derivatives by the normalised image coordinates.
-        along_y: The same for y.
         rays: ``(x, y, 1)``.
     """
     cross_x = torch.linalg.cross(vectors, along_x, dim=0)
     cross_y = torch.linalg.cross(vectors, along_y, dim=0)
     x, y, _ = rays
     return torch.cat([cross_x, cross_y, -x * cross_x - y * cross_y]).mT
-
-
-def _rank_three(
-    radiance: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"]
-) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "3 pixel"]]:
-    filled = torch.where(weight > 0, radiance, 0)
-    start = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -3:]
-    if bool((weight > 0).all()):
-        return start, start.mT @ radiance
-    full = ((weight > 0).sum(dim=0) > 3).nonzero()[:, 0]
-    some = full[:: max(1, -(-len(full) // _COLUMNS))]
-    if len(some) < 3:
-        raise InputError(
-            f"{len(some)} pixels are seen in four views or more; needed: three at least. Mark "
-            "fewer values as shadow."
-        )
-    few = low_rank_problem(radiance[None, :, some], weight[None, :, some], start[None])
-    left = solve_variable_projection(few).lights
-    every = low_rank_problem(radiance[None], weight[None], left)
-    right = solve_packed(*equations_of_samples(every, left, every.weight))
-    return left[0], right[0]
 
 
 def _between(

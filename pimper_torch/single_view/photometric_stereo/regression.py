@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer
+from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer, unpacked
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
@@ -60,8 +60,6 @@ def regress(
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        lights: One row a view.
-        robust: Whether to reweight.
         shadows: Of a light from behind: ``attached``, radiance is 0; ``none``, it is linear in
             the light, and negative.
         base: Whether radiance has a part that is the same in all views, such as ambient light.
@@ -149,12 +147,7 @@ def determined(
     size = lights.double().norm(dim=0)
     basis = lights.double() / torch.where(size > 0, size, 1)
     unknowns = lights.shape[1]
-    packed = (outer(basis.mT) @ weight.double()).mT
-    rows, columns = torch.triu_indices(unknowns, unknowns)
-    full = packed.new_zeros(len(packed), unknowns, unknowns)
-    full[:, rows, columns] = packed
-    full[:, columns, rows] = packed
-    values = torch.linalg.eigvalsh(full)
+    values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
     spanned = values[:, 0] > least * values[:, -1]
     return count >= unknowns, spanned & (values[:, -1] > 0)
 

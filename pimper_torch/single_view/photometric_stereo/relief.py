@@ -22,7 +22,6 @@ def rounded_relief(
     Args:
         shading: Of a surface, up to a bas-relief transformation, ``b_z < 0``, raster order.
         weight: Not negative.
-        mask: True at the pixels.
 
     Differentiable; degenerate for a plane, where ``lambda`` is 1.
     """
@@ -46,10 +45,8 @@ def convex(
     """Choose the convex one of a transformation and its mirror image, which fit equally well.
 
     Args:
-        relief: Either of them.
         shading: It is applied to this, raster order.
         weight: Not negative.
-        mask: True at the pixels.
     """
     mu, nu, lam = (part.to(shading) for part in (relief.mu, relief.nu, relief.lam))
     found = BasRelief(mu=mu, nu=nu, lam=lam)
@@ -67,7 +64,6 @@ def bulge(
     Args:
         sideways: The parts of shading along x and y, uncorrelated with z.
         weight: Not negative.
-        mask: True at the pixels.
     """
     rows, columns = torch.nonzero(mask, as_tuple=True)
     position = torch.stack([columns, rows]).to(sideways)

@@ -37,8 +37,8 @@ class PhotometricStereo(Record):
             not valid, an estimate or zero.
         albedo: Of each colour, not negative. With unknown lights up to one factor, such that
             lights have the median length 1.
-        lights: One row a view: direction to the point light times its irradiance; or four or nine
-            harmonics. Zero for a view without samples.
+        lights: One row a view: direction to the point light times its irradiance, or four
+            harmonics; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
         finding: A :class:`Finding` for each pixel.
@@ -84,7 +84,6 @@ def photometric_stereo(
                                                                     by ``resolve``
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ``four_harmonics``  any, around the viewer, no cast shadows     convex or concave
-    ``nine_harmonics``  the same, to second order                   convex or concave
     ==================  ==========================================  =================
 
     Convex is chosen. ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a

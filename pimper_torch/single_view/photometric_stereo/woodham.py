@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import PackedCholesky, outer
+from pimper_torch.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.records import Record
 from pimper_torch.single_view.photometric_stereo.regression import regress
 
@@ -71,7 +71,7 @@ def calibrated_stereo(
         packed = outer(rows.mT) @ heavy
         factored = PackedCholesky(packed, rows.shape[1])
         found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
-        full = _unpacked(packed, rows.shape[1])
+        full = unpacked(packed, rows.shape[1])
         inner = full[:, :3, :3]
         if ambient:
             total = full[:, 3, 3].clamp_min(torch.finfo(full.dtype).tiny)
@@ -119,11 +119,3 @@ def _shared(
     black = (vectors == 0).all(dim=2).all(dim=1)
     normal = torch.where(black[:, None], 0, sign * normal)
     return normal.mT, (sign * albedo).clamp_min(0).mT
-
-
-def _unpacked(packed: Float[Tensor, "entry pixel"], size: int) -> Float[Tensor, "pixel size size"]:
-    rows, columns = torch.triu_indices(size, size)
-    full = packed.new_zeros(packed.shape[1], size, size)
-    full[:, rows, columns] = packed.mT
-    full[:, columns, rows] = packed.mT
-    return full

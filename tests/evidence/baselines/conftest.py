@@ -2,9 +2,9 @@ from functools import cache
 
 import pytest
 import torch
+from comparison import compare_in_view
 from reliefs import WavyPlane
 
-from pimper_torch.evidence.metrics.relative import compare_in_view
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights

@@ -244,14 +244,14 @@ def test_presets_and_rivals_have_names():
         for name in BenchConfig(scale="full").chosen_methods:
             assert callable(method_named(name))
     assert set(BenchConfig().chosen_methods) < set(BenchConfig(scale="full").chosen_methods)
-    assert BenchConfig(methods=("lim",)).chosen_methods == ("lim",)
+    assert BenchConfig(methods=("paper",)).chosen_methods == ("paper",)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
         {"scenes": ()},
-        {"methods": ("lim", "lim")},
+        {"methods": ("paper", "paper")},
         {"methods": ("default", "mine/default.yaml")},  # one name in the table
         {"methods": ()},
         {"processes": 0},

@@ -155,7 +155,7 @@ def test_columns_that_no_row_fills_are_left_out():
 
 
 def test_thresholds_that_differ_between_rows_have_columns_of_their_own():
-    rows = (FULL, FULL.replace(method="lim", f_scores=((0.25, 50.0), (1.0, 60.0))))
+    rows = (FULL, FULL.replace(method="paper", f_scores=((0.25, 50.0), (1.0, 60.0))))
     first, second = cells(markdown(table(*rows)))
     assert (first["F 0.25 %"], first["F 0.5 %"], first["F 1 %"]) == (MISSING, "97.5", "99.2")
     assert (second["F 0.25 %"], second["F 0.5 %"], second["F 1 %"]) == ("50.0", MISSING, "60.0")
@@ -172,7 +172,7 @@ def test_nothing_in_a_name_or_a_note_breaks_the_table():
 
 
 def test_published_rows_stand_before_ours_and_are_marked():
-    ours = [FULL, FULL.replace(scene="potatoes"), FULL.replace(method="lim"), FULL]
+    ours = [FULL, FULL.replace(scene="potatoes"), FULL.replace(method="paper"), FULL]
     rows = with_published(ours)
     assert [(row.scene, row.published) for row in rows] == [
         ("mug", True),
@@ -291,10 +291,10 @@ def test_files_that_cannot_be_read_or_written_are_refused(tmp_path):
 def test_a_missing_program_is_told_from_a_failure():
     missing = row_of_failure("mug", "pmvs", MissingProgramError("pmvs2 is not on the PATH"))
     assert missing.note == "not installed\npmvs2 is not on the PATH"
-    failed = row_of_failure("mug", "lim", ReconstructionError("no facet"), minutes=0.5)
+    failed = row_of_failure("mug", "paper", ReconstructionError("no facet"), minutes=0.5)
     assert failed.note == "failed: no facet"
     assert failed.minutes == 0.5
-    assert row_of_failure("mug", "lim", MemoryError()).note == "failed: MemoryError"
+    assert row_of_failure("mug", "paper", MemoryError()).note == "failed: MemoryError"
 
 
 def test_this_machine_is_described():

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.datasets.colmap import read_colmap, read_colmap_scene
+from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets.colmap import read_colmap
 from pimper_torch.exchange.colmap_workspace import write_colmap
 from pimper_torch.sfm.colmap import read_model
 
@@ -35,14 +35,6 @@ def test_a_text_model_is_read_with_its_photographs(folder, sees, hand_camera):
     assert sees(capture) == pytest.approx([9, 11])
     assert_close(capture.cameras.cam_from_world[1], hand_camera)
     assert capture.truth.points_world is None  # found, not measured
-
-
-def test_the_cloud_comes_as_a_scene(folder):
-    with pytest.warns(PimperWarning, match="0 could be triangulated"):  # of one point
-        scene = read_colmap_scene(folder, max_size_px=8)
-    assert scene.points_world.tolist() == [[6, 3, 5]]
-    assert scene.observation_pixels.tolist() == [[4.5, 5.5], [4.75, 5.5], [4.5, 5.5]]
-    assert scene.views.images.shape == (3, 3, 6, 8)
 
 
 def test_the_model_itself_may_be_named_and_masks_lie_beside(folder, paint, sees):
@@ -79,8 +71,6 @@ def test_a_missing_photograph_is_named(folder):
     (folder / "images" / "a.png").unlink()
     with pytest.raises(InputError, match=r"no a\.png"):
         read_colmap(folder)
-    with pytest.raises(InputError, match=r"no a\.png"):
-        read_colmap_scene(folder)
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path):

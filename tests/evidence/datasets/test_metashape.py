@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.datasets.metashape import read_metashape
+from pimper_torch.evidence.datasets.programs import read_metashape
 
 # `hand_camera` from camera to chunk, row by row: columns are its right, down, forward, place.
 TRANSFORM = "0 0 1 -4 1 0 0 2 0 1 0 3 0 0 0 1"
@@ -154,9 +154,9 @@ def test_entities_are_not_expanded(save):
 
 
 def test_a_folder_without_one_xml_file_is_refused(save, tmp_path):
-    with pytest.raises(InputError, match=r"one \.xml file"):
+    with pytest.raises(InputError, match=r"one file named \*\.xml"):
         read_metashape(tmp_path)
     save()
     (tmp_path / "other.xml").touch()
-    with pytest.raises(InputError, match=r"one \.xml file"):
+    with pytest.raises(InputError, match=r"one file named \*\.xml"):
         read_metashape(tmp_path)

@@ -11,7 +11,6 @@ from pimper_torch.evidence.datasets.posed import (
     assemble,
     image_files,
     mask_finder,
-    shrink,
 )
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import LINEAR
@@ -42,15 +41,6 @@ def test_the_camera_stays_with_its_photograph(shot, tmp_path, sees):
     # sRGB 120 of the brighter quarter and 100 of the rest, by the formula of IEC 61966-2-1.
     assert_close(float(capture.views.images[0, 0, 0, 0]), ((120 / 255 + 0.055) / 1.055) ** 2.4)
     assert_close(float(capture.views.images[0, 2, 11, 15]), ((100 / 255 + 0.055) / 1.055) ** 2.4)
-
-
-def test_shrinking_a_capture_keeps_saturated_pixels(shot, tmp_path):
-    capture = assemble([shot()], tmp_path, "a toy", encoding=LINEAR)
-    images = 0.2 * torch.ones_like(capture.views.images)
-    images[0, 0, 1, 1] = 1.0
-    small, _ = shrink(capture.views.replace(images=images), capture.cameras, 4)
-    assert small.images.max() == 1
-    assert (small.images[0, 1:] < 0.5).all()
 
 
 def test_linear_values_are_left_as_they_are(shot, tmp_path):
@@ -256,17 +246,3 @@ def test_two_masks_for_one_photograph_are_refused(tmp_path, paint):
         paint(tmp_path / "m" / name, 100)
     with pytest.raises(InputError, match=r"1-a\.png, 1-b\.png"):
         mask_finder(tmp_path / "m", "a toy")(tmp_path / "1.jpg")
-
-
-def test_shrinking_a_capture_is_reading_it_smaller(shot, tmp_path):
-    shots = [shot(skew_px=2.0), shot("b.png", 6, 4, lens=LENS.replace(width=6, height=4))]
-    whole = assemble(shots, tmp_path, "a toy")
-    small = assemble(shots, tmp_path, "a toy", max_size_px=8)
-    views, cameras = shrink(whole.views, whole.cameras, 8)
-    assert views.images.shape == (2, 3, 6, 8)
-    assert_close(views.images, small.views.images)
-    assert_close(cameras.intrinsics, small.cameras.intrinsics)
-    assert torch.equal(cameras.sizes_px, small.cameras.sizes_px)
-    again, same = shrink(whole.views, whole.cameras, 0)
-    assert torch.equal(again.images, whole.views.images)
-    assert torch.equal(same.intrinsics, whole.cameras.intrinsics)

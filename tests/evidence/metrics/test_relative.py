@@ -1,9 +1,10 @@
 import pytest
 import torch
+from comparison import compare_in_view
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics import compare_in_view, relative_error
+from pimper_torch.evidence.metrics import relative_error
 from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.meshes import icosphere, table

@@ -1,7 +1,5 @@
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
@@ -10,7 +8,6 @@ from pimper_torch.evidence.scenes.compositions import potato_on_table
 from pimper_torch.evidence.scenes.lights import Lights, wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere, join, potato, table
 from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.photographs import save_masks, save_photographs
 from pimper_torch.evidence.scenes.render import render_objects, render_shape
 from pimper_torch.evidence.scenes.scene_object import SceneObject
 from pimper_torch.evidence.scenes.sensor import SensorConfig
@@ -247,28 +244,6 @@ def test_the_potato_scene_has_shadows_and_texture_and_little_saturation():
     assert (scene.views.images >= 1).float().mean() < 0.03
     assert scene.albedo[scene.foreground].std() > 0.1
     assert 0.2 < scene.foreground.float().mean() < 0.6
-
-
-def test_photographs_are_written_as_srgb_bytes(tmp_path):
-    scene = potato_on_table(4, num_views=2, width=64, height=48)
-    paths = save_photographs(scene.views, tmp_path / "photos")
-    assert [path.name for path in paths] == list(scene.views.names)
-    for path, image in zip(paths, scene.views.images, strict=True):
-        bytes_ = np.asarray(Image.open(path))
-        assert bytes_.shape == (48, 64, 3)
-        coded = bytes_.astype(np.float64) / 255
-        linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
-        # Half a byte, where sRGB is steepest: 2.4 / 1.055 of it.
-        assert np.abs(linear - image.movedim(0, -1).numpy()).max() < 0.5 / 255 * 2.4
-
-
-def test_masks_are_white_on_the_object(tmp_path):
-    masks = torch.zeros(2, 6, 8, dtype=torch.bool)
-    masks[1, 2:4, 5] = True
-    paths = save_masks(masks, ["a.png", "b.jpg"], tmp_path / "masks")
-    assert [path.name for path in paths] == ["a.png", "b.png"]
-    found = np.stack([np.asarray(Image.open(path)) for path in paths])
-    assert (found == 255 * masks.numpy()).all()
 
 
 def test_a_sensor_without_rays_is_refused():

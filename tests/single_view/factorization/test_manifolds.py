@@ -11,10 +11,9 @@ from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
 from pimper_torch.single_view.factorization.alternation import solve_alternation
-from pimper_torch.single_view.factorization.descent import solve_descent
-from pimper_torch.single_view.factorization.manifolds import Free, SecondOrder, second_order
+from pimper_torch.single_view.factorization.manifolds import Free
 
-MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone(), SecondOrder()])
+MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone()])
 
 
 def draw(generator, *shape):
@@ -36,29 +35,6 @@ def test_albedo_and_normal_are_joined_and_split(manifold, generator):
     assert_close(found[1], normals)
     assert_close(manifold.project(vectors), vectors)
     assert_close(manifold.retract(vectors), vectors)
-
-
-def test_nine_harmonics_have_the_same_length_for_every_normal(generator):
-    normals = normalize(draw(generator, 30, 3), dim=-1)
-    basis = second_order(normals)
-    assert_close(basis[:, :1].square().sum(dim=1), torch.ones(30).double())
-    assert_close(basis[:, 1:4].square().sum(dim=1), torch.ones(30).double())
-    assert_close(basis[:, 4:].square().sum(dim=1), torch.ones(30).double())
-    many = second_order(normalize(draw(generator, 200_000, 3), dim=-1))
-    moments = many.T @ many / len(many)
-    assert_close(moments, moments.diagonal().diag(), rtol=0, atol=0.01)  # orthogonal
-
-
-def test_projection_finds_the_nearest_second_order_vector(generator):
-    vectors = draw(generator, 40, 9)
-    vectors[0, 1:4] = 0  # two normals are equally near
-    found = SecondOrder().project(vectors)
-    rays = second_order(normalize(draw(generator, 20_000, 3), dim=-1))
-    best = (vectors @ rays.T).clamp_min(0) / 3  # least squares along a ray of length sqrt(3)
-    rivals = (vectors[:, None] - best[..., None] * rays).norm(dim=-1).amin(dim=1)
-    distance = (found - vectors).norm(dim=-1)
-    assert (distance <= rivals + 1e-9).all()
-    assert (distance >= rivals - 1e-2).all()  # as near as the rays lie to one another
 
 
 @MANIFOLDS
@@ -100,7 +76,6 @@ def test_vectors_without_a_normal_are_refused(generator):
     [
         (solve_alternation, 3e-3),
         (solve_balm, 1e-6),
-        (solve_descent, 1e-8),
         (solve_variable_projection, 1e-12),
     ],
 )
@@ -122,12 +97,8 @@ def test_every_solver_explains_the_data_on_every_manifold(solve, tolerance, mani
         manifold=manifold,
     )
     found = solve(problem, 600, tolerance)
-    # Of radiances about 2. With nine harmonics lights and shading mimic each other so well that
-    # alternation crawls: it is the one that runs into the limit.
-    assert found.convergence.residual[0] < 3e-3
-    crawls = solve is solve_alternation and manifold.rank == 9
-    expected = StopCause.LIMIT if crawls else StopCause.CONVERGED
-    assert found.convergence.cause.tolist() == [expected, StopCause.EMPTY]
+    assert found.convergence.residual[0] < 3e-3  # of radiances about 2
+    assert found.convergence.cause.tolist() == [StopCause.CONVERGED, StopCause.EMPTY]
     assert_close(manifold.project(found.shading.mT).mT, found.shading)
     stopped = solve(problem, 2, tolerance)
     assert stopped.convergence.cause[0] == StopCause.LIMIT

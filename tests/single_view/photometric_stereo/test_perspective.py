@@ -149,5 +149,5 @@ def test_what_does_not_fit_is_refused(generator):
         factorize_in_perspective(images[:1].expand(5, -1, -1, -1), mask, intrinsics)
     three = torch.zeros(12, int(mask.sum()), dtype=torch.bool)
     three[:3] = True
-    with pytest.raises(InputError, match="four views"):
+    with pytest.raises(InputError, match="0 pixels more than 3"):
         factorize_in_perspective(images, mask, intrinsics, three)

@@ -4,16 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.single_view.factorization.ambiguity import (
-    align_factorizations,
-    lorentz,
-    minkowski,
-)
-from pimper_torch.single_view.factorization.manifolds import second_order
-from pimper_torch.single_view.photometric_stereo.spherical_harmonics import (
-    four_harmonic_stereo,
-    nine_harmonic_stereo,
-)
+from pimper_torch.single_view.factorization.ambiguity import align_factorizations, minkowski
+from pimper_torch.single_view.photometric_stereo.spherical_harmonics import four_harmonic_stereo
 
 
 @pytest.fixture
@@ -48,32 +40,6 @@ def test_highlights_lose_their_weight(bumpy, soft, generator, angles_deg):
     assert angles_deg(found.shading[1:], bumpy.columns).mean() < 1
 
 
-def test_light_of_second_order_needs_nine(bumpy, soft, patchwork, generator, angles_deg):
-    second = 0.1 * torch.randn(15, 5, generator=generator, dtype=torch.float64)
-    lights = torch.cat([soft, second], dim=1)
-    albedo = patchwork(bumpy)
-    radiance = lights @ (albedo * second_order(bumpy.columns.mT).mT)
-    weight = torch.ones_like(radiance)
-    four = four_harmonic_stereo(radiance, weight, bumpy.mask, generator)
-    nine = nine_harmonic_stereo(radiance, weight, bumpy.mask, generator)
-    assert angles_deg(four.shading[1:], bumpy.columns).mean() > 5
-    assert angles_deg(nine.shading[1:], bumpy.columns).mean() < 0.6
-    ratio = nine.shading[0] / albedo
-    assert ratio.std() < 0.03 * ratio.mean()
-
-
-def test_lorentz_transformations_leave_the_span_of_nine(bumpy, patchwork):
-    cone = patchwork(bumpy) * harmonics(bumpy.columns.mT).mT
-    before = cone[0] * second_order(bumpy.columns.mT).mT
-    generator = torch.tensor([0.3, -0.2, 0.1, 0.5, 0.4, -0.9], dtype=torch.float64)
-    moved = lorentz(generator) @ cone
-    normals = moved[1:] / moved[0]
-    after = moved[0] ** 2 / cone[0] * second_order(normals.mT).mT
-    rows = torch.linalg.qr(before.mT).Q
-    assert_close((after @ rows) @ rows.mT, after)
-    assert (normals - bumpy.columns).abs().mean() > 0.1
-
-
 def test_point_lights_from_all_sides_come_near_to_four_harmonics(bumpy, angles_deg):
     # Point lights over the viewer's half ball, evenly; 20 % of the samples lie in attached shadow.
     index = torch.arange(40, dtype=torch.float64) + 0.5
@@ -94,7 +60,5 @@ def test_point_lights_from_all_sides_come_near_to_four_harmonics(bumpy, angles_d
 def test_fewer_views_than_harmonics_are_refused(bumpy, soft, generator):
     radiance = soft[:8] @ harmonics(bumpy.columns.mT).mT
     weight = torch.ones_like(radiance)
-    with pytest.raises(InputError, match="needed: 9 views"):
-        nine_harmonic_stereo(radiance, weight, bumpy.mask, generator)
     with pytest.raises(InputError, match="needed: 4 views"):
         four_harmonic_stereo(radiance[:3], weight[:3], bumpy.mask, generator)
