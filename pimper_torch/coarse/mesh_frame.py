@@ -116,9 +116,8 @@ def compare_with_scene(
     told = _told(found, distance, diagonal)
     if not found.score >= _GOOD:
         frames = [matrix for matrix in _frames() if not torch.equal(matrix, here)]
-        scores = [_score(fit(matrix, _TRIED)) for matrix in frames]
-        matrix = frames[max(range(len(frames)), key=lambda index: scores[index])]
-        best, score = fit(matrix), 0.0 if math.isnan(found.score) else found.score
+        matrix = max(frames, key=lambda matrix: _known(fit(matrix, _TRIED).score))
+        best, score = fit(matrix), _known(found.score)
         good = best.score >= _GOOD and best.hits >= _MIN_SEEN * best.rays
         if good and far_better(score, [best.score], _BETTER, 0.0) is not None:
             raise InputError(
@@ -147,8 +146,8 @@ def compare_with_scene(
     return {name: value for name, value in figures.items() if not math.isnan(value)}
 
 
-def _score(fit: Fit) -> float:
-    return 0.0 if math.isnan(fit.score) else fit.score
+def _known(score: float) -> float:
+    return 0.0 if math.isnan(score) else score
 
 
 def _told(found: Fit, distance: float, diagonal: float) -> str:

@@ -77,21 +77,20 @@ def choose_ways(
     if min(len(plain), len(turned)) >= 2 * _APART:
         variance = _APART * (plain.var() / len(plain) + turned.var() / len(turned))
         errors = float((turned.mean() - plain.mean()) / variance.sqrt().clamp_min(1e-12))
-    stored = errors > _ERRORS
     told = f"{len(open_ones)} of {len(ways)} masks, whose photographs EXIF turns"
-    if stored:
-        told += (
-            ", are drawn on the pixels that the files store, as their outlines show; they are "
-            "turned, too."
+    if errors > _ERRORS:
+        caution(
+            f"{where}: {told}, are drawn on the pixels that the files store, as their outlines "
+            "show; they are turned, too.",
+            stacklevel=4,
         )
-    else:
-        told = (
-            f"of {told}, nothing tells whether they are turned already; they are taken as they "
-            "are. If that is wrong, turn them."
+    elif errors > -_ERRORS:
+        caution(
+            f"{where}: of {told}, nothing tells whether they are turned already; they are taken as "
+            "they are. If that is wrong, turn them.",
+            stacklevel=4,
         )
-    if errors > -_ERRORS:
-        caution(f"{where}: {told}", stacklevel=4)
-    return stored
+    return errors > _ERRORS
 
 
 def _changes(

@@ -81,12 +81,30 @@ def _agreeing_fraction(pairs: Collection[tuple[int, float]]) -> float:
 
 def agreement(model: SparseModel, pair: VerifiedPair, max_error_px: float) -> float:
     """Return the fraction of a pair's matches that the model's epipolar geometry explains."""
-    ends = [
-        undistorted_pixels(model, view, pixels)
-        for view, pixels in zip(pair.views, (pair.first, pair.second), strict=True)
+    return float((match_errors(model, [pair]) <= max_error_px).double().mean())
+
+
+def match_errors(model: SparseModel, pairs: Sequence[VerifiedPair]) -> Float[Tensor, " match"]:
+    """Measure Sampson's distances of matches from the epipolar lines of a model, in pixels."""
+    cameras = pinholes_of(model)
+    errors = [
+        sampson_errors(epipolar_geometry(cameras, pair.views), pair.first, pair.second)
+        for pair in undistorted_pairs(model, pairs)
     ]
-    errors = sampson_errors(epipolar_geometry(pinholes_of(model), pair.views), *ends)
-    return float((errors <= max_error_px).double().mean())
+    return torch.cat([*errors, torch.zeros(0, dtype=torch.float64)])
+
+
+def undistorted_pairs(
+    model: SparseModel, pairs: Sequence[VerifiedPair]
+) -> tuple[VerifiedPair, ...]:
+    """Undistort matches by the lenses of a model."""
+    return tuple(
+        pair.replace(
+            first=undistorted_pixels(model, pair.views[0], pair.first),
+            second=undistorted_pixels(model, pair.views[1], pair.second),
+        )
+        for pair in pairs
+    )
 
 
 def pinholes_of(model: SparseModel) -> Cameras:

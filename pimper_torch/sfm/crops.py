@@ -14,10 +14,11 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
 from pimper_torch.records import Views
+from pimper_torch.sfm.agreement import match_errors
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel, longest_tracks
-from pimper_torch.sfm.photograph_agreement import explained_fraction, match_errors
+from pimper_torch.sfm.photograph_agreement import explained_fraction
 from pimper_torch.sfm.quarter_turns import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.squares import (
     ERRORS,

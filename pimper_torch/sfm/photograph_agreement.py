@@ -8,14 +8,14 @@ few do by chance. Cameras of another convention are put right in every usual way
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pimper_torch.camera_files.conventions import camera_mistakes, far_better
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pixels
+from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pairs
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.static_background import sampson_errors
@@ -38,13 +38,6 @@ def explained_fraction(
     return _fraction(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
 
 
-def match_errors(model: SparseModel, verified: Sequence[VerifiedPair]) -> Float[Tensor, " match"]:
-    """Measure Sampson's distances of matches from the epipolar lines of a model, in pixels."""
-    cameras = pinholes_of(model)
-    errors = [_errors(cameras, pair) for pair in undistorted_pairs(model, verified)]
-    return torch.cat([*errors, torch.zeros(0, dtype=torch.float64)])
-
-
 def _fraction(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
     """Return the fraction of undistorted matches that cameras explain."""
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
@@ -61,7 +54,8 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     """
     one, other = pair.views
     K, poses = cameras.intrinsics, cameras.cam_from_world
-    near = _errors(cameras, pair) <= max_error_px
+    geometry = epipolar_geometry(cameras, pair.views)
+    near = sampson_errors(geometry, pair.first, pair.second) <= max_error_px
     between = poses[other] @ torch.linalg.inv(poses[one])
     rays = homogeneous(pair.first) @ torch.linalg.inv(K[one]).mT @ between[:3, :3].mT
     back = homogeneous(pair.second) @ torch.linalg.inv(K[other]).mT
@@ -71,24 +65,6 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     ahead = (torch.linalg.cross(back, shift) * normal).sum(dim=1) > 0
     ahead_there = (torch.linalg.cross(rays, shift) * normal).sum(dim=1) > 0
     return near & ahead & ahead_there
-
-
-def _errors(cameras: Cameras, pair: VerifiedPair) -> Float[Tensor, " match"]:
-    """Measure Sampson's distances of matches, in pixels."""
-    return sampson_errors(epipolar_geometry(cameras, pair.views), pair.first, pair.second)
-
-
-def undistorted_pairs(
-    model: SparseModel, verified: Sequence[VerifiedPair]
-) -> tuple[VerifiedPair, ...]:
-    """Undistort matches by the lenses of a model."""
-    return tuple(
-        pair.replace(
-            first=undistorted_pixels(model, pair.views[0], pair.first),
-            second=undistorted_pixels(model, pair.views[1], pair.second),
-        )
-        for pair in verified
-    )
 
 
 def require_agreement(

@@ -14,7 +14,12 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.agreement import epipolar_geometry, pinholes_of, undistorted_pixels
+from pimper_torch.sfm.agreement import (
+    epipolar_geometry,
+    pinholes_of,
+    undistorted_pairs,
+    undistorted_pixels,
+)
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.crops import find_crop
@@ -36,7 +41,6 @@ from pimper_torch.sfm.photograph_agreement import (
     explained,
     explained_fraction,
     require_agreement,
-    undistorted_pairs,
 )
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
