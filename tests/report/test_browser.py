@@ -314,7 +314,7 @@ def test_pictures_of_a_result_are_made(browser, tmp_path):
     if not report:
         pytest.skip("PIMPER_REPORT names no page")
     folder = Path(os.environ.get("PIMPER_PICTURES", tmp_path))
-    context = browser.new_context(viewport={"width": 1400, "height": 900})
+    context = browser.new_context(viewport={"width": 1200, "height": 770})
     page = context.new_page()
     opening(page, Path(report).absolute())
     print(f"first frame after {page.evaluate('document.documentElement.dataset.ready')} ms")  # noqa: T201 - a figure to read
@@ -329,6 +329,6 @@ def test_pictures_of_a_result_are_made(browser, tmp_path):
         if view is not None:
             behind(page, view)
         page.wait_for_timeout(500)
-        page.screenshot(path=folder / f"{name}.jpg", type="jpeg", quality=85)
+        page.screenshot(path=folder / f"{name}.jpg", type="jpeg", quality=68)
         assert pixels((folder / f"{name}.jpg").read_bytes()).std() > 20
     context.close()
