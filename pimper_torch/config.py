@@ -39,7 +39,6 @@ def require_at_most(config: object, section: str = "", /, **most: int | float) -
     """Refuse values above the bounds of their fields: slips that no memory or time suffices for.
 
     Args:
-        config: Whose fields they are.
         section: Of the config, for the message.
         most: The largest value of each field.
 

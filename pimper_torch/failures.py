@@ -76,9 +76,6 @@ def collecting(
 def skipped(*failures: Failure, error: BaseException | None = None) -> None:
     """Note what failed and was left out; outside of :func:`collecting`, warn of it at once.
 
-    Args:
-        error: That they failed with.
-
     Raises:
         ReconstructionError: Failures are to end the run.
     """

@@ -69,7 +69,6 @@ def over_rows(
 
     Args:
         kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
-        rows: How many there are.
         size: How many rows of usual work one of them is.
 
     Returns:

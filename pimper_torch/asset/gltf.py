@@ -38,7 +38,6 @@ def gltf_of(
         material: In glTF's words; its textures' indices are those of ``images``. Extensions that it
             names are declared.
         images: PNG or JPEG files.
-        offset_world: The node's translation.
     """
     buffer, views, accessors = bytearray(), [], []
 

@@ -45,7 +45,6 @@ def read_arguments(
     Args:
         command: Its parameters are the options; its docstring is their help.
         name: After ``pimper``.
-        arguments: After the name.
         levels: Several numbers are one word, such as 15000,15100,14900.
         rare: Options that ``--help`` leaves to ``--help-all``, as it leaves settings of stages.
 

@@ -70,7 +70,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         Args:
             name: A preset to print (default, fast, paper, or a YAML file); or a section or a
                 setting to explain, such as sweep or fuse.contours.
-            preset: Whose settings these are.
         """
         is_preset = name in presets() or Path(name).suffix in (".yaml", ".yml")
         chosen = name if is_preset else preset

@@ -138,7 +138,6 @@ def fine_surface(
         scene: Photographs, cameras and cloud.
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
-        densify: How photographs are matched.
 
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
@@ -320,7 +319,6 @@ def supports(
     """Return the :class:`~pimper_torch.records.Support` of each face of a fine surface.
 
     Args:
-        contour: Contour points.
         counts: Of the views that see each face.
         reach: Distance to a point, or a contour point, that supports a face.
     """

@@ -42,7 +42,6 @@ def fitted_normals(
 
     Args:
         mesh: After splitting and dropping.
-        surface: On the mesh before.
         split: From the one to the other.
         index: Of each child among the mesh's faces; -1 for a dropped one.
     """
@@ -88,8 +87,6 @@ def with_points(
     facet, at its own position with its own covariance.
 
     Args:
-        coarse: Before.
-        mesh: After.
         split: From the one to the other.
         index: Of each child among the mesh's faces; -1 for a dropped one.
         source: The old vertex that each vertex is or is a copy of; new ones follow the old.

@@ -284,11 +284,7 @@ def _severity(
 def departures(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
 ) -> Float[Tensor, " face"]:
-    """Return the 90th percentile of the surface's distances from each facet's plane.
-
-    Args:
-        vertices: The facets' corners.
-    """
+    """Return the 90th percentile of the surface's distances from each facet's plane."""
     normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)
     offset = surface.vertices_world.to(vertices) - centre[surface.facet]

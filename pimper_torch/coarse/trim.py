@@ -61,7 +61,6 @@ def view_counts(
     Args:
         level: Photographs, at the resolution of the depth maps.
         maps: Of all views; without, none sees through a face.
-        matched_world: Points of the cloud.
         reach: Distance from these up to which a depth map meets them, scene units.
     """
     cameras = level.cameras

@@ -22,11 +22,7 @@ _DAMPING = 1e-3
 
 
 class CoarsePart:
-    """Gives the continuous function linear on every facet that is nearest to values.
-
-    Args:
-        facets: The coarse mesh's faces.
-    """
+    """Gives the continuous function linear on every facet that is nearest to values."""
 
     def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:
         self._subdivision, self._facets = subdivision, facets

@@ -215,7 +215,6 @@ def _evaluated(
 
     Args:
         probe: Random signs.
-        answer: The solution to these.
     """
     parts = kind.coefficients, kind.targets, kind.information, kind.correlated
     if compiled_for(*parts, weight, heights, answer):

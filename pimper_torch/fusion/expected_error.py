@@ -52,7 +52,6 @@ def expected_error(
         fine: The solve that detail is from.
         coarse: The solve that the coarse shape is from, with what neighbours err by together;
             the same record where there was only one solve. Noise has the factors of ``fine``.
-        facets: The coarse mesh's faces.
         draws: Of noise. The result is off by one over the square root of twice as many.
 
     Returns:

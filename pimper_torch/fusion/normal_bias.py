@@ -68,7 +68,6 @@ def normal_bias(
     """Compare normals with those of a shape, facet by facet.
 
     Args:
-        facets: The coarse mesh's faces.
         normals: Photometric, unit.
         shape: Of the surface, unit.
         known: Where there are photometric ones.

@@ -133,7 +133,6 @@ def kept_slopes(
         edges: Those without normals at both ends.
         flat: ``q``.
         directions: ``d``, unit.
-        shape: Normals of the surface.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
     found = slopes(edges, flat, directions, shape, variance)
@@ -180,7 +179,6 @@ def swept_heights(
 
     Args:
         transferred: Heights of the surface that was swept.
-        offsets: Along its normals.
         information: Of the offsets, each vertex's own share; one without says nothing.
         facing: Cosine between normals and directions.
         correlated: Vertices in a window, which have one offset.

@@ -84,7 +84,6 @@ def intersect_height_field(
         ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
             float64 rays meet a float32 height field in float64.
         ray_directions: Any length and sign; the ray is the whole line.
-        steps: Newton's steps.
 
     Returns:
         The points, and whether each lies on the height field: all neighbours it is blended from
@@ -161,7 +160,6 @@ def _gap(
     Args:
         grid: The height field; every sample has a value.
         rays: x, y and z of the rays' origins, and of their directions.
-        distance: Along each ray.
     """
     x, y, z, dx, dy, dz = rays
     count, height, width = grid.depth.shape

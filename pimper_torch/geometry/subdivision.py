@@ -56,7 +56,6 @@ class Subdivision(Record):
 
         Args:
             per_corner: One row a vertex of the coarse mesh.
-            facets: The coarse mesh's faces.
         """
         corners = per_corner[facets[self.facet]]
         return (self.barycentric[..., None] * corners).sum(dim=1)

@@ -241,7 +241,6 @@ def _placed(
     Args:
         points: See :func:`decimate`, as for the three that follow.
         values: Normals and attributes.
-        bound: Distance.
         cosine: Of the angle between normals.
         ring: The neighbours in order.
         index: The neighbour that the vertex is collapsed on.
@@ -322,7 +321,6 @@ def decimate(
 
     Args:
         values: Unit normals, then attributes in units of their tolerance.
-        bound: Distance.
         cosine: Of the angle between normals.
         free: Vertices that may be removed.
         candidates: Whether a vertex is to be tried; updated.

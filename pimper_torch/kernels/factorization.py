@@ -476,8 +476,6 @@ def solve_on_cone(
     Args:
         radiance: Patch, view, sample; zero where missing.
         given: The weights; 0 where missing.
-        regularization: Weight of the anchor.
-        prior: Patch, packed, sample.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The deviation is estimated from every ``stride``-th sample.
         max_iterations: Maximum number of steps.

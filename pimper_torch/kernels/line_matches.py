@@ -32,7 +32,6 @@ def most_alike(
 
     Args:
         first: Pixels in one photograph.
-        second: In the other.
         first_descriptors: Of length 1.
         matrix: Homography from the first photograph, or fundamental matrix.
         planar: Whether it is a homography.

@@ -50,7 +50,6 @@ def register(
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         outward: Unit normals, patch frame.
-        inside: Samples of the templates.
         min_facing: Cosine of the steepest viewing angle.
         dark_level: Mean over the channels below which a sample is invalid.
     """

@@ -62,7 +62,6 @@ def compressed_equations(
         kinds: Unknowns, coefficients, targets and weights of each set, as in
             :func:`normal_equations`.
         damping: Weight of each unknown's prior; above 0.
-        start: Mean of the prior.
 
     Returns:
         The matrix, columns in order, and the right-hand side. A constant to autograd.

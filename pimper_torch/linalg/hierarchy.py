@@ -50,7 +50,6 @@ class Level:
 
     Args:
         prolong: From the next level's unknowns to this one's; ``None`` on the last.
-        restrict: The transpose.
     """
 
     def __init__(
@@ -102,7 +101,6 @@ class CompiledLevel(Level):
     Args:
         inverse_diagonal: Of its dominant diagonal, in the dtype of the level.
         prolong_matrix: From the next level's unknowns to this one's; ``None`` on the last.
-        restrict_matrix: The transpose.
     """
 
     def __init__(

@@ -110,7 +110,6 @@ def solve_compressed(
         matrix: Symmetric positive definite; float64.
         sides: Right-hand sides, float64, on the CPU.
         what: Names the system in errors.
-        start: Initial values of multigrid.
 
     Raises:
         SingularSystemError: See :func:`prepare`.

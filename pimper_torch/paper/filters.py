@@ -33,7 +33,6 @@ def behind_others(
     contour, and is not marked only if it is observed here.
 
     Args:
-        pixels: In the view.
         points_cam: In its camera's frame.
         observed: Whether the view has an observation of the point.
         neighbours: How many nearest points in the image to look at.

@@ -100,7 +100,6 @@ def integrate_weighted(
 
     Args:
         right: Wanted steps to the right.
-        down: Wanted steps down.
         weight_right: Of ``right``, not negative.
         weight_down: Of ``down``.
         iterations: Limit; 0 gives :func:`integrate_steps`.

@@ -114,10 +114,8 @@ def tangent_curvature(
     """Assemble second derivatives by albedo and two rotations of the normal, over albedo.
 
     Args:
-        square: By each rotation twice.
         first: By albedo and the first rotation.
         second: By albedo and the second.
-        across: By both rotations.
         albedo: The unit of the rotations.
     """
     none = torch.zeros_like(square)

@@ -45,7 +45,6 @@ def cast_shadows(
     """Cast a ray from every sample to the point light of every view.
 
     Args:
-        field: Point lights.
         caster: The surface that casts the shadows.
         points: World; on that surface or near it.
         normals: Unit, outward.
@@ -109,7 +108,6 @@ def cast_shadows_on_rasters(
     guard, if any, grows by the distance between the two.
 
     Args:
-        field: Point lights.
         caster: The surface that casts the shadows.
         points: World, of every sample.
         normals: World, unit, outward.

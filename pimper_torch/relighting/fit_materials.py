@@ -123,7 +123,6 @@ class _Trial:
 
         Args:
             one: Number of the cluster.
-            tried: For it, first.
         """
 
         def with_one(rows: Float[Tensor, "candidate 3"]) -> Float[Tensor, "candidate cluster 3"]:

@@ -22,7 +22,6 @@ def predict(
 
     Args:
         mesh: With albedo; prepared where several pictures are wanted of it.
-        camera: One.
         materials: Of the mesh; matte without.
 
     Returns:

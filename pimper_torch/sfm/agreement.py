@@ -52,7 +52,6 @@ def judged(
 
     Args:
         model: Its names are among ``files``.
-        pairs: With numbers of photographs.
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
     """
     view_of = {files.index(name): view for view, name in enumerate(model.names)}

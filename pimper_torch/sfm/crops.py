@@ -57,7 +57,6 @@ def points_tell(
 
     Args:
         model: In the pixels of the photographs.
-        views: The photographs.
         changed: Numbers of those whose place is in question.
         reaches_px: How far they are shifted for comparison, one distance after the other.
     """
@@ -217,7 +216,6 @@ def _cut(
     """Cut the pictures of some views: their lenses and observations follow.
 
     Args:
-        views: Their numbers.
         size: Width and height of what is cut out; ``None`` leaves them.
         shift: Its corner, pixels of the pictures.
         fresh: Added to the numbers of their cameras.

@@ -118,7 +118,6 @@ def strongest(
     Args:
         counts: Verified matches of each pair, or another weight.
         num_views: How many photographs there are.
-        most: Pairs a photograph.
     """
     chosen: set[PhotographPair] = set()
     for view in range(num_views):

@@ -38,7 +38,6 @@ def turned_pixels(
     """Return where pixels are after clockwise quarter turns of their picture.
 
     Args:
-        pixels: In the picture before.
         quarters: Any whole number.
 
     >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)

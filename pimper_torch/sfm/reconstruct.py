@@ -311,7 +311,6 @@ def kept_model(
 
     Args:
         store: Where; without it, or a key, nothing is kept.
-        find: Finds it.
 
     Returns:
         The model, and the seconds of wall clock in which it was found.

@@ -29,9 +29,6 @@ def others_of(
 ) -> tuple[Float[Tensor, "*way observation sample"], Float[Tensor, "*way observation sample"]]:
     """Average the squares of each observation's point without its own, and those of another point.
 
-    Args:
-        point: That it sees.
-
     Returns:
         Of unit length, or zero.
     """
@@ -77,7 +74,6 @@ def squares_in(
     """Sample squares along two sides, without their mean and with unit length.
 
     Args:
-        picture: Radiance.
         centers: Pixels of it.
         sides: In pixels of it, turned as it is.
 

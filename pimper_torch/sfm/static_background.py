@@ -167,7 +167,6 @@ def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Ten
 
     Args:
         still: Pixels in the first and in the second photograph.
-        max_error_px: Scale of the loss.
     """
     first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
     count = torch.tensor([len(still[0]), len(moving[0])])

@@ -44,7 +44,6 @@ def split_cloud(
 
     Args:
         fixation: Where the cameras look.
-        plane: The object stands on.
         tolerance: Of the plane, scene units.
         box_world: What is outside is not the object.
     """

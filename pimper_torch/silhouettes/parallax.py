@@ -60,8 +60,6 @@ def plane_agreement(
     """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
 
     Args:
-        pictures: At the working size.
-        plane: Supporting the object.
         fixation: Its fixation point is the centre of what is looked at.
         hidden: Where views do not show the plane, as far as is known.
     """
@@ -78,7 +76,6 @@ def room_agreement(
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
     Args:
-        pictures: At the working size.
         background_from_view: From pixels of each photograph to those where the room is at rest;
             NaN for views that show too little of it.
         hidden: Where views do not show the room, as far as is known.
@@ -99,8 +96,6 @@ def texture_agreement(
     radiance without its smooth part.
 
     Args:
-        pictures: At the working size.
-        near: Samples of the texture.
         far: Samples of the brightness, which may be fewer and reach farther.
         hidden: Where views do not show the background, as far as is known. What they show there is
             compared with its texture, but is no part of it.

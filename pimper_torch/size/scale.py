@@ -75,7 +75,6 @@ def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
 
     Args:
         lengths: One at least.
-        source: What they come from.
 
     Raises:
         InputError: A length is zero.

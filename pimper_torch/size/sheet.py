@@ -49,9 +49,6 @@ def side_of(code: int) -> int | None:
 def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
     """Put markers along the border of a sheet; the object stands in the middle.
 
-    Args:
-        paper: Upright.
-
     Raises:
         ConfigError: A side of which there are no markers.
     """

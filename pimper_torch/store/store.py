@@ -76,7 +76,6 @@ class Store:
         """Write a record in place of one of the same key.
 
         Args:
-            key: A file's name.
             record: Of any class that :func:`~pimper_torch.records.save_record` takes.
             about: What else is to be known of it; what JSON holds.
 

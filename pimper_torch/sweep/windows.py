@@ -57,7 +57,6 @@ def level_weight(
     A window would otherwise mix the two sides of a depth edge.
 
     Args:
-        depth: What the template carries.
         swept: 1 where a sample has costs, else 0.
         spacing: Of the samples, in units of the depth.
         max_slope: Between a sample and each of its four neighbours; more is a cliff.

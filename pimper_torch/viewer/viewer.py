@@ -88,7 +88,6 @@ class Viewer:
         Args:
             names: Of the photographs, in the order of the cameras.
             reference: View that the page begins in.
-            views: The photographs.
         """
         frame = self._frame = frame_of_cameras(cameras, reference, points_world)
         scene = self.server.scene

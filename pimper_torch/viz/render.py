@@ -116,7 +116,6 @@ def crop(
 
     Args:
         low: Upper left corner, pixels; may lie outside the picture, as all of it may.
-        high: Lower right corner.
     """
     factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()

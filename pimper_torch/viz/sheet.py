@@ -30,7 +30,6 @@ def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -
 
     Args:
         side_mm: Of the black squares, 10 to 36; their numbers tell it.
-        paper: Upright.
 
     Raises:
         ConfigError: A side of which there are no markers.
@@ -45,7 +44,6 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
 
     Args:
         side_mm: Of the black squares, 10 to 36.
-        paper: Upright.
 
     Raises:
         ConfigError: A side of which there are no markers.

@@ -63,8 +63,6 @@ def judge_patches(
     Args:
         facets: The two patches of each seam.
         overlapping: Whether their height fields lie over each other.
-        reliable: Whether they also agree.
-        count: Patches.
     """
     status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
     status[facets[overlapping].flatten()] = int(AlignStatus.DISPUTED)

@@ -147,8 +147,6 @@ def plane_regularization(
 
     Args:
         subdivision: What the energy is integrated over.
-        trends: J of every facet.
-        fitted: Whether it was fitted.
     """
     weights = seam_weight(subdivision.barycentric.double())
     gradients = _elements(subdivision).rotated

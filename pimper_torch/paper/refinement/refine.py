@@ -113,7 +113,6 @@ def smooth_seams(
     """Minimise the energy over the subdivided mesh.
 
     Args:
-        subdivision: The flat facets, subdivided.
         points: The union: where the patches have each vertex.
         supported: Where they have it anywhere.
         spacing: Of each facet's vertices, scene units; the radius is counted in it.
