@@ -33,8 +33,8 @@ def loss_scale(seen: Observed) -> float:
 
 def fit_strengths(
     seen: Observed,
-    diffuse: Float[Tensor, "*batch pixel channel"],
-    response: Float[Tensor, "light pixel channel"],
+    diffuse: Float[Tensor, "*batch pixel #channel"],
+    response: Float[Tensor, "light pixel #channel"],
     scale: float,
 ) -> Strengths:
     """Fit ambient and directed strength for every light, by reweighted least squares.
