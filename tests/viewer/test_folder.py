@@ -108,7 +108,13 @@ def ball(tmp_path):
 def test_the_command_serves_a_page_until_ctrl_c(ball):
     code = "import sys; from pimper_torch.cli.supervise import main; sys.exit(main())"
     line = [sys.executable, "-c", code, "view", str(ball), "--port", "0", "--json"]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
+    # What runs in the background of a shell ignores Ctrl-C, and so does what it starts.
+    with subprocess.Popen(
+        line,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
         for written in process.stdout:
             event = json.loads(written)
             if event["event"] == "view":
