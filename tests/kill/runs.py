@@ -32,7 +32,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
 
 ENDINGS = ("killed", "disk", "memory")
 # What tells times, and so differs from run to run.
-TIMED = ("summary.json", "overview.png", ".pimper.json")
+TIMED = ("summary.json", "overview.png", "report.html", ".pimper.json")
 SETTINGS = ("--preset", "fast")
 FORMER = (*SETTINGS, "--faces", "all", "--factorize.light-prior", "3")
 # Seconds after which a run hangs, and what stands for its exit code.
