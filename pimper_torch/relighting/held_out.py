@@ -115,7 +115,11 @@ def relight(
         judged = judge(surface, observed, names, lights, materials)
         plain = judge(surface, observed, names, matte)
     else:
-        judged, plain = (predicted(surface, held_out, one) for one in (materials, None))
+        names, observed = held_out.views.names, observe_all(surface, held_out, None)
+        judged, plain = (
+            judge(surface, observed, names, lights_of(surface, observed, one), one)
+            for one in (materials, None)
+        )
     return Relighting(
         lights=lights,
         materials=materials,
@@ -123,23 +127,6 @@ def relight(
         matte=plain,
         held_out=held_out is not None,
     )
-
-
-def predicted(
-    surface: Mesh | LitSurface, scene: SparseScene, materials: Materials | None = None
-) -> Judged:
-    """Fit the lights of photographs alone, and judge the surface by them.
-
-    Args:
-        surface: A mesh of any kind whose vertices carry albedo and normals, such as texels of an
-            asset.
-        scene: Photographs in the mesh's frame.
-        materials: Of the mesh; matte without.
-    """
-    lit = surface if isinstance(surface, LitSurface) else LitSurface(surface)
-    observed = observe_all(lit, scene, None)
-    lights = lights_of(lit, observed, materials)
-    return judge(lit, observed, scene.views.names, lights, materials)
 
 
 def judge(

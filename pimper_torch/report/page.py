@@ -25,7 +25,7 @@ HEAD = "<title>pimper_torch report</title>"
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
-# Of a page of 15 MB, whose pictures take up to 4 MB; text takes a third more than bytes.
+# Of a page of 15 MB, whose pictures and scripts take 2 MB; text takes a third more than bytes.
 _MAX_ASSET_BYTES = 7_500_000
 
 

@@ -13,6 +13,7 @@ from pimper_torch.radiometry import srgb_from_linear
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
+# Choices, for a sheet of four tiles of 390 pixels.
 _GAP_PX, _TITLE_PX, _HEADLINE_PX = 10, 26, 36
 _TEXT_PX, _LARGE_PX, _SMALL_PX = 15, 18, 11
 TALLEST = 1.6  # a picture that is higher for its width is shown narrower
