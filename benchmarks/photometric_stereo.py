@@ -24,9 +24,9 @@ from torch.nn.functional import normalize
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.scene_object import Texture
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.harmonics import harmonics

@@ -1,10 +1,10 @@
 """Photographs small enough to stand in a scene."""
 
 import numpy as np
-from torch.nn.functional import interpolate
 
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
+from pimper_torch.report.pictures import shrunk
 
 # Longest side: a hundred of them have one megabyte as JPEG.
 _SIDE_PX = 256
@@ -14,9 +14,6 @@ def small_pictures(views: Views) -> list[np.ndarray]:
     """Shrink photographs, without the padding of the raster, to 8-bit sRGB."""
     pictures = []
     for image, (width, height) in zip(views.images, views.sizes_px.tolist(), strict=True):
-        factor = min(1.0, _SIDE_PX / max(width, height))
-        size = (max(1, round(factor * height)), max(1, round(factor * width)))
-        own = image[:, :height, :width].detach().cpu().clamp(0, 1)
-        small = interpolate(own[None], size=size, mode="area")[0]
+        small = shrunk(image[:, :height, :width].detach().cpu().clamp(0, 1), _SIDE_PX)
         pictures.append(to_bytes(small.expand(3, -1, -1)).movedim(0, -1).contiguous().numpy())
     return pictures

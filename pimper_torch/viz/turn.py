@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.parallel import side_by_side
@@ -100,21 +101,11 @@ def circling(
     elevation = math.radians(_ELEVATION_DEG)
     angles = torch.arange(number).to(up) * (2 * math.pi / number)
     level = angles.cos()[:, None] * ahead + angles.sin()[:, None] * beside
-    back = math.cos(elevation) * level + math.sin(elevation) * up
-    right = normalize(torch.linalg.cross(up.expand_as(back), back), dim=-1)
-    down = torch.linalg.cross(-back, right)
     half = math.radians(_FOV_DEG) / 2
+    back = math.cos(elevation) * level + math.sin(elevation) * up
     eyes = center + _MARGIN * radius / math.sin(half) * back
-    poses = torch.eye(4).to(up).repeat(number, 1, 1)
-    poses[:, :3, :3] = torch.stack([right, down, -back], dim=1)
-    poses[:, :3, 3] = -(poses[:, :3, :3] @ eyes[..., None])[..., 0]
-    focal = side_px / 2 / math.tan(half)
-    pinhole = [[focal, 0.0, side_px / 2], [0.0, focal, side_px / 2], [0.0, 0.0, 1.0]]
-    return Cameras(
-        intrinsics=torch.tensor(pinhole).to(up).repeat(number, 1, 1),
-        cam_from_world=poses,
-        sizes_px=torch.full((number, 2), side_px),
-    )
+    focal_px = side_px / 2 / math.tan(half)
+    return pinholes(look_at(eyes, center, up), focal_px, side_px, side_px)
 
 
 def _drawn(hits: Hits, look: Float[Tensor, "vertex 6"], mesh: Mesh, pose: Tensor) -> Image.Image:

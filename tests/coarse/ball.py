@@ -6,10 +6,10 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.fine_surface import FineSurfaceConfig
 from pimper_torch.coarse.surface import CoarseSurfaceConfig
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.render import render_shape
 from pimper_torch.evidence.scenes.shapes import Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Silhouettes

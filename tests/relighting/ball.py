@@ -3,9 +3,9 @@
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.directions import even_directions
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io.tensors import scene_of

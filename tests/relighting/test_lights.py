@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
 from pimper_torch.evidence.scenes.meshes import icosphere, join, moved, table
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.lights import ViewLights, fit_lights

@@ -2,9 +2,10 @@
 
 import torch
 
-from pimper_torch.evidence.scenes.cameras import look_at, turntable_directions
+from pimper_torch.evidence.scenes.cameras import turntable_directions
 from pimper_torch.evidence.scenes.room import upside_down
 from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.pinholes import look_at
 from pimper_torch.geometry.projection import project
 
 K = torch.tensor([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]]).double()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Silhouettes

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Cameras, Silhouettes
 from pimper_torch.silhouettes.hull import margins, visual_hull
 

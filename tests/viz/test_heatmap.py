@@ -7,7 +7,7 @@ from matplotlib import colormaps
 from PIL import Image
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh
 from pimper_torch.viz.heatmap import (
     MISSED,

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.cameras import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 
@@ -16,32 +17,6 @@ from pimper_torch.records import Cameras
 # Of two aims that are as good, the one nearer to the object's centre is taken.
 _STAY = 0.01
 FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
-
-
-def look_at(
-    eyes_world: Float[Tensor, "view 3"],
-    target_world: Float[Tensor, " 3"],
-    up_world: Float[Tensor, " 3"],
-) -> Float[Tensor, "view 4 4"]:
-    """Return ``cam_from_world`` of cameras that look at one point and are held upright."""
-    forward = normalize(target_world - eyes_world, dim=-1)
-    right = normalize(torch.linalg.cross(forward, up_world.expand_as(forward)), dim=-1)
-    down = torch.linalg.cross(forward, right)
-    rotation = torch.stack([right, down, forward], dim=1)
-    return rigid(rotation, -(rotation @ eyes_world[..., None])[..., 0])
-
-
-def pinholes(
-    cam_from_world: Float[Tensor, "view 4 4"], focal_px: float, width: int, height: int
-) -> Cameras:
-    """Return cameras of one focal length whose axis meets the centre of the image."""
-    K = cam_from_world.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
-    num_views = len(cam_from_world)
-    return Cameras(
-        intrinsics=K.repeat(num_views, 1, 1),
-        cam_from_world=cam_from_world,
-        sizes_px=torch.tensor([[width, height]]).repeat(num_views, 1),
-    )
 
 
 def panned(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:

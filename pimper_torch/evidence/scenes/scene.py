@@ -16,9 +16,7 @@ from pimper_torch.evidence.scenes.cameras import (
     arc_directions,
     cropped,
     handheld_directions,
-    look_at,
     panned,
-    pinholes,
     turntable_directions,
 )
 from pimper_torch.evidence.scenes.conductors import CONDUCTORS
@@ -43,6 +41,7 @@ from pimper_torch.evidence.scenes.scene_object import (
 )
 from pimper_torch.evidence.scenes.textures import Uniform
 from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Mesh

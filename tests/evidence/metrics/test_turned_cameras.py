@@ -5,8 +5,9 @@ from torch.testing import assert_close
 from pimper_torch.evidence.metrics import similarity_between_cameras
 from pimper_torch.evidence.metrics.poses import compare_cameras
 from pimper_torch.evidence.metrics.turned_cameras import standing_as
-from pimper_torch.evidence.scenes.cameras import arc_cameras, look_at, pinholes
+from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.colmap import pinhole_lenses, pinhole_of
