@@ -19,6 +19,16 @@ from pimper_torch.records.patches import (
     SweptPatches,
     Templates,
 )
+from pimper_torch.records.priors import (
+    AlbedoPrior,
+    DepthPrior,
+    InlierPrior,
+    LightPrior,
+    MapPrior,
+    NormalPrior,
+    Prior,
+    SilhouettePrior,
+)
 from pimper_torch.records.reconstruction import Reconstruction, StageReport
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import (
@@ -35,6 +45,7 @@ from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
 from pimper_torch.records.views import Cameras, Views
 
 __all__ = [
+    "AlbedoPrior",
     "AlignStatus",
     "Cameras",
     "Capture",
@@ -43,23 +54,30 @@ __all__ = [
     "ContourRays",
     "Convergence",
     "DepthPatches",
+    "DepthPrior",
     "Depths",
     "DtuProtocol",
     "Estimate",
     "FacetPoints",
     "Failure",
     "Heights",
+    "InlierPrior",
     "LeftOut",
     "Lens",
+    "LightPrior",
+    "MapPrior",
     "Mesh",
+    "NormalPrior",
     "Observations",
     "PatchSet",
     "PatchStatus",
     "PatchViews",
     "PhotometricPatches",
     "Photometry",
+    "Prior",
     "Reconstruction",
     "Record",
+    "SilhouettePrior",
     "Silhouettes",
     "SparseScene",
     "StageReport",

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.records.faults import no_pinhole, not_rigid, once
+from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
 
 
@@ -27,6 +28,8 @@ class Views(Record):
         orientations: EXIF's number of the orientation that was applied to each file's pixels;
             ``None`` where none was.
         folder: Path that the files lie in, by which a model's images of one name are told apart.
+        priors: What is guessed of some photographs, such as normals by a network. Maps of
+            photographs that are left out are not looked at.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -36,6 +39,7 @@ class Views(Record):
     focals_px: Float[Tensor, " view"]
     orientations: Int[Tensor, " view"] | None = None
     folder: str = field(default="", repr=False, compare=False)
+    priors: tuple[Prior, ...] = ()
 
     @property
     def num_views(self) -> int:
@@ -52,6 +56,9 @@ class Views(Record):
             low, high = self.sizes_px.aminmax()
             found = f"reach from {int(low)} to {int(high)}"
             yield "sizes_px", found, f"width and height within the raster of {raster.tolist()}"
+        for index, prior in enumerate(self.priors):
+            for name, found, needed in prior.faults():
+                yield f"priors[{index}].{name}", found, needed
 
     @property
     def inside(self) -> Bool[Tensor, "view height width"]:
