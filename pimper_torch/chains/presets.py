@@ -49,7 +49,14 @@ _FORMER = {
     "enclose": "`coarse_surface`, with reference and num_facets",
     "adapt": "`remesh`",
     "mend": "no setting: `Repair` takes a `RepairConfig`",
-    "fuse.rims": "`fuse.contours`",
+    "fuse.rims": "`fuse.terms`, by contour_rays",
+    **{
+        f"fuse.{former}": f"`fuse.terms`, by {name}"
+        for former, name in [
+            *(("slopes", "normals"), ("heights", "swept_heights")),
+            *(("points", "cloud_points"), ("contours", "contour_rays")),
+        ]
+    },
     "fuse.drift_rounds": "`fuse.bias_iterations`",
     "fuse.noise_rounds": "`fuse.noise_iterations`",
     "refine.hold_planes": "`refine.keep_planes`",

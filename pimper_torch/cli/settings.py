@@ -69,7 +69,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
         Args:
             name: A preset to print (default, fast, paper, or a YAML file); or a section or a
-                setting to explain, such as sweep or fuse.contours.
+                setting to explain, such as sweep or fuse.terms.
         """
         is_preset = name in presets() or Path(name).suffix in (".yaml", ".yml")
         chosen = name if is_preset else preset

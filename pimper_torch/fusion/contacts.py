@@ -1,11 +1,11 @@
 """Points that the surface passes through, as terms of its heights.
 
 Each lifts the vertex nearest to where a line through the point, along the direction of heights,
-meets the surface. Terms of the three vertices of that face would be right to a further order, but
-couple these a thousand times as strongly as slopes do, by entries of the wrong sign for multigrid.
+meets the surface. Equations in the three vertices of that face would be right to a further order,
+but couple these a thousand times as strongly as slopes do, by entries of the wrong sign for
+multigrid.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.fusion.terms import MIN_FACING, Terms
+from pimper_torch.fusion.equations import MIN_FACING, Equations
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
@@ -89,16 +89,14 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
     )
 
 
-def passing(contacts: Sequence[Contacts], surface: BaseSurface) -> list[Terms]:
-    """Return the terms that let the surface pass through points, kind by kind.
+def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equations:
+    """State that the surface passes through points.
+
+    Args:
+        caster: Of rays on the surface.
 
     Differentiable; which face is nearest is constant.
     """
-    caster = RayCaster(surface.points, surface.faces) if contacts else None
-    return [_passing(each, surface, caster) for each in contacts if caster is not None]
-
-
-def _passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Terms:
     line = contacts.lines
     hits = _above_or_below(caster, surface, contacts.points, line)
     lift = -hits.distance
@@ -107,7 +105,7 @@ def _passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Ter
     vertex = corners.gather(1, fraction.argmax(dim=1, keepdim=True))
     facing = (surface.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(MIN_FACING)
     variance = contacts.variance[met]
-    return Terms(
+    return Equations(
         unknowns=vertex,
         coefficients=torch.ones_like(facing)[:, None],
         targets=surface.heights[vertex[:, 0]] + lift[met] / facing,

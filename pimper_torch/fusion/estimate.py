@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.failures import reason_of, skipped
-from pimper_torch.fusion.terms import Terms
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
@@ -59,7 +59,7 @@ class Fused(Record):
 
     heights: Float[Tensor, " vertex"]
     factors: tuple[Float[Tensor, ""], ...]
-    kinds: tuple[Terms, ...]
+    kinds: tuple[Equations, ...]
     weights: tuple[Float[Tensor, " _"], ...]
     damping: Float[Tensor, " vertex"]
 
@@ -72,7 +72,7 @@ class Fused(Record):
 
 
 def fuse_terms(
-    kinds: Sequence[Terms],
+    kinds: Sequence[Equations],
     start: Float[Tensor, " vertex"],
     damping: Float[Tensor, " vertex"],
     iterations: int,
@@ -129,7 +129,7 @@ def fuse_terms(
     )
 
 
-def fuse_like(fused: Fused, kinds: Sequence[Terms], start: Float[Tensor, " vertex"]) -> Fused:
+def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " vertex"]) -> Fused:
     """Solve once more, for terms with common errors, with the weights that a solve has found.
 
     Residuals from vertex to vertex do not show what normals err by together: slopes seem to have
@@ -177,7 +177,7 @@ def _kept(error: SingularSystemError) -> None:
 
 
 def _solved(
-    kinds: Sequence[Terms],
+    kinds: Sequence[Equations],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[Float[Tensor, ""]],
     start: Float[Tensor, " vertex"],
@@ -205,7 +205,7 @@ def _solved(
 
 
 def _evaluated(
-    kind: Terms,
+    kind: Equations,
     weight: Float[Tensor, " equation"],
     heights: Float[Tensor, " vertex"],
     probe: Float[Tensor, " vertex"],
@@ -246,12 +246,12 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     return robust_variance(square, everything).clamp_min(_MIN_FACTOR)
 
 
-def _sum(kind: Terms, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+def _sum(kind: Equations, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
     return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
 
 
 def _system(
-    kinds: Sequence[Terms],
+    kinds: Sequence[Equations],
     weights: Sequence[Float[Tensor, " _"]],
     factors: Sequence[Float[Tensor, ""]],
     start: Float[Tensor, " vertex"],

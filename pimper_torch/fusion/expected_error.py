@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.fusion.bands import CoarsePart
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused
-from pimper_torch.fusion.terms import Terms
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.systems import prepare
@@ -108,7 +108,7 @@ def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
 
 
 def _noise(
-    kind: Terms,
+    kind: Equations,
     weight: Float[Tensor, " equation"],
     factor: Float[Tensor, ""],
     subdivision: Subdivision,

@@ -4,26 +4,30 @@ It reads in the order of its ``forward``: the errors that facets have in common 
 coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from functools import reduce
+from operator import or_
+from typing import Annotated, cast
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
-from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import about_mean
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
-from pimper_torch.fusion.normal_bias import NormalBias, common_variance, normal_bias
+from pimper_torch.fusion.normal_bias import NormalBias, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, pose
-from pimper_torch.fusion.terms import Terms
+from pimper_torch.fusion.terms import TERMS, Normals, Passing, Term
 from pimper_torch.geometry.subdivision import transferred
 from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import average
 from pimper_torch.memory import release_memory
@@ -43,10 +47,8 @@ class FuseConfig:
     Attributes:
         samples_per_vertex: Template samples between neighbouring vertices of the surface.
             Time and memory fall with its square.
-        slopes: Whether normals take part.
-        heights: Whether swept heights do.
-        points: Whether the cloud's points do.
-        contours: Whether the rays through the silhouettes do.
+        terms: Kinds of evidence, in the order that they are summed up, see
+            :mod:`~pimper_torch.fusion.terms`.
         bias_iterations: How often the tilt that the normals of a facet have in common, and the
             variance of the error that its swept heights have in common, are estimated; 0 takes
             all errors for independent.
@@ -58,10 +60,7 @@ class FuseConfig:
     """
 
     samples_per_vertex: float = 1.0
-    slopes: bool = True
-    heights: bool = True
-    points: bool = True
-    contours: bool = True
+    terms: tuple[str, ...] = tuple(TERMS)
     bias_iterations: Annotated[int, Range(least=0, most=1000)] = 2
     noise_iterations: Annotated[int, Range(least=1, most=1000)] = 3
     error_draws: Annotated[int, Range(least=0, most=1000)] = 8
@@ -72,8 +71,8 @@ class FuseConfig:
         # The number of vertices goes with the square: 16 a sample tell all that it says.
         sound = 0.25 <= each <= 65_535
         require(sound, "fuse.samples_per_vertex", each, "at least 0.25, at most 65,535")
-        some = self.slopes or self.heights or self.points or self.contours
-        require(some, "fuse.slopes", self.slopes, "true unless heights or points are")
+        known = set(self.terms) <= set(TERMS) and len(set(self.terms)) == len(self.terms) > 0
+        require(known, "fuse.terms", self.terms, f"some of {', '.join(TERMS)}, each once")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -83,13 +82,13 @@ class _Shared(Record):
     Attributes:
         tilt: Of the normals of each facet; ``None`` if no position tells it.
         tilt_variance: Of what remains of it in the normals that it was added to.
-        height_variance: Of the common error of a facet's swept heights; ``None`` where unknown.
+        terms: With the variance of the errors that a facet's positions have in common.
         expected: Expected errors of the heights; ``None`` if they are not asked for.
     """
 
     tilt: NormalBias | None
     tilt_variance: Float[Tensor, ""]
-    height_variance: Float[Tensor, ""] | None
+    terms: tuple[Term, ...]
     expected: Float[Tensor, " vertex"] | None
 
 
@@ -97,7 +96,7 @@ class Fuse(Stage):
     """Solve for the surface that agrees best with all terms, over all facets at once.
 
     Unknown is the height of every vertex of the subdivided mesh along the coarse mesh's smoothed
-    normal. Terms are linear in it: edges are at right angles to photometric normals, the sweep
+    normal. Equations are linear in it: edges are at right angles to photometric normals, the sweep
     knows heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and
     where there is no photometric normal the surface keeps its slopes, or continues those of lit
     surface that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds,
@@ -116,9 +115,16 @@ class Fuse(Stage):
     constant.
     """
 
-    def __init__(self, config: FuseConfig | None = None) -> None:
+    def __init__(
+        self, config: FuseConfig | None = None, terms: Sequence[Term] | None = None
+    ) -> None:
         super().__init__()
         self.config = config or FuseConfig()
+        if terms is None:
+            terms = [TERMS[name]() for name in self.config.terms]
+        for term in terms:
+            require(isinstance(term, Term), "Fuse: terms", term, "modules derived from Term")
+        self.terms = nn.ModuleList(terms)
 
     def forward(self, swept: SweptPatches, contours: Contours, expected: bool = True) -> Surface:
         """Fuse what is known of all patches.
@@ -136,15 +142,15 @@ class Fuse(Stage):
                 is not finite.
         """
         config = self.config
-        coarse = pose(swept, _COARSER * config.samples_per_vertex, config.slopes)
-        contacts = self._contacts(coarse, swept, contours)
-        shared = self._shared(coarse, contacts, expected)
+        coarse = self._posed(swept, _COARSER * config.samples_per_vertex)
+        terms = tuple(term.bound(coarse, contours) for term in self._terms)
+        shared = self._shared(coarse, terms, expected)
         subdivided = coarse.subdivision
         del coarse
         release_memory()
-        fine = pose(swept, config.samples_per_vertex, config.slopes)
+        fine = self._posed(swept, config.samples_per_vertex)
         release_memory()
-        solved = self._solve(fine, contacts, shared)
+        solved = self._solve(fine, shared)
         release_memory()
         leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
         leave_out("fuse.normals", ~fine.known, at=fine.points)
@@ -176,87 +182,68 @@ class Fuse(Stage):
             ),
         )
 
-    def _contacts(
-        self, problem: Problem, swept: SweptPatches, contours: Contours
-    ) -> list[Contacts]:
-        """List points that the surface passes through: of the cloud, and of contours."""
-        surface, cloud = problem.surface, swept.patches.coarse.points
-        found = []
-        if self.config.points and cloud is not None:
-            found.append(cloud_points(cloud, surface))
-        tangent = contours.touching(problem.points, problem.normals)
-        if self.config.contours and len(tangent.ray):
-            found.append(contour_tangents(tangent, surface))
-        return found
+    @property
+    def _terms(self) -> tuple[Term, ...]:
+        return tuple(cast("Term", term) for term in self.terms)
 
-    def _shared(self, problem: Problem, contacts: list[Contacts], expected: bool) -> _Shared:
+    def _posed(self, swept: SweptPatches, samples_per_vertex: float) -> Problem:
+        """Pose the problem, with the edges that terms tell the slope of."""
+        lit = any(isinstance(term, Normals) for term in self._terms)
+        problem = pose(swept, samples_per_vertex, lit)
+        told = [term.sloped(problem) for term in self._terms]
+        none = torch.zeros_like(problem.lit)
+        return problem.replace(
+            sloped=reduce(or_, (each for each in told if each is not None), none)
+        )
+
+    def _shared(self, problem: Problem, terms: tuple[Term, ...], expected: bool) -> _Shared:
         """Estimate the errors that a facet has in common, and the expected error of the heights.
 
         Normals and positions are estimated from each other, in turns.
         """
         subdivision, facets, known = problem.subdivision, problem.facets, problem.known
-        points = passing(contacts, problem.surface)
-        heights = self._heights(problem, None)
-        unlit = problem.unlit()
-
-        def solve(
-            normals: Float[Tensor, "vertex 3"],
-            positions: list[Terms],
-            tilt_variance: Float[Tensor, ""] | None = None,
-        ) -> Fused:
-            terms = [*unlit, *positions, problem.slopes(normals, tilt_variance)]
-            return self._fused(problem, terms)
-
-        normals, shape, height_variance = problem.blend.normals_world, problem.normals, None
-        if (
-            self.config.bias_iterations == 0
-            or not bool(problem.lit.any())
-            or not (heights or points)
-        ):
-            terms = [*unlit, *points, *heights]
+        made = _Made.of(terms, problem)
+        firm = made.equations(lambda term: term.position and not term.loose)
+        loose = made.equations(lambda term: term.loose)
+        normals, shape = problem.photometric, problem.normals
+        if self.config.bias_iterations == 0 or not bool(problem.lit.any()) or not (firm or loose):
             return _Shared(
                 tilt=None,
                 tilt_variance=normals.new_zeros(()),
-                height_variance=None,
-                expected=None if not expected else self._expected(problem, terms, normals, None),
+                terms=terms,
+                expected=self._expected(problem, made) if expected else None,
             )
-        # Heights are evaluated by the others first, which they would draw along.
-        positions = points or heights
+        # Loose positions are evaluated by the others first, which they would draw along.
+        taken = made.without(lambda term: term.loose) if firm else made
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
-            fused = solve(normals, positions, tilt.variance())
+            tilted = problem.replace(tilt_variance=tilt.variance())
+            fused = self._fused(problem, taken.again(tilted).equations())
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
-            if points and heights:
-                vertex = torch.cat([kind.unknowns[:, 0] for kind in points])
-                height_variance = common_variance(
-                    heights[0], fused.heights, subdivision.facet, subdivision.facet[vertex]
-                )
-                positions = [*points, *self._heights(problem, height_variance)]
+            if firm and loose:
+                vertex = torch.cat([kind.unknowns[:, 0] for kind in firm])
+                made = taken = made.evaluated(problem, fused.heights, vertex)
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
-        terms = [*unlit, *positions]
+        straight = problem.replace(photometric=normals)
         return _Shared(
             tilt=tilt,
             tilt_variance=variance,
-            height_variance=height_variance,
-            expected=self._expected(problem, terms, normals, variance) if expected else None,
+            terms=made.terms,
+            expected=self._expected(straight, made, variance) if expected else None,
         )
 
     def _expected(
-        self,
-        problem: Problem,
-        terms: list[Terms],
-        normals: Float[Tensor, "vertex 3"],
-        tilt_variance: Float[Tensor, ""] | None,
+        self, problem: Problem, made: "_Made", tilt_variance: Float[Tensor, ""] | None = None
     ) -> Float[Tensor, " vertex"] | None:
         """Solve as at full size, and give the expected error of the heights."""
         if self.config.error_draws == 0:
             return None
-        independent = correlated = self._fused(problem, [*terms, problem.slopes(normals)])
+        independent = correlated = self._fused(problem, made.again(problem).equations())
         if tilt_variance is not None:
-            common = [*terms, problem.slopes(normals, tilt_variance)]
+            common = made.again(problem.replace(tilt_variance=tilt_variance)).equations()
             correlated = fuse_like(independent, common, problem.blend.heights)
         subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
         return solved_or(
@@ -268,34 +255,26 @@ class Fuse(Stage):
             memory=True,
         )
 
-    def _solve(
-        self, problem: Problem, contacts: list[Contacts], shared: _Shared
-    ) -> Float[Tensor, " vertex"]:
+    def _solve(self, problem: Problem, shared: _Shared) -> Float[Tensor, " vertex"]:
         """Solve at full size, for the detail and once more for the coarse shape.
 
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
         """
-        normals = problem.blend.normals_world
         if shared.tilt is not None:
             tilt = shared.tilt.at(problem.subdivision, problem.facets)
-            normals = normalize(normals + tilt, dim=-1)
-        terms = problem.unlit()
+            normals = normalize(problem.photometric + tilt, dim=-1)
+            problem = problem.replace(photometric=normals)
+        made = _Made.of(shared.terms, problem)
         release_memory()
-        terms += [
-            *passing(contacts, problem.surface),
-            *self._heights(problem, shared.height_variance),
-            problem.slopes(normals),
-        ]
-        release_memory()
-        fused = self._fused(problem, terms)
+        fused = self._fused(problem, made.equations())
         detail = fused.heights
         if shared.tilt is None:
             return detail
-        terms[-1] = problem.slopes(normals, shared.tilt_variance)
+        common = made.again(problem.replace(tilt_variance=shared.tilt_variance)).equations()
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            shape = fuse_like(fused, terms, problem.blend.heights).heights
+            shape = fuse_like(fused, common, problem.blend.heights).heights
             return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
 
         return solved_or(
@@ -306,9 +285,49 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _heights(self, problem: Problem, shared: Float[Tensor, ""] | None) -> list[Terms]:
-        return problem.heights(shared) if self.config.heights else []
-
-    def _fused(self, problem: Problem, terms: list[Terms]) -> Fused:
+    def _fused(self, problem: Problem, kinds: list[Equations]) -> Fused:
         start, iterations = problem.blend.heights, self.config.noise_iterations
-        return fuse_terms(terms, start, problem.damping, iterations)
+        return fuse_terms(kinds, start, problem.damping, iterations)
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """Terms, with the equations that each of them has made."""
+
+    terms: tuple[Term, ...]
+    kinds: tuple[list[Equations], ...]
+
+    @classmethod
+    def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_Made":
+        """Make the equations of all terms; those of points share one ray caster."""
+        if any(isinstance(term, Passing) and term.contacts is not None for term in terms):
+            caster = RayCaster(problem.points, problem.subdivision.faces)
+            problem = problem.replace(caster=caster)
+        return cls(terms, tuple(term.equations(problem) for term in terms))
+
+    def equations(self, wanted: Callable[[Term], bool] = lambda _: True) -> list[Equations]:
+        """List those of all terms, or of some."""
+        pairs = zip(self.terms, self.kinds, strict=True)
+        return [one for term, kinds in pairs if wanted(term) for one in kinds]
+
+    def without(self, unwanted: Callable[[Term], bool]) -> "_Made":
+        """Leave out some terms."""
+        left = [pair for pair in zip(self.terms, self.kinds, strict=True) if not unwanted(pair[0])]
+        return _Made(tuple(term for term, _ in left), tuple(kinds for _, kinds in left))
+
+    def again(self, problem: Problem) -> "_Made":
+        """Make the equations of tilted terms anew, for other normals or another tilt."""
+        pairs = zip(self.terms, self.kinds, strict=True)
+        made = (term.equations(problem) if term.tilted else kinds for term, kinds in pairs)
+        return _Made(self.terms, tuple(made))
+
+    def evaluated(
+        self, problem: Problem, heights: Float[Tensor, " vertex"], firm: Int[Tensor, " known"]
+    ) -> "_Made":
+        """Evaluate loose terms, and make their equations anew."""
+        terms = tuple(
+            term.evaluated(problem, heights, firm) if term.loose else term for term in self.terms
+        )
+        pairs = zip(terms, self.kinds, strict=True)
+        made = (term.equations(problem) if term.loose else kinds for term, kinds in pairs)
+        return _Made(terms, tuple(made))

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.fusion.terms import Common, Terms
+from pimper_torch.fusion.equations import Common, Equations
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.records import Record
 
@@ -85,7 +85,7 @@ def normal_bias(
 
 
 def common_variance(
-    found: Terms,
+    found: Equations,
     heights: Float[Tensor, " vertex"],
     facet: Int[Tensor, " vertex"],
     otherwise: Int[Tensor, " term"],

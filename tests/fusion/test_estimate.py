@@ -4,8 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
-from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.singular import SingularSystemError
@@ -23,10 +23,10 @@ def smooth() -> torch.Tensor:
     return x.sin() + 0.3 * (3 * x).cos()
 
 
-def steps(noise: torch.Tensor, deviation: float) -> Terms:
+def steps(noise: torch.Tensor, deviation: float) -> Equations:
     """Differences of a chain of heights, each measured three times, as in a triangle mesh."""
     first = torch.arange(COUNT - 1).repeat(3)
-    return Terms(
+    return Equations(
         unknowns=torch.stack([first, first + 1], dim=1),
         coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(first), 2),
         targets=smooth().diff().repeat(3) + noise,
@@ -35,8 +35,8 @@ def steps(noise: torch.Tensor, deviation: float) -> Terms:
     )
 
 
-def places(noise: torch.Tensor, deviation: float) -> Terms:
-    return Terms(
+def places(noise: torch.Tensor, deviation: float) -> Equations:
+    return Equations(
         unknowns=torch.arange(COUNT)[:, None],
         coefficients=torch.ones(COUNT, 1, dtype=torch.float64),
         targets=smooth() + noise,

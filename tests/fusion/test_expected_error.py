@@ -4,9 +4,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.fusion.bands import CoarsePart
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions
-from pimper_torch.fusion.terms import Terms
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.topology import face_edges
 
@@ -35,7 +35,7 @@ def differences(subdivision, deviation, correlated=1.0, evaluated=True):
     """Say how heights differ along all edges."""
     edges = face_edges(subdivision.faces)[0]
     length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
-    return Terms(
+    return Equations(
         unknowns=edges,
         coefficients=torch.tensor([-1.0, 1.0]).double().expand(len(edges), 2),
         targets=torch.zeros(len(edges)).double(),
@@ -48,7 +48,7 @@ def differences(subdivision, deviation, correlated=1.0, evaluated=True):
 def heights(subdivision, deviation, correlated=1.0, vertices=None):
     vertices = torch.arange(len(subdivision.points)) if vertices is None else vertices
     ones = torch.ones(len(vertices)).double()
-    return Terms(
+    return Equations(
         unknowns=vertices[:, None],
         coefficients=ones[:, None],
         targets=0 * ones,

@@ -2,16 +2,24 @@ from functools import cache
 
 import pytest
 import torch
+from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.remesh import Remesh
 from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.fusion.terms import ContourRays, KeptSlopes, Normals, SweptHeights, Term
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, Silhouettes
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
+
+
+def without(*names: str) -> tuple[str, ...]:
+    return tuple(name for name in FuseConfig().terms if name not in names)
+
 
 # Silhouettes that constrain nothing.
 FREE = Contours.none(
@@ -63,9 +71,9 @@ def test_facets_beside_a_plane_come_to_lie_on_it(swept, height):
 
 def test_heights_alone_do_and_slopes_alone_stay_where_they_are(swept):
     lifted, given = swept(1.0)
-    heights = Fuse(FuseConfig(slopes=False))(given, FREE)
+    heights = Fuse(FuseConfig(terms=without("normals")))(given, FREE)
     assert off_plane(lifted, heights).abs().median() < 0.05
-    slopes = Fuse(FuseConfig(heights=False, points=False))(given, FREE)
+    slopes = Fuse(FuseConfig(terms=without("swept_heights", "cloud_points")))(given, FREE)
     # Nothing knows how high: the facets, which are parallel, stay a sample above.
     assert (off_plane(lifted, slopes) - lifted.height).abs().max() < 0.05
 
@@ -94,7 +102,9 @@ def test_normals_at_right_angles_to_the_direction_of_heights_raise_no_fold(swept
         normals[:, size : 2 * size, size : 2 * size] = wrong
         buckets.append(found.replace(normals_patch=normals))
     photometric = given.photometric.replace(buckets=tuple(buckets))
-    surface = Fuse(FuseConfig(heights=False))(given.replace(photometric=photometric), FREE)
+    surface = Fuse(FuseConfig(terms=without("swept_heights")))(
+        given.replace(photometric=photometric), FREE
+    )
     assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 5.6
 
 
@@ -193,10 +203,11 @@ def test_contours_bring_the_surface_to_where_it_touches_them(swept):
     # A contour may touch anywhere on its ray, which lies in the plane.
     points = points + 3 * spacing * torch.linspace(-1, 1, 60).double()[:, None] * ray
     contours = Touching(points, lifted.normal, 0.1 * spacing)
-    silent = FuseConfig(heights=False, points=False)
+    silent = FuseConfig(terms=without("swept_heights", "cloud_points"))
     assert off_plane(lifted, Fuse(silent)(given, contours)).abs().quantile(0.9) < 0.1
-    without = Fuse(FuseConfig(heights=False, points=False, contours=False))(given, contours)
-    assert (off_plane(lifted, without) - lifted.height).abs().max() < 0.05
+    deaf = FuseConfig(terms=without("swept_heights", "cloud_points", "contour_rays"))
+    unheard = Fuse(deaf)(given, contours)
+    assert (off_plane(lifted, unheard) - lifted.height).abs().max() < 0.05
     # A tenth of them lie beside the object: the others outvote them.
     points[::10] += 5 * spacing * lifted.normal
     wrong = Fuse(silent)(given, Touching(points, lifted.normal, 0.1 * spacing))
@@ -242,7 +253,7 @@ def noisy(lifted, given, points: float, rotation: float, seed: int):
 def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
     lifted, given = swept(0.5)
     spacing = float(given.patches.buckets[0].spacing[0])
-    fuse = Fuse(FuseConfig(heights=False, bias_iterations=1, noise_iterations=2))
+    fuse = Fuse(FuseConfig(terms=without("swept_heights"), bias_iterations=1, noise_iterations=2))
     median = []
     for points, rotation in ((0.05, 0.02), (0.4, 0.1)):
         ratios, expected = [], []
@@ -256,7 +267,11 @@ def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
         assert 0.4 < sorted(ratios)[1] < 2.5
         median.append(sorted(expected)[1])
     assert 3 < median[1] / median[0] < 12  # noise is 8 and 5 times as large
-    silent = Fuse(FuseConfig(heights=False, bias_iterations=1, noise_iterations=2, error_draws=0))
+    silent = Fuse(
+        FuseConfig(
+            terms=without("swept_heights"), bias_iterations=1, noise_iterations=2, error_draws=0
+        )
+    )
     assert silent(noisy(lifted, given, 0.1, 0.05, 0), FREE).expected_error is None
 
 
@@ -382,5 +397,52 @@ def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swe
 
 
 def test_without_any_evidence_nothing_can_be_fused():
-    with pytest.raises(ConfigError, match="slopes"):
-        FuseConfig(slopes=False, heights=False, points=False, contours=False)
+    with pytest.raises(ConfigError, match=r"fuse\.terms"):
+        FuseConfig(terms=())
+
+
+class At(Term):
+    """All vertices lie at one height above the facets."""
+
+    position = True
+
+    def __init__(self, height: float) -> None:
+        super().__init__()
+        self.height = nn.Parameter(torch.tensor(height, dtype=torch.float64))
+
+    def equations(self, problem):
+        vertex = torch.arange(len(problem.points))[:, None]
+        ones = torch.ones_like(problem.blend.heights)
+        return [
+            Equations(
+                unknowns=vertex,
+                coefficients=ones[:, None],
+                targets=self.height * ones,
+                information=1e6 * ones / problem.spacing**2,
+                correlated=ones,
+                evaluated=False,
+            )
+        ]
+
+
+def test_a_term_from_elsewhere_joins_the_list_and_its_parameters_have_gradients(swept):
+    lifted, given = swept(1.0)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    own = At(0.7 * spacing)
+    fuse = Fuse(FuseConfig(noise_iterations=1, error_draws=0), [KeptSlopes(), own])
+    surface = fuse(given, FREE)
+    assert_close(
+        off_plane(lifted, surface), torch.full_like(surface.information, 1.7), atol=1e-2, rtol=0
+    )
+    surface.vertices_world.sum().backward()
+    # The facets are raised as one: every vertex moves along its direction.
+    assert own.height.grad.abs() > 0.9 * len(surface.information) * abs(float(lifted.normal.sum()))
+    with pytest.raises(ConfigError, match="modules derived from Term"):
+        Fuse(terms=[nn.Identity()])
+
+
+def test_the_list_of_settings_is_the_list_of_terms(swept):
+    _, given = swept(1.0)
+    named = Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
+    listed = [KeptSlopes(), ContourRays(), SweptHeights(), Normals()]
+    assert torch.equal(named.vertices_world, Fuse(terms=listed)(given, FREE).vertices_world)

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.problem import pose
+from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -192,10 +193,10 @@ def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
         photometric=cap.photometric.replace(buckets=tuple(photometry)), buckets=tuple(heights)
     )
     problem = pose(swept, 1.0, True)
-    own, coarse = kinds = problem.heights()
+    own, coarse = kinds = SweptHeights().equations(problem)
     assert not torch.isin(own.unknowns, coarse.unknowns).any()
-    terms = [*kinds, problem.slopes(problem.blend.normals_world), *problem.unlit()]
-    fused = fuse_terms(terms, problem.blend.heights, problem.damping, 4)
+    kinds += [*Normals().equations(problem), *KeptSlopes().equations(problem)]
+    fused = fuse_terms(kinds, problem.blend.heights, problem.damping, 4)
     # A fifth of a spacing is claimed: by heights that are exact, and by others that are off by one.
     assert fused.factors[0] < 0.5
     assert fused.factors[1] > 5

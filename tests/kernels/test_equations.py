@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import _evaluated
-from pimper_torch.fusion.terms import Terms
 from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
 
@@ -39,7 +39,7 @@ def test_evidence_is_evaluated_as_in_torch(real):
     def draw(*shape, dtype=real):
         return torch.rand(*shape, generator=generator, dtype=dtype) + 0.1
 
-    kind = Terms(
+    kind = Equations(
         unknowns=torch.randint(0, 30, (200, 2), generator=generator),
         coefficients=draw(200, 2) - 0.6,
         targets=draw(200),

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.contacts import BaseSurface, cloud_points, contour_tangents, passing
-from pimper_torch.fusion.terms import (
+from pimper_torch.fusion.equations import (
     Common,
     kept_slopes,
     kept_steps,
@@ -15,14 +15,16 @@ from pimper_torch.fusion.terms import (
 )
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.topology import face_edges
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def terms_of(contacts, known, surface):
-    """Give the terms of points of a surface."""
-    return passing([contacts(known, surface)], surface)[0]
+def equations_of(contacts, known, surface):
+    """Return the equations of points of a surface."""
+    caster = RayCaster(surface.points, surface.faces)
+    return passing(contacts(known, surface), surface, caster)
 
 
 @pytest.fixture
@@ -158,7 +160,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
         reach=1.0,
         finest=1e-9,
     )
-    found = terms_of(cloud_points, cloud, surface)
+    found = equations_of(cloud_points, cloud, surface)
     assert len(found.targets) == 40
     assert found.unknowns.shape == (40, 1)
     assert_close(found.coefficients, torch.ones(40, 1).double())
@@ -169,7 +171,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     # On a surface that leans, what it is lifted by is what it is off by at the point.
     leaning = subdivision.points + (0.3 * subdivision.points[:, :1]) * UP
     raised = torch.cat([xy, 0.3 * xy[:, :1] + 0.02], dim=1)
-    above = terms_of(
+    above = equations_of(
         cloud_points,
         cloud.replace(points_world=raised),
         surface.replace(points=leaning, heights=leaning[:, 2], directions=UP.expand_as(along)),
@@ -178,7 +180,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     # Uncertain across, sure along: only what is across a slanting line blurs it.
     assert (1 / found.information < 0.05).all()
     assert (1 / found.information >= 1e-4).all()
-    near = terms_of(cloud_points, cloud, surface.replace(reach=0.01))
+    near = equations_of(cloud_points, cloud, surface.replace(reach=0.01))
     assert len(near.targets) == int((lift.abs() <= 0.01 / 1.0).sum())
 
 
@@ -208,13 +210,13 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
         view=torch.zeros(30, dtype=torch.long),
         ray=torch.arange(30),
     )
-    found = terms_of(contour_tangents, contours, surface)
+    found = equations_of(contour_tangents, contours, surface)
     facing = float(along[0] @ normal)
     assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
     assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
     # What a direction runs along cannot be reached by heights: nothing is said.
     beside = contours.replace(normals_world=torch.tensor([0.0, 1.0, 0.0]).double().expand(30, 3))
-    assert len(terms_of(contour_tangents, beside, surface).targets) == 0
+    assert len(equations_of(contour_tangents, beside, surface).targets) == 0
 
 
 @pytest.mark.parametrize("kind", ["slopes", "kept_slopes", "kept_steps", "swept_heights"])
@@ -285,7 +287,7 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivi
             reach=9.0,
             finest=1e-3,
         )
-        found = terms_of(cloud_points, points, surface)
+        found = equations_of(cloud_points, points, surface)
         return {"target": found.targets}
 
     inputs = {"heights": height, "points": points_world, "all": torch.zeros(()).double()}
@@ -322,7 +324,7 @@ def test_a_contour_stays_where_it_is_as_the_surface_is_raised(subdivision, gener
             reach=9.0,
             finest=1e-3,
         )
-        found = terms_of(contour_tangents, contours, surface)
+        found = equations_of(contour_tangents, contours, surface)
         return {"target": found.targets, "information": found.information}
 
     inputs = {

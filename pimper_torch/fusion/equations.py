@@ -1,0 +1,207 @@
+r"""Linear equations in the heights of vertices, of every kind that the fusion knows.
+
+A vertex lies at ``x_v = q_v + h_v d_v``: its position on the flat facet, and the height along its
+direction. Every kind is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
+the variance that its source claims.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.records import Record
+
+# A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
+MIN_FACING = 0.2
+
+# Heights along a direction cannot follow normals that are further from it than this (cosine).
+_UPRIGHT = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Common(Record):
+    """An error that neighbours have in common, as their light and albedo were found together.
+
+    It does not average out. Neighbours that have it agree with each other, and would outvote
+    what is right; ``count`` times its variance, added to that of each, makes all of them
+    together count for what they know.
+
+    Attributes:
+        variance: Of the error.
+        count: Of the neighbours that have it, for each vertex.
+    """
+
+    variance: Float[Tensor, ""]
+    count: Float[Tensor, " vertex"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Equations(Record):
+    """Equations of one kind.
+
+    Attributes:
+        unknowns: Vertices that each equation ties together.
+        coefficients: Of their heights.
+        targets: What these should add up to.
+        information: Inverse variance of the target, as its source claims, or what is left of it
+            where neighbours have a common error: together they must not count for more.
+        correlated: How many times less than the variance so enlarged each target errs by.
+        evaluated: Whether the noise factor is estimated from residuals.
+    """
+
+    unknowns: Int[Tensor, "equation term"]
+    coefficients: Float[Tensor, "equation term"]
+    targets: Float[Tensor, " equation"]
+    information: Float[Tensor, " equation"]
+    correlated: Float[Tensor, " equation"]
+    evaluated: bool = True
+
+    def residual(self, heights: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+        """Return the residual: target less sum."""
+        return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
+
+
+def slopes(
+    edges: Int[Tensor, "edge 2"],
+    flat: Float[Tensor, "vertex 3"],
+    directions: Float[Tensor, "vertex 3"],
+    normals: Float[Tensor, "vertex 3"],
+    variance: Float[Tensor, " vertex"],
+    common: Common | None = None,
+) -> Equations:
+    r"""State that edges are at right angles to the normals at their ends.
+
+    :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`, which is exact on a parabola. An error of the
+    angle moves one end by the edge's length times it.
+
+    Args:
+        edges: Those whose ends have normals.
+        flat: ``q``.
+        directions: ``d``, unit.
+        normals: Unit, outward.
+        variance: Of the normals, squared radians.
+        common: Tilt that neighbours' normals have in common.
+    """
+    one, other = edges.unbind(dim=1)
+    centre = normalize(normals[one] + normals[other], dim=-1)
+    step = flat[other] - flat[one]
+    own = (variance[one] + variance[other]) / 2
+    each, together = own, own
+    if common is not None:
+        each = own + common.variance
+        together = own + common.variance * (common.count[one] + common.count[other]) / 2
+    leaning = torch.stack(
+        [-(centre * directions[one]).sum(dim=-1), (centre * directions[other]).sum(dim=-1)], dim=1
+    )
+    return Equations(
+        unknowns=edges,
+        coefficients=leaning,
+        targets=-(centre * step).sum(dim=-1),
+        information=1 / (together * step.square().sum(dim=-1)),
+        correlated=together / each,
+    )
+
+
+def upright(
+    edges: Int[Tensor, "edge 2"],
+    directions: Float[Tensor, "vertex 3"],
+    normals: Float[Tensor, "vertex 3"],
+) -> Bool[Tensor, " edge"]:
+    """Find edges whose slope heights can follow.
+
+    Others lie across a contour or a fold as seen along the directions: raising both ends by the
+    same height would rotate the edge. Constant.
+    """
+    centre = normalize(normals[edges].detach().sum(dim=1), dim=-1)
+    return ((centre[:, None] * directions[edges].detach()).sum(dim=-1) > _UPRIGHT).all(dim=1)
+
+
+def kept_slopes(
+    edges: Int[Tensor, "edge 2"],
+    flat: Float[Tensor, "vertex 3"],
+    directions: Float[Tensor, "vertex 3"],
+    shape: Float[Tensor, "vertex 3"],
+    transferred: Float[Tensor, " vertex"],
+    variance: Float[Tensor, " vertex"],
+) -> Equations:
+    """State that edges lie as they do on the surface that there is, where light tells nothing.
+
+    Args:
+        edges: Those without normals at both ends.
+        flat: ``q``.
+        directions: ``d``, unit.
+        variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
+    """
+    found = slopes(edges, flat, directions, shape, variance)
+    return found.replace(
+        targets=(found.coefficients * transferred[edges]).sum(dim=1),
+        evaluated=False,
+    )
+
+
+def kept_steps(
+    edges: Int[Tensor, "edge 2"],
+    flat: Float[Tensor, "vertex 3"],
+    transferred: Float[Tensor, " vertex"],
+    variance: float | Float[Tensor, ""],
+) -> Equations:
+    """State that heights go on differing as they do, where edges are not upright.
+
+    Args:
+        flat: ``q``.
+        transferred: Heights of the surface that there is.
+        variance: Of its slopes, squared radians.
+    """
+    one, other = edges.unbind(dim=1)
+    square = (flat[other] - flat[one]).square().sum(dim=-1)
+    return Equations(
+        unknowns=edges,
+        coefficients=flat.new_tensor([-1.0, 1.0]).expand(len(edges), 2),
+        targets=transferred[other] - transferred[one],
+        information=1 / (variance * square),
+        correlated=torch.ones_like(square),
+        evaluated=False,
+    )
+
+
+def swept_heights(
+    transferred: Float[Tensor, " vertex"],
+    offsets: Float[Tensor, " vertex"],
+    information: Float[Tensor, " vertex"],
+    facing: Float[Tensor, " vertex"],
+    correlated: float,
+    common: Common | None = None,
+) -> Equations:
+    """State where the sweep has the surface.
+
+    Args:
+        transferred: Heights of the surface that was swept.
+        information: Of the offsets, each vertex's own share; one without says nothing.
+        facing: Cosine between normals and directions.
+        correlated: Vertices in a window, which have one offset.
+        common: Error that neighbours have in common, beyond their windows.
+    """
+    known = upright_heights(information, facing).nonzero()[:, 0]
+    steep = facing[known]
+    together = 1 / (information[known] * steep.square())
+    each = together / correlated
+    if common is not None:
+        each = each + common.variance
+        together = together + common.variance * common.count[known]
+    return Equations(
+        unknowns=known[:, None],
+        coefficients=torch.ones_like(steep)[:, None],
+        targets=transferred[known] + offsets[known] / steep,
+        information=1 / together,
+        correlated=together / each,
+    )
+
+
+def upright_heights(
+    information: Float[Tensor, " vertex"], facing: Float[Tensor, " vertex"]
+) -> Bool[Tensor, " vertex"]:
+    """Find vertices whose swept offsets tell heights."""
+    return (information > 0) & (facing > MIN_FACING)
