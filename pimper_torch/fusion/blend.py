@@ -72,6 +72,10 @@ class Blend(Record):
         offsets: How far outside the height fields the sweep has the surface, along their normals;
             0 where not swept.
         offset_information: Inverse variance of the offsets; 0 where not swept.
+        prior_normals_world: That were guessed, unit; zero where none was.
+        prior_normal_information: Inverse variance of these.
+        prior_offsets: Like ``offsets``, that were guessed.
+        prior_offset_information: Inverse variance of these.
     """
 
     heights: Float[Tensor, " vertex"]
@@ -83,6 +87,10 @@ class Blend(Record):
     normal_information: Float[Tensor, " vertex"]
     offsets: Float[Tensor, " vertex"]
     offset_information: Float[Tensor, " vertex"]
+    prior_normals_world: Float[Tensor, "vertex 3"]
+    prior_normal_information: Float[Tensor, " vertex"]
+    prior_offsets: Float[Tensor, " vertex"]
+    prior_offset_information: Float[Tensor, " vertex"]
 
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
@@ -171,7 +179,8 @@ class _Estimates(Record):
     """Heights, normals, albedo and offsets of single patches at single vertices.
 
     ``normal`` counts where ``known``, and begins with the information that the rest is multiplied
-    by, as ``offset`` does. ``albedo`` begins with the fraction that it is known of.
+    by, as ``offset`` and the two priors do. ``albedo`` begins with the fraction that it is known
+    of.
     """
 
     vertex: Int[Tensor, " estimate"]
@@ -182,6 +191,8 @@ class _Estimates(Record):
     albedo: Float[Tensor, "estimate layer"]
     normal: Float[Tensor, "estimate 4"]
     offset: Float[Tensor, "estimate 2"]
+    prior_normal: Float[Tensor, "estimate 4"]
+    prior_offset: Float[Tensor, "estimate 2"]
 
 
 def _estimates(
@@ -223,6 +234,15 @@ def _estimates(
     if swept is not None:
         layers = torch.stack([swept.information, swept.information * swept.offset], dim=1)
         offset = sample_raster(layers, xy, *raster)
+    prior_normal, prior_offset = torch.zeros_like(normal), torch.zeros_like(offset)
+    if swept is not None and swept.priors is not None:
+        priors = swept.priors
+        certain, sure = priors.normal_information, priors.offset_information
+        guessed = priors.normals_patch @ templates.patch_from_world[:, None, :3, :3]
+        layers = torch.cat([certain[..., None], certain[..., None] * guessed], dim=-1)
+        prior_normal = sample_raster(layers.movedim(-1, 1), xy, *raster)
+        layers = torch.stack([sure, sure * priors.offset], dim=1)
+        prior_offset = sample_raster(layers, xy, *raster)
     return _Estimates(
         vertex=vertex[found],
         height=((points - origins) * along).sum(dim=-1)[found],
@@ -232,6 +252,8 @@ def _estimates(
         normal=normal.movedim(1, -1)[found],
         albedo=albedo.movedim(1, -1)[found],
         offset=offset.movedim(1, -1)[found],
+        prior_normal=prior_normal.movedim(1, -1)[found],
+        prior_offset=prior_offset.movedim(1, -1)[found],
     )
 
 
@@ -341,6 +363,10 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
     certain, normals = _split(_sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
     swept, offsets = _split(_sum_at(vertex, weight[:, None] * estimates.offset, count))
+    guessed, prior_normals = _split(
+        _sum_at(vertex, weight[:, None] * estimates.prior_normal, count)
+    )
+    told, prior_offsets = _split(_sum_at(vertex, weight[:, None] * estimates.prior_offset, count))
     photometric = (seen > _MIN_WEIGHT) & (certain > 0)
     colours = _sum_at(vertex, weight[:, None] * estimates.albedo, count)
     observed = colours[:, 0] > _MIN_WEIGHT
@@ -355,6 +381,10 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         normal_information=_beside_unknown(certain * per_support, seen * per_support) * photometric,
         offsets=offsets[:, 0],
         offset_information=swept * per_support,
+        prior_normals_world=normalize(prior_normals, dim=-1),
+        prior_normal_information=guessed * per_support,
+        prior_offsets=prior_offsets[:, 0],
+        prior_offset_information=told * per_support,
     )
 
 

@@ -25,6 +25,7 @@ from torch.nn.functional import normalize
 from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused
+from pimper_torch.fusion.terms import UNMEASURED
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.systems import prepare
@@ -33,10 +34,6 @@ from pimper_torch.linalg.systems import prepare
 # surface of rendered mug, potatoes and jar (16 photographs of 640x480) are correlated by 0.5 to
 # 0.8 over 1.5 to 3 % of the diagonal and by 0.3 to 0.5 over 3 to 6 %; their facets are 2 to 3 %.
 _REGION = 2.5
-
-# Errors of slopes that were not measured, over the standard error they are given: in the median
-# 5.0 on the mug, 11.5 on the potatoes and 3.7 on the jar.
-_UNMEASURED = 5.0
 
 # Of the answers, relative, in the energy norm: far below the sampling error of a dozen draws.
 _ACCURACY = 1e-2
@@ -122,7 +119,7 @@ def _noise(
     depends on where they point.
     """
     claimed = 1 / (weight * kind.information.double() * kind.correlated.double())
-    each = claimed * (factor.clamp_min(1) if kind.evaluated else _UNMEASURED**2)
+    each = claimed * (factor.clamp_min(1) if kind.evaluated else UNMEASURED**2)
     facet = subdivision.facet[kind.unknowns[:, 0]]
     count = torch.bincount(facet, minlength=1)[facet].to(each)
     together = torch.ones_like(each)

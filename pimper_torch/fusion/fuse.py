@@ -4,7 +4,7 @@ It reads in the order of its ``forward``: the errors that facets have in common 
 coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -142,13 +142,15 @@ class Fuse(Stage):
                 is not finite.
         """
         config = self.config
-        coarse = self._posed(swept, _COARSER * config.samples_per_vertex)
+        lit = any(isinstance(term, Normals) for term in self._terms)
+        coarse = pose(swept, _COARSER * config.samples_per_vertex, lit)
         terms = tuple(term.bound(coarse, contours) for term in self._terms)
+        coarse = _sloped(coarse, terms)
         shared = self._shared(coarse, terms, expected)
         subdivided = coarse.subdivision
         del coarse
         release_memory()
-        fine = self._posed(swept, config.samples_per_vertex)
+        fine = _sloped(pose(swept, config.samples_per_vertex, lit), shared.terms)
         release_memory()
         solved = self._solve(fine, shared)
         release_memory()
@@ -186,16 +188,6 @@ class Fuse(Stage):
     def _terms(self) -> tuple[Term, ...]:
         return tuple(cast("Term", term) for term in self.terms)
 
-    def _posed(self, swept: SweptPatches, samples_per_vertex: float) -> Problem:
-        """Pose the problem, with the edges that terms tell the slope of."""
-        lit = any(isinstance(term, Normals) for term in self._terms)
-        problem = pose(swept, samples_per_vertex, lit)
-        told = [term.sloped(problem) for term in self._terms]
-        none = torch.zeros_like(problem.lit)
-        return problem.replace(
-            sloped=reduce(or_, (each for each in told if each is not None), none)
-        )
-
     def _shared(self, problem: Problem, terms: tuple[Term, ...], expected: bool) -> _Shared:
         """Estimate the errors that a facet has in common, and the expected error of the heights.
 
@@ -213,17 +205,23 @@ class Fuse(Stage):
                 terms=terms,
                 expected=self._expected(problem, made) if expected else None,
             )
-        # Loose positions are evaluated by the others first, which they would draw along.
-        taken = made.without(lambda term: term.loose) if firm else made
+
+        def doubted(term: Term) -> bool:
+            return term.loose if firm else term.guessed
+
+        # These are evaluated by the others first, which they would draw along.
+        taken = made.without(doubted)
+        vertex = torch.cat(
+            [kind.unknowns[:, 0] for kind in firm or loose] or [problem.edges.new_zeros(0)]
+        )
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
             tilted = problem.replace(tilt_variance=tilt.variance())
             fused = self._fused(problem, taken.again(tilted).equations())
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
-            if firm and loose:
-                vertex = torch.cat([kind.unknowns[:, 0] for kind in firm])
-                made = taken = made.evaluated(problem, fused.heights, vertex)
+            made, problem = made.evaluated(problem, fused.heights, vertex, doubted)
+            taken = made
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
@@ -312,8 +310,8 @@ class _Made:
 
     def without(self, unwanted: Callable[[Term], bool]) -> "_Made":
         """Leave out some terms."""
-        left = [pair for pair in zip(self.terms, self.kinds, strict=True) if not unwanted(pair[0])]
-        return _Made(tuple(term for term, _ in left), tuple(kinds for _, kinds in left))
+        pairs = zip(self.terms, self.kinds, strict=True)
+        return _Made.of_pairs(pair for pair in pairs if not unwanted(pair[0]))
 
     def again(self, problem: Problem) -> "_Made":
         """Make the equations of tilted terms anew, for other normals or another tilt."""
@@ -322,12 +320,35 @@ class _Made:
         return _Made(self.terms, tuple(made))
 
     def evaluated(
-        self, problem: Problem, heights: Float[Tensor, " vertex"], firm: Int[Tensor, " known"]
-    ) -> "_Made":
-        """Evaluate loose terms, and make their equations anew."""
+        self,
+        problem: Problem,
+        heights: Float[Tensor, " vertex"],
+        firm: Int[Tensor, " known"],
+        doubted: Callable[[Term], bool],
+    ) -> tuple["_Made", Problem]:
+        """Evaluate some terms, and make their equations anew, and what guesses leave open."""
+        pairs = list(zip(self.terms, self.kinds, strict=True))
+        anew = [doubted(term) and bool(kinds) for term, kinds in pairs]
         terms = tuple(
-            term.evaluated(problem, heights, firm) if term.loose else term for term in self.terms
+            term.evaluated(problem, heights, firm) if new else term
+            for term, new in zip(self.terms, anew, strict=True)
         )
-        pairs = zip(terms, self.kinds, strict=True)
-        made = (term.equations(problem) if term.loose else kinds for term, kinds in pairs)
-        return _Made(terms, tuple(made))
+        if guessed := any(term.guessed and kinds for term, kinds in pairs):
+            problem = _sloped(problem, terms)
+        kinds = tuple(
+            term.equations(problem) if new or (guessed and term.residual) else old
+            for term, new, old in zip(terms, anew, self.kinds, strict=True)
+        )
+        return _Made(terms, kinds), problem
+
+    @classmethod
+    def of_pairs(cls, pairs: Iterable[tuple[Term, list[Equations]]]) -> "_Made":
+        """Put terms beside their equations."""
+        terms, kinds = zip(*pairs, strict=True)
+        return cls(terms, kinds)
+
+
+def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:
+    """Collect the edges that terms tell the slope of."""
+    told = (term.sloped(problem) for term in terms)
+    return problem.replace(sloped=reduce(or_, told, torch.zeros_like(problem.lit)))

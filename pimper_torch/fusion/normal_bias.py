@@ -64,6 +64,7 @@ def normal_bias(
     normals: Float[Tensor, "vertex 3"],
     shape: Float[Tensor, "vertex 3"],
     known: Bool[Tensor, " vertex"],
+    most: float = 0.25,
 ) -> NormalBias:
     """Compare normals with those of a shape, facet by facet.
 
@@ -71,12 +72,13 @@ def normal_bias(
         normals: Photometric, unit.
         shape: Of the surface, unit.
         known: Where there are photometric ones.
+        most: Larger differences, as across a cliff, are cut to so many radians.
 
-    Large differences, as across a cliff, are cut to a quarter of a radian. Differentiable.
+    Differentiable.
     """
     difference = torch.where(known[:, None], shape - normals, 0)
     size = difference.norm(dim=-1, keepdim=True)
-    difference = difference * (0.25 / size.clamp_min(0.25))
+    difference = difference * (most / size.clamp_min(most))
     one = known.to(difference)
     count = one.new_zeros(len(facets)).index_add(0, subdivision.facet, one)
     summed = difference.new_zeros(len(facets), 3)

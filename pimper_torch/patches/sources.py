@@ -1,21 +1,31 @@
 """Image pyramids and the occluding surface, prepared once for all patches."""
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import halve
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Mesh, Record, Views
+from pimper_torch.records import (
+    Cameras,
+    DepthPrior,
+    InlierPrior,
+    Mesh,
+    NormalPrior,
+    Record,
+    Views,
+)
 
 # Levels of a pyramid, down to an eighth of the photographs' size: templates of the coarsest scale
 # have a sample for every four pixels. A choice.
@@ -73,16 +83,45 @@ class Sources(Record):
             or the mask, not finite, or saturated in any channel.
         gray: Mean over the channels.
         caster: Of the surface that occludes; ``None`` where none is given yet.
+        priors: Guessed maps of the photographs, prepared like these.
     """
 
     images: Pyramid
     unusable: Pyramid
     gray: Pyramid
     caster: RayCaster | None = None
+    priors: "tuple[PriorMaps, ...]" = ()
 
     def hidden_by(self, mesh: Mesh) -> "Sources":
         """Set the surface that occludes."""
         return self.replace(caster=RayCaster(mesh.vertices_world, mesh.faces))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PriorMaps(Record):
+    """Guessed maps of some views, at several sizes.
+
+    Attributes:
+        view: That each map is of.
+        zoom: Width and height of each map over those of its photograph.
+        sizes_px: Width and height of each map.
+        kind: Of the prior.
+        maps: Values times their inverse variance, and that; or probabilities.
+        in_world: Whether normals are in the world's frame, not the camera's.
+    """
+
+    view: Int[Tensor, " map"]
+    zoom: Float[Tensor, "map 2"]
+    sizes_px: Int[Tensor, "map 2"]
+    kind: Literal["normals", "depth", "inlier"]
+    maps: Sources
+    in_world: bool = False
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """Return the pinholes that the maps were seen by."""
+        own = cameras.take(self.view)
+        zoom = torch.cat([self.zoom, torch.ones_like(self.zoom[:, :1])], dim=1).to(own.intrinsics)
+        return own.replace(intrinsics=zoom[:, :, None] * own.intrinsics, sizes_px=self.sizes_px)
 
 
 def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEVELS) -> Sources:
@@ -112,6 +151,58 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
         images=Pyramid(finest=images, coarser=halved, sizes=sizes),
         gray=Pyramid(finest=gray, coarser=halved_gray, sizes=sizes),
         unusable=Pyramid(finest=unusable, coarser=halved_unusable, sizes=sizes),
+        priors=tuple(
+            _prior_maps(prior, views, levels)
+            for prior in views.priors
+            if isinstance(prior, NormalPrior | DepthPrior | InlierPrior)
+            and set(prior.names) & set(views.names)
+        ),
+    )
+
+
+def _prior_maps(
+    prior: NormalPrior | DepthPrior | InlierPrior, views: Views, levels: int
+) -> PriorMaps:
+    """Prepare the maps of the photographs that there are.
+
+    Raises:
+        InputError: Depth that is not along the camera's axis in scene units.
+    """
+    there = [index for index, name in enumerate(prior.names) if name in views.names]
+    prior = prior.take(there)
+    view = torch.tensor([views.names.index(name) for name in prior.names], dtype=torch.long)
+    kind: Literal["normals", "depth", "inlier"]
+    if isinstance(prior, InlierPrior):
+        kind, values = "inlier", prior.probability[:, None]
+        known = torch.ones_like(prior.probability, dtype=torch.bool)
+    else:
+        known = prior.variance.isfinite()
+        precision = torch.where(known, 1 / prior.variance, 0)[:, None]
+        if isinstance(prior, NormalPrior):
+            kind, layers = "normals", prior.normals.movedim(-1, 1)
+        else:
+            if prior.inverse or prior.along != "axis" or prior.gauge != "scene":
+                raise InputError(
+                    "a DepthPrior is not in scene units along the camera's axis; needed: "
+                    "`pimper_torch.priors.settled`, which fits it to the cloud."
+                )
+            kind, layers = "depth", prior.depth[:, None]
+        layers = torch.where(known[:, None], layers, 0)
+        values = torch.cat([precision * layers, precision], dim=1)
+    seen = Views(
+        images=values.to(views.images),
+        sizes_px=prior.sizes_px,
+        names=prior.names,
+        masks=known,
+        focals_px=torch.full_like(prior.sizes_px[:, 0], torch.nan, dtype=views.images.dtype),
+    )
+    return PriorMaps(
+        view=view.to(prior.sizes_px.device),
+        zoom=prior.sizes_px / views.sizes_px[view],
+        sizes_px=prior.sizes_px,
+        kind=kind,
+        maps=prepare(seen, math.inf, levels),
+        in_world=isinstance(prior, NormalPrior) and prior.frame == "world",
     )
 
 

@@ -16,6 +16,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.priors import merged
 from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.resample import occluded, resampled
 from pimper_torch.patches.sources import LEVELS, Sources, prepare
@@ -109,7 +110,13 @@ class Warp(Stage):
             raster = templates.take(some).depth
             shape = len(raster), cameras.num_views, channels, *raster.shape[1:]
             radiance = raster.new_zeros(shape, dtype=sources.images.finest.dtype)
-            return Observations(radiance=radiance, valid=radiance[:, :, 0] > 0)
+            valid = radiance[:, :, 0] > 0
+            unseen = [
+                (maps, Observations(radiance=radiance[:, maps.view], valid=valid[:, maps.view]))
+                for maps in sources.priors
+            ]
+            priors = merged(unseen, valid, cameras, templates.take(some)) if unseen else None
+            return Observations(radiance=radiance, valid=valid, priors=priors)
 
         found = over_patches(
             lambda some: self._register(cameras, sources, templates.take(some)),
@@ -123,7 +130,26 @@ class Warp(Stage):
         return found
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
-        images, config = sources.images.finest, self.config
+        found = self._resampled(cameras, sources, templates, self.config.dark_level)
+        guesses = [
+            (maps, self._resampled(maps.cameras(cameras), maps.maps, templates, -math.inf))
+            for maps in sources.priors
+        ]
+        shown = found.valid
+        for maps, guess in guesses:
+            shown = shown.index_add(1, maps.view, guess.valid)
+        assert sources.caster is not None  # forward sees to it
+        stride = self.config.occlusion_stride
+        hidden = occluded(shown, cameras, sources.caster, templates, stride)
+        found.radiance.masked_fill_(hidden[:, :, None], 0)
+        priors = merged(guesses, hidden, cameras, templates) if guesses else None
+        return found.replace(valid=found.valid & ~hidden, priors=priors)
+
+    def _resampled(
+        self, cameras: Cameras, sources: Sources, templates: Templates, dark_level: float
+    ) -> Observations:
+        """Resample views on a bucket, without occlusion."""
+        images = sources.images.finest
         fast = images.dtype == torch.float32 and compiled_for(
             images,
             cameras.cam_from_world,
@@ -134,17 +160,13 @@ class Warp(Stage):
             templates.spacing,
         )
         if fast:
-            steepest = math.cos(math.radians(config.max_tilt_deg))
-            found = resampled(cameras, sources, templates, steepest, config.dark_level)
-        else:
-            found = self._reference(cameras, sources, templates)
-        assert sources.caster is not None  # forward sees to it
-        stride = config.occlusion_stride
-        hidden = occluded(found.valid, cameras, sources.caster, templates, stride)
-        found.radiance.masked_fill_(hidden[:, :, None], 0)
-        return found.replace(valid=found.valid & ~hidden)
+            steepest = math.cos(math.radians(self.config.max_tilt_deg))
+            return resampled(cameras, sources, templates, steepest, dark_level)
+        return self._reference(cameras, sources, templates, dark_level)
 
-    def _reference(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
+    def _reference(
+        self, cameras: Cameras, sources: Sources, templates: Templates, dark_level: float
+    ) -> Observations:
         world_from_patch = invert_rigid(templates.patch_from_world)
         num, height, width = templates.depth.shape
         points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
@@ -154,7 +176,7 @@ class Warp(Stage):
             transferred = templates.normals_patch.detach().reshape(num, -1, 3)
             outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
         seen = [
-            self._seen_by(view, templates, points_world, outward, cameras, sources)
+            self._seen_by(view, templates, points_world, outward, cameras, sources, dark_level)
             for view in range(cameras.num_views)
         ]
         return Observations(
@@ -170,6 +192,7 @@ class Warp(Stage):
         outward: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         sources: Sources,
+        dark_level: float,
     ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
         center = cameras.centers_world[view]
         facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
@@ -191,7 +214,7 @@ class Warp(Stage):
         found = look_up(sources.images.levels(view), pixels[wanted], level[wanted])
         fractions = [fraction.to(found) for fraction in sources.unusable.levels(view)]
         lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
-        usable = (lost < 0.1) & (found.mean(dim=1) > self.config.dark_level)
+        usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
         radiance = found.new_zeros(*wanted.shape, found.shape[1])
         radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
         valid = torch.zeros_like(wanted).index_put((wanted,), usable)

@@ -157,16 +157,39 @@ class PatchSet(OverPatches):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PatchPriors(Record):
+    """A bucket of priors on its templates, those of all views that see a sample merged.
+
+    Attributes:
+        normals_patch: Unit, in the patch frame; anything where the information is 0.
+        normal_information: Inverse variance of the normals, one over squared radians.
+        offset: How far outside the template the surface lies, along the outward normal of what the
+            template carries; scene units.
+        offset_information: Inverse variance of the offset, one over scene units squared.
+        inlier: Probability that a view shows diffuse reflection of its light; 1 where unknown.
+            ``None`` without such a prior.
+    """
+
+    normals_patch: Float[Tensor, "patch height width 3"]
+    normal_information: Float[Tensor, "patch height width"]
+    offset: Float[Tensor, "patch height width"]
+    offset_information: Float[Tensor, "patch height width"]
+    inlier: Float[Tensor, "patch view height width"] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Observations(Record):
     """A bucket of views resampled on templates: the matrices J and D of its patches.
 
     Attributes:
         radiance: ``J`` before its samples are put in a row; zero where missing.
         valid: ``D``: true where a view has the sample.
+        priors: What was guessed of the photographs, if anything.
     """
 
     radiance: Float[Tensor, "patch view channel height width"]
     valid: Bool[Tensor, "patch view height width"]
+    priors: PatchPriors | None = None
 
     @property
     def raster(self) -> tuple[int, ...]:
@@ -362,11 +385,13 @@ class Heights(Record):
             nothing tells. A sample's own share: neighbours that were averaged with it have
             theirs.
         num_views: In how many views a sample of the patch shows, lit or not.
+        priors: What was guessed of the photographs, if anything.
     """
 
     offset: Float[Tensor, "patch height width"]
     information: Float[Tensor, "patch height width"]
     num_views: Int[Tensor, " patch"]
+    priors: PatchPriors | None = None
 
     @property
     def raster(self) -> tuple[int, ...]:

@@ -165,8 +165,13 @@ class Sweep(Stage):
 
         def lost(some: slice) -> Heights:
             zero = torch.zeros_like(templates.depth[some])
-            none = templates.facet.new_zeros(len(zero))
-            return Heights(offset=zero, information=zero, num_views=none)
+            none, priors = templates.facet.new_zeros(len(zero)), bucket[1].priors
+            return Heights(
+                offset=zero,
+                information=zero,
+                num_views=none,
+                priors=None if priors is None else priors.take(some),
+            )
 
         def work(some: slice) -> Heights:
             templates, registered, photometry = bucket
@@ -256,6 +261,7 @@ class Sweep(Stage):
             offset=none.index_put((weighed,), offset),
             information=none.index_put((weighed,), information),
             num_views=shown,
+            priors=registered.priors,
         )
 
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:

@@ -1,3 +1,4 @@
+import math
 from functools import cache
 
 import pytest
@@ -11,8 +12,9 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.terms import ContourRays, KeptSlopes, Normals, SweptHeights, Term
+from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.records import Cameras, ContourPoints, FacetPoints, Silhouettes
+from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
 
@@ -446,3 +448,58 @@ def test_the_list_of_settings_is_the_list_of_terms(swept):
     named = Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
     listed = [KeptSlopes(), ContourRays(), SweptHeights(), Normals()]
     assert torch.equal(named.vertices_world, Fuse(terms=listed)(given, FREE).vertices_world)
+
+
+def guessed(lifted, given, lean: float, error_deg: float):
+    """Guesses of the plane's normal, all of them leaning alike."""
+    buckets = []
+    for own, templates in zip(given.buckets, given.patches.buckets, strict=True):
+        axis = torch.tensor([1.0, 0.0, 0.0]).double()
+        across = normalize(axis - (axis @ lifted.normal) * lifted.normal, dim=0)
+        normal = normalize(lifted.normal + lean * across, dim=0)
+        rotated = rotate(templates.patch_from_world, normal.expand(len(templates.facet), 1, 3))
+        priors = PatchPriors(
+            normals_patch=rotated[:, :, None].expand(*own.offset.shape, 3),
+            normal_information=torch.full_like(own.offset, math.radians(error_deg) ** -2),
+            offset=torch.zeros_like(own.offset),
+            offset_information=torch.zeros_like(own.offset),
+        )
+        buckets.append(own.replace(priors=priors))
+    return given.replace(buckets=tuple(buckets))
+
+
+def unlit(given):
+    return given.replace(
+        photometric=given.photometric.replace(
+            buckets=tuple(
+                found.replace(
+                    valid=torch.zeros_like(found.valid), information=0 * found.information
+                )
+                for found in given.photometric.buckets
+            )
+        )
+    )
+
+
+def test_a_guess_that_the_photographs_contradict_is_not_believed_however_sure_it_is(swept):
+    lifted, given = swept(0.5)
+    plain = off_plane(lifted, Fuse()(given, FREE)).abs()
+    for error_deg in (5.0, 1.0):
+        wrong = guessed(lifted, given, lean=0.3, error_deg=error_deg)
+        off = off_plane(lifted, Fuse()(wrong, FREE)).abs()
+        assert off.quantile(0.9) < plain.quantile(0.9) + 0.05
+        deaf = Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
+        assert torch.equal(deaf.vertices_world, Fuse()(given, FREE).vertices_world)
+
+
+def test_guessed_normals_tell_slopes_where_light_tells_none(swept):
+    lifted, given = swept(0.5)
+    axis = torch.tensor([1.0, 0.0, 0.0]).double()
+    across = normalize(axis - (axis @ lifted.normal) * lifted.normal, dim=0)
+    silent = FuseConfig(terms=without("swept_heights", "cloud_points"), bias_iterations=0)
+    surface = Fuse(silent)(guessed(lifted, unlit(given), 0.1, 0.5), FREE)
+    away = off_plane(lifted, surface)
+    along = surface.vertices_world.double() @ across
+    along = along / float(given.patches.buckets[0].spacing[0])
+    slope = ((along - along.mean()) * away).mean() / along.var(correction=0)
+    assert -0.1 < slope < -0.08  # kept slopes stand beside it
