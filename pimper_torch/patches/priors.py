@@ -9,7 +9,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.patches.sources import PriorMaps
-from pimper_torch.records import Cameras, Observations, PatchPriors, Templates
+from pimper_torch.photometry.harmonics import rotate_lights
+from pimper_torch.records import Cameras, LightPrior, Observations, PatchPriors, Templates
 
 
 def merged(
@@ -17,6 +18,7 @@ def merged(
     hidden: Bool[Tensor, "patch view height width"],
     cameras: Cameras,
     templates: Templates,
+    lights: LightPrior | None = None,
 ) -> PatchPriors:
     """Average guesses of one sample by their inverse variance, which adds up.
 
@@ -27,12 +29,14 @@ def merged(
     Args:
         guesses: Maps, and what was looked up in them.
         hidden: Where a surface occludes a sample in a view.
+        lights: Of all views.
 
-    Differentiable in the maps.
+    Differentiable in the maps and lights.
     """
     shape = templates.depth.shape
     normals = templates.depth.new_zeros(*shape, 5)
     offsets = templates.depth.new_zeros(*shape, 4)
+    albedo = templates.depth.new_zeros(*shape, 2)
     inlier: Float[Tensor, "patch view height width"] | None = None
     for maps, guess in guesses:
         seen = guess.valid & ~hidden[:, maps.view]
@@ -42,6 +46,8 @@ def merged(
             normals = normals + _in_patches(values, seen, own, templates, maps.in_world)
         elif maps.kind == "depth":
             offsets = offsets + _offsets(values, seen, own, templates)
+        elif maps.kind == "albedo":
+            albedo = albedo + values.sum(dim=1).movedim(1, -1)
         else:
             ones = torch.ones_like(hidden, dtype=values.dtype) if inlier is None else inlier
             own_inlier = torch.where(seen, values[:, :, 0], 1)
@@ -52,12 +58,24 @@ def merged(
     scatter = 2 * (information - length).clamp_min(0)
     total, mean_square, certain, seen_in = offsets.unbind(dim=-1)
     offset = total / torch.where(certain > 0, certain, 1)
+    precise = albedo[..., 1] > 0
+    one = torch.where(precise, albedo[..., 1], 1)
+    rotated: Float[Tensor, "patch view 4"] | None = None
+    if lights is not None:
+        rotation = templates.patch_from_world[:, None].to(lights.lights)
+        if lights.frame == "camera":
+            rotation = rotation @ invert_rigid(cameras.cam_from_world).to(rotation)
+        rotated = rotate_lights(rotation, lights.lights[:, None])[:, :, 0]
     return PatchPriors(
         normals_patch=normalize(vector, dim=-1),
         normal_information=_scattered(information, scatter, count),
         offset=offset,
         offset_information=_scattered(certain, mean_square - offset * total, seen_in),
+        albedo=albedo[..., 0] / one,
+        albedo_variance=torch.where(precise, 1 / one, torch.inf),
         inlier=inlier,
+        lights_patch=rotated,
+        light_variance=None if lights is None else lights.variance.expand(shape[0], -1),
     )
 
 

@@ -18,9 +18,11 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import halve
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
+    AlbedoPrior,
     Cameras,
     DepthPrior,
     InlierPrior,
+    LightPrior,
     Mesh,
     NormalPrior,
     Record,
@@ -84,6 +86,8 @@ class Sources(Record):
         gray: Mean over the channels.
         caster: Of the surface that occludes; ``None`` where none is given yet.
         priors: Guessed maps of the photographs, prepared like these.
+        lights: Guessed lights of the photographs, one a view, of infinite variance where none is
+            guessed.
     """
 
     images: Pyramid
@@ -91,6 +95,7 @@ class Sources(Record):
     gray: Pyramid
     caster: RayCaster | None = None
     priors: "tuple[PriorMaps, ...]" = ()
+    lights: LightPrior | None = None
 
     def hidden_by(self, mesh: Mesh) -> "Sources":
         """Set the surface that occludes."""
@@ -113,7 +118,7 @@ class PriorMaps(Record):
     view: Int[Tensor, " map"]
     zoom: Float[Tensor, "map 2"]
     sizes_px: Int[Tensor, "map 2"]
-    kind: Literal["normals", "depth", "inlier"]
+    kind: Literal["normals", "depth", "albedo", "inlier"]
     maps: Sources
     in_world: bool = False
 
@@ -154,14 +159,15 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
         priors=tuple(
             _prior_maps(prior, views, levels)
             for prior in views.priors
-            if isinstance(prior, NormalPrior | DepthPrior | InlierPrior)
+            if isinstance(prior, NormalPrior | DepthPrior | AlbedoPrior | InlierPrior)
             and set(prior.names) & set(views.names)
         ),
+        lights=_lights_of(views),
     )
 
 
 def _prior_maps(
-    prior: NormalPrior | DepthPrior | InlierPrior, views: Views, levels: int
+    prior: NormalPrior | DepthPrior | AlbedoPrior | InlierPrior, views: Views, levels: int
 ) -> PriorMaps:
     """Prepare the maps of the photographs that there are.
 
@@ -171,7 +177,7 @@ def _prior_maps(
     there = [index for index, name in enumerate(prior.names) if name in views.names]
     prior = prior.take(there)
     view = torch.tensor([views.names.index(name) for name in prior.names], dtype=torch.long)
-    kind: Literal["normals", "depth", "inlier"]
+    kind: Literal["normals", "depth", "albedo", "inlier"]
     if isinstance(prior, InlierPrior):
         kind, values = "inlier", prior.probability[:, None]
         known = torch.ones_like(prior.probability, dtype=torch.bool)
@@ -180,6 +186,10 @@ def _prior_maps(
         precision = torch.where(known, 1 / prior.variance, 0)[:, None]
         if isinstance(prior, NormalPrior):
             kind, layers = "normals", prior.normals.movedim(-1, 1)
+        elif isinstance(prior, AlbedoPrior):
+            kind, gray = "albedo", torch.where(known, prior.albedo.mean(dim=1), torch.nan)
+            layers = gray[:, None] / gray.flatten(1).nanmedian(dim=1).values[:, None, None, None]
+            precision = precision * torch.where(known, gray, 0).square()[:, None]
         else:
             if prior.inverse or prior.along != "axis" or prior.gauge != "scene":
                 raise InputError(
@@ -203,6 +213,24 @@ def _prior_maps(
         kind=kind,
         maps=prepare(seen, math.inf, levels),
         in_world=isinstance(prior, NormalPrior) and prior.frame == "world",
+    )
+
+
+def _lights_of(views: Views) -> LightPrior | None:
+    """Put the guessed lights in the order of the views."""
+    given = next((prior for prior in views.priors if isinstance(prior, LightPrior)), None)
+    if given is None:
+        return None
+    lights = given.lights.new_zeros(views.num_views, 4)
+    variance = torch.full_like(lights[:, 0], torch.inf)
+    there = [index for index, name in enumerate(given.names) if name in views.names]
+    view = torch.tensor([views.names.index(given.names[index]) for index in there]).to(
+        lights.device
+    )
+    return given.replace(
+        lights=lights.index_copy(0, view.long(), given.lights[there]),
+        variance=variance.index_copy(0, view.long(), given.variance[there]),
+        names=views.names,
     )
 
 

@@ -24,6 +24,7 @@ from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
     Observations,
+    PatchPriors,
     PatchSet,
     PatchViews,
     Templates,
@@ -115,7 +116,9 @@ class Warp(Stage):
                 (maps, Observations(radiance=radiance[:, maps.view], valid=valid[:, maps.view]))
                 for maps in sources.priors
             ]
-            priors = merged(unseen, valid, cameras, templates.take(some)) if unseen else None
+            priors: PatchPriors | None = None
+            if unseen or sources.lights is not None:
+                priors = merged(unseen, valid, cameras, templates.take(some), sources.lights)
             return Observations(radiance=radiance, valid=valid, priors=priors)
 
         found = over_patches(
@@ -142,7 +145,9 @@ class Warp(Stage):
         stride = self.config.occlusion_stride
         hidden = occluded(shown, cameras, sources.caster, templates, stride)
         found.radiance.masked_fill_(hidden[:, :, None], 0)
-        priors = merged(guesses, hidden, cameras, templates) if guesses else None
+        priors: PatchPriors | None = None
+        if guesses or sources.lights is not None:
+            priors = merged(guesses, hidden, cameras, templates, sources.lights)
         return found.replace(valid=found.valid & ~hidden, priors=priors)
 
     def _resampled(

@@ -81,7 +81,7 @@ class Bilinear(Record):
     @property
     def requires_grad(self) -> bool:
         """Whether gradients of the solution are required."""
-        data = (self.radiance, self.anchor, self.regularization, self.prior)
+        data = (self.radiance, self.weight, self.anchor, self.regularization, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
 

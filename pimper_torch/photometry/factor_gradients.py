@@ -53,7 +53,8 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     holds at the optimum alone. A patch whose gradient it does not reduce keeps its solution.
 
     Args:
-        problem: Gradients reach its ``radiance``, ``anchor``, ``regularization`` and ``prior``.
+        problem: Gradients reach its ``radiance``, ``weight``, ``anchor``, ``regularization`` and
+            ``prior``.
         factors: Its solution, near enough to a minimum that the Hessian is positive definite.
 
     Returns:

@@ -1,14 +1,15 @@
 """Factorization of patches into albedo, normals and light."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
@@ -24,6 +25,18 @@ from pimper_torch.photometry.harmonics import harmonics, rotate_lights
 from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.priors import (
+    RELATIVE_NOISE,
+    FactorPrior,
+    FieldLights,
+    GuessedAlbedo,
+    GuessedInliers,
+    GuessedLights,
+    GuessedNormals,
+    Known,
+    PatchSamples,
+    SurfaceNormals,
+)
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, in_row, on_raster, rows_of
 from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold
@@ -34,6 +47,7 @@ from pimper_torch.records import (
     Convergence,
     Failure,
     Observations,
+    PatchPriors,
     PatchStatus,
     PatchViews,
     PhotometricPatches,
@@ -48,8 +62,12 @@ from pimper_torch.stage import Stage
 BORROWED_SAMPLES = 16.0
 
 # Minimum weight of the prior, as a fraction of a view's data: a choice, regularizes views with few
-# samples.
-MIN_REGULARIZATION = 1e-6
+# samples. By the other weight lights are fixed.
+MIN_REGULARIZATION, FIXED_LIGHTS = 1e-6, 1e6
+
+# Information of the surface's normals where guesses stand beside them: a choice, 5.4 degrees, as
+# much as the weight of their prior says.
+_SURFACE_INFORMATION = 0.1 / RELATIVE_NOISE**2
 
 # The Gauss-Newton matrix of a patch's lights is summed over about this many samples: a choice, ten
 # for each of 24 lights' coefficients.
@@ -147,10 +165,12 @@ class Illumination(Record):
     Attributes:
         field: Light of all views.
         caster: Of rays on the surface; ``None`` if cast shadows are not predicted.
+        guess_variance: Of what guessed normals differ from the surface's, beyond what both claim.
     """
 
     field: LightField
     caster: RayCaster | None
+    guess_variance: float | Float[Tensor, ""] = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -200,9 +220,19 @@ class Factorize(Stage):
     that light does not determine.
     """
 
-    def __init__(self, config: FactorizeConfig | None = None) -> None:
+    def __init__(
+        self, config: FactorizeConfig | None = None, priors: Sequence[FactorPrior] | None = None
+    ) -> None:
         super().__init__()
-        self.config = config or FactorizeConfig()
+        self.config = config = config or FactorizeConfig()
+        if priors is None:
+            own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
+            guesses = GuessedNormals(), GuessedAlbedo(), GuessedInliers(), GuessedLights()
+            priors = [*own, *guesses]
+        for prior in priors:
+            needed = "modules derived from FactorPrior"
+            require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)
+        self.priors = nn.ModuleList(priors)
 
     def forward(self, seen: PatchViews) -> PhotometricPatches:
         """Factorize all patches: :meth:`light`, :meth:`solve` and :meth:`conclude` in turn."""
@@ -221,11 +251,15 @@ class Factorize(Stage):
                 :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        field = self._field(seen, coarse)
-        if not self.config.shadows or not bool(field.point_light.any()):
-            return Illumination(field=field, caster=None)
-        mesh = seen.patches.surface or seen.patches.coarse.mesh
-        return Illumination(field=field, caster=RayCaster(mesh.vertices_world, mesh.faces))
+        guesses = [bucket.priors for bucket in seen.buckets]
+        variance = _excess_variance(coarse, guesses)
+        pairs = zip(coarse, guesses, strict=True)
+        field = self._field(seen, [_beside_guesses(*pair, variance) for pair in pairs])
+        caster: RayCaster | None = None
+        if self.config.shadows and bool(field.point_light.any()):
+            mesh = seen.patches.surface or seen.patches.coarse.mesh
+            caster = RayCaster(mesh.vertices_world, mesh.faces)
+        return Illumination(field=field, caster=caster, guess_variance=variance)
 
     def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
         """Fit the light field; soft light, which is simpler, where what was asked for fails."""
@@ -267,7 +301,7 @@ class Factorize(Stage):
 
     def _solved(self, bucket: _Bucket, light: Illumination, some: slice) -> Photometry:
         bucket = bucket.take(some)
-        prepared = self._prepare(bucket, _illuminated(bucket, light), light.field)
+        prepared = self._prepare(bucket, _illuminated(bucket, light), light)
         return self._photometry(bucket, prepared, self._solve(prepared.problem))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
@@ -285,13 +319,13 @@ class Factorize(Stage):
         self,
         bucket: _Bucket,
         illuminated: Bool[Tensor, "patch view height width"],
-        field: LightField,
+        light: Illumination,
     ) -> _Prepared:
         """Pose the problem; under light that never moves, samples in shadow take part.
 
         There shadows are at rest on the surface; elsewhere they move over it as false texture.
         """
-        config = self.config
+        config, field, variance = self.config, light.field, light.guess_variance
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
         anchor = rotate_lights(patch_from_world, field.lights_at(centre))
@@ -315,7 +349,7 @@ class Factorize(Stage):
         at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
-        problem = self._problem(rows, anchor, refused, raster)
+        problem = self._problem(rows, anchor, refused, raster, bucket.registered.priors, variance)
         return _Prepared(rows=rows, status=status, problem=problem)
 
     def _photometry(self, bucket: _Bucket, prepared: _Prepared, factors: Factors) -> Photometry:
@@ -323,6 +357,7 @@ class Factorize(Stage):
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
         found = refine_on_manifold(problem, factors)
+        problem, factors = _of_views(problem, factors, rows.seen.shape[1])
         finite_normals = (
             found.normals.isfinite().all(dim=2) & found.albedo.isfinite() & (found.albedo > 0)
         )
@@ -360,39 +395,57 @@ class Factorize(Stage):
     def _problem(
         self,
         rows: Rows,
-        anchor: Float[Tensor, "patch view 4"],
+        field: Float[Tensor, "patch view 4"],
         refused: Bool[Tensor, " patch"],
         raster: int,
+        guessed: PatchPriors | None,
+        variance: float | Float[Tensor, ""],
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
-        shading = initial_shading(gray, rows.seen, anchor, harmonics(rows.normals).mT)
+        shading = initial_shading(gray, rows.seen, field, harmonics(rows.normals).mT)
+        samples = _samples(rows, gray, field, shading[:, 0], guessed, variance)
+        known = [cast("Known", prior(samples)) for prior in self.priors]
+        for each in known:
+            if each.inlier is not None:
+                weight = weight * each.inlier
+        anchor, light_weight = _anchor(field, known)
         square = shading[:, 0] ** 2
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
         borrowed = BORROWED_SAMPLES * square.sum(dim=1) / count
-        regularization = max(config.light_prior, MIN_REGULARIZATION) * (
-            seen_square + borrowed[:, None]
-        )
+        unit = seen_square + borrowed[:, None]
         views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
-        level = (anchor**2).sum(dim=(1, 2)) / views
-        prior = None
-        gamma = level * torch.where(refused, FIXED_NORMALS, config.geometry_weight)
-        if bool((gamma > 0).any()):
-            prior = gamma[:, None, None] * cone.normal_prior(rows.normals.mT)
-        return Bilinear(
+        level = (field**2).sum(dim=(1, 2)) / views
+        fixed = torch.where(refused, FIXED_NORMALS, 0)[:, None].expand_as(square)
+        told = [(rows.normals, fixed)]
+        told += [
+            (each.normals, torch.where(refused[:, None], 0, each.normal_weight))
+            for each in known
+            if each.normals is not None and each.normal_weight is not None
+        ]
+        prior: Float[Tensor, "patch packed sample"] | None = None
+        for normals, pull in told:
+            if bool((pull > 0).any()):
+                own = (level[:, None] * pull)[:, None] * cone.normal_prior(normals.mT)
+                prior = own if prior is None else prior + own
+        problem = Bilinear(
             radiance=gray,
             weight=weight,
             lights=anchor,
             anchor=anchor,
             shading=shading,
-            regularization=regularization,
+            regularization=light_weight.clamp_min(MIN_REGULARIZATION) * unit,
             prior=prior,
             manifold=cone,
             loss=LOSSES[config.loss](config.loss_scale),
             stride=max(1, raster // SPREAD_SAMPLES),
         )
+        for each in known:
+            if each.albedo is not None and each.albedo_weight is not None:
+                problem = _with_albedo(problem, each.albedo, each.albedo_weight, level)
+        return problem
 
     def _solve(self, problem: Bilinear) -> Factors:
         config = self.config
@@ -400,6 +453,128 @@ class Factorize(Stage):
         if torch.is_grad_enabled() and problem.requires_grad:
             limits = max(limits[0], TO_CONVERGENCE[0]), min(limits[1], TO_CONVERGENCE[1])
         return SOLVERS[config.solver](problem.detach(), *limits)
+
+
+def _excess_variance(
+    normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
+) -> float | Float[Tensor, ""]:
+    """Return the variance of guessed normals about the surface's, beyond what both claim."""
+    square, claimed = [], []
+    for own, guess in zip(normals, guesses, strict=True):
+        if guess is not None:
+            some = guess.normal_information > 0
+            square.append((guess.normals_patch - own)[some].square().sum(dim=-1))
+            claimed.append(1 / guess.normal_information[some])
+    if sum(map(len, square)) == 0:
+        return 0.0
+    # Half of the squares of two Gaussian components lie below 2 log 2 times their variance.
+    found = torch.cat(square).median() / math.log(2)
+    return (found - torch.cat(claimed).median() - 1 / _SURFACE_INFORMATION).clamp_min(0)
+
+
+def _believed(
+    information: Float[Tensor, "*batch"], variance: float | Float[Tensor, ""]
+) -> Float[Tensor, "*batch"]:
+    """Lower information by a variance that is added."""
+    return information / (1 + information * variance)
+
+
+def _beside_guesses(
+    normals: Float[Tensor, "patch height width 3"],
+    guessed: PatchPriors | None,
+    variance: float | Float[Tensor, ""],
+) -> Float[Tensor, "patch height width 3"]:
+    """Average the surface's normals with those that were guessed."""
+    if guessed is None:
+        return normals
+    information = _believed(guessed.normal_information, variance)[..., None]
+    return normalize(_SURFACE_INFORMATION * normals + information * guessed.normals_patch, dim=-1)
+
+
+def _samples(
+    rows: Rows,
+    gray: Float[Tensor, "patch view sample"],
+    field: Float[Tensor, "patch view 4"],
+    albedo: Float[Tensor, "patch sample"],
+    guessed: PatchPriors | None,
+    variance: float | Float[Tensor, ""],
+) -> PatchSamples:
+    """Lay out what priors are asked about."""
+    samples = PatchSamples(
+        radiance=gray, seen=rows.seen, normals=rows.normals, albedo=albedo, lights=field
+    )
+    if guessed is None:
+        return samples
+
+    def row(raster: Float[Tensor, "patch height width"]) -> Float[Tensor, "patch sample"]:
+        return raster.flatten(1).gather(1, rows.index)
+
+    normals = guessed.normals_patch.flatten(1, 2)
+    inlier = guessed.inlier
+    return samples.replace(
+        guessed_normals=normals.gather(1, rows.index[..., None].expand(-1, -1, 3)),
+        guessed_information=row(_believed(guessed.normal_information, variance)),
+        guessed_albedo=row(guessed.albedo),
+        guessed_albedo_variance=row(guessed.albedo_variance),
+        guessed_inlier=None if inlier is None else in_row(inlier, rows.index),
+        guessed_lights=guessed.lights_patch,
+        guessed_light_variance=guessed.light_variance,
+    )
+
+
+def _anchor(
+    field: Float[Tensor, "patch view 4"], known: Sequence[Known]
+) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
+    """Return the mean of the lights that priors know, by weight, and the sum of the weights."""
+    told = [
+        (each.lights, each.light_weight)
+        for each in known
+        if each.lights is not None and each.light_weight is not None
+    ]
+    if len(told) == 1:
+        return told[0]
+    total = torch.zeros_like(field[..., 0])
+    mean = torch.zeros_like(field)
+    for lights, weight in told:
+        total, mean = total + weight, mean + weight[..., None] * lights
+    some = (total > 0)[..., None]
+    return torch.where(some, mean / torch.where(some, total[..., None], 1), field), total
+
+
+def _with_albedo(
+    problem: Bilinear,
+    albedo: Float[Tensor, "patch sample"],
+    weight: Float[Tensor, "patch sample"],
+    level: Float[Tensor, " patch"],
+) -> Bilinear:
+    """Add a view under ambient light of mean strength, which shows albedo itself."""
+    strength = level.sqrt()[:, None]
+    light = torch.zeros_like(problem.anchor[:, :1]) + 0
+    light[..., 0] = strength
+    fixed = FIXED_LIGHTS * problem.regularization.amax(dim=1, keepdim=True)
+    return problem.replace(
+        radiance=torch.cat([problem.radiance, (strength * albedo)[:, None]], dim=1),
+        weight=torch.cat([problem.weight, weight[:, None]], dim=1),
+        lights=torch.cat([problem.lights, light], dim=1),
+        anchor=torch.cat([problem.anchor, light], dim=1),
+        regularization=torch.cat([problem.regularization, fixed], dim=1),
+    )
+
+
+def _of_views(problem: Bilinear, factors: Factors, views: int) -> tuple[Bilinear, Factors]:
+    """Leave out what stands for known albedo."""
+    if problem.weight.shape[1] == views:
+        return problem, factors
+    return (
+        problem.replace(
+            radiance=problem.radiance[:, :views],
+            weight=problem.weight[:, :views],
+            lights=problem.lights[:, :views],
+            anchor=problem.anchor[:, :views],
+            regularization=problem.regularization[:, :views],
+        ),
+        factors.replace(lights=factors.lights[:, :views], weight=factors.weight[:, :views]),
+    )
 
 
 def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:

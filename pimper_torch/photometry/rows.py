@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pimper_torch.records import Observations, Record, Templates
@@ -55,8 +55,8 @@ def rows_of(
 
 
 def in_row(
-    raster: Bool[Tensor, "patch view height width"], index: Int[Tensor, "patch sample"]
-) -> Bool[Tensor, "patch view sample"]:
+    raster: Shaped[Tensor, "patch view height width"], index: Int[Tensor, "patch sample"]
+) -> Shaped[Tensor, "patch view sample"]:
     """Take the samples of a row from their rasters."""
     flat = raster.flatten(2)
     return flat.gather(2, index[:, None].expand(-1, flat.shape[1], -1))

@@ -166,15 +166,23 @@ class PatchPriors(Record):
         offset: How far outside the template the surface lies, along the outward normal of what the
             template carries; scene units.
         offset_information: Inverse variance of the offset, one over scene units squared.
+        albedo: Gray, up to a factor; 0 where nothing is guessed.
+        albedo_variance: Relative; infinite where nothing is guessed.
         inlier: Probability that a view shows diffuse reflection of its light; 1 where unknown.
             ``None`` without such a prior.
+        lights_patch: First-order harmonics in the patch frame, up to a factor. ``None`` without.
+        light_variance: Relative; infinite where nothing is guessed.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
     normal_information: Float[Tensor, "patch height width"]
     offset: Float[Tensor, "patch height width"]
     offset_information: Float[Tensor, "patch height width"]
+    albedo: Float[Tensor, "patch height width"]
+    albedo_variance: Float[Tensor, "patch height width"]
     inlier: Float[Tensor, "patch view height width"] | None = None
+    lights_patch: Float[Tensor, "patch view 4"] | None = None
+    light_variance: Float[Tensor, "patch view"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

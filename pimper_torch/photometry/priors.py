@@ -1,0 +1,177 @@
+"""Priors of the factorization: each tells something of lights, normals, albedo or outliers.
+
+A factorization takes a list of them. Leaving one out removes its effect, and one that is written
+elsewhere, such as a network, is added to the list: nothing else names it.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from pimper_torch.records import Record
+
+# Standard deviation of residuals over the radiance of albedo 1: a choice, in the middle of rendered
+# scenes. By it variances become weights: a normal that is known to 5.4 degrees counts as a tenth of
+# a view.
+RELATIVE_NOISE = 0.03
+
+# No guess of a sample counts as more views than this: a choice, so that photographs overrule it.
+MOST_VIEWS = 1.0
+
+# Relative mean square error of the light field: a choice, 6 degrees.
+FIELD_VARIANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PatchSamples(Record):
+    """A batch of patches before it is factorized, the samples of each in a row.
+
+    Attributes:
+        radiance: Gray, linear; zero where missing.
+        seen: False where missing, and in the padding.
+        normals: Of the surface so far, unit, patch frame.
+        albedo: Gray, that suits these and the lights best.
+        lights: Of the field, first-order harmonics in the patch frame.
+        guessed_normals: That views carry, unit, patch frame.
+        guessed_information: Inverse variance of these, one over squared radians; 0 where unknown.
+        guessed_albedo: That views carry, gray, up to a factor; 0 where unknown.
+        guessed_albedo_variance: Relative.
+        guessed_inlier: Probability of diffuse reflection that views carry; 1 where unknown.
+        guessed_lights: That views carry, patch frame, up to a factor.
+        guessed_light_variance: Relative; infinite where unknown.
+    """
+
+    radiance: Float[Tensor, "patch view sample"]
+    seen: Bool[Tensor, "patch view sample"]
+    normals: Float[Tensor, "patch sample 3"]
+    albedo: Float[Tensor, "patch sample"]
+    lights: Float[Tensor, "patch view 4"]
+    guessed_normals: Float[Tensor, "patch sample 3"] | None = None
+    guessed_information: Float[Tensor, "patch sample"] | None = None
+    guessed_albedo: Float[Tensor, "patch sample"] | None = None
+    guessed_albedo_variance: Float[Tensor, "patch sample"] | None = None
+    guessed_inlier: Float[Tensor, "patch view sample"] | None = None
+    guessed_lights: Float[Tensor, "patch view 4"] | None = None
+    guessed_light_variance: Float[Tensor, "patch view"] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Known(Record):
+    """What a prior knows of a batch of patches; ``None`` of what it does not.
+
+    Attributes:
+        lights: Patch frame.
+        light_weight: In units of each view's own data.
+        normals: Unit, patch frame.
+        normal_weight: In views, see :func:`views_worth`.
+        albedo: Gray, in units of the lights.
+        albedo_weight: In views.
+        inlier: Factor of the weight of every entry, in [0, 1].
+    """
+
+    lights: Float[Tensor, "patch view 4"] | None = None
+    light_weight: Float[Tensor, "patch view"] | None = None
+    normals: Float[Tensor, "patch sample 3"] | None = None
+    normal_weight: Float[Tensor, "patch sample"] | None = None
+    albedo: Float[Tensor, "patch sample"] | None = None
+    albedo_weight: Float[Tensor, "patch sample"] | None = None
+    inlier: Float[Tensor, "patch view sample"] | None = None
+
+
+class FactorPrior(nn.Module):
+    """A prior of the factorization; one of your own overrides :meth:`forward`."""
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return what is known of some patches."""
+        raise NotImplementedError
+
+
+class FieldLights(FactorPrior):
+    """Lights are those of the light field.
+
+    Args:
+        weight: In units of each view's own data.
+    """
+
+    def __init__(self, weight: float = 1.0) -> None:
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the field's lights."""
+        weight = torch.full_like(samples.lights[..., 0], self.weight)
+        return Known(lights=samples.lights, light_weight=weight)
+
+
+class SurfaceNormals(FactorPrior):
+    """Normals are those of the surface so far.
+
+    Args:
+        weight: In views.
+    """
+
+    def __init__(self, weight: float = 0.1) -> None:
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the surface's normals."""
+        weight = torch.full_like(samples.albedo, self.weight)
+        return Known(normals=samples.normals, normal_weight=weight)
+
+
+class GuessedNormals(FactorPrior):
+    """Normals are those that views carry, to their variance."""
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the guesses."""
+        information = samples.guessed_information
+        if information is None:
+            return Known()
+        return Known(normals=samples.guessed_normals, normal_weight=views_worth(information))
+
+
+class GuessedAlbedo(FactorPrior):
+    """Albedo is that which views carry, to its variance, up to a factor for each patch."""
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the guesses, in the unit of the albedo that suits the light."""
+        guess, variance = samples.guessed_albedo, samples.guessed_albedo_variance
+        if guess is None or variance is None:
+            return Known()
+        both = (guess > 0) & (samples.albedo > 0)
+        ratio = torch.where(both, samples.albedo / torch.where(both, guess, 1), torch.nan)
+        factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+        weight = torch.where(both, views_worth(1 / variance), 0)
+        return Known(albedo=factor * guess, albedo_weight=weight)
+
+
+class GuessedInliers(FactorPrior):
+    """Entries count by the probability of diffuse reflection that views carry."""
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the guesses."""
+        return Known(inlier=samples.guessed_inlier)
+
+
+class GuessedLights(FactorPrior):
+    """Lights are those that views carry, to their variance, up to a factor for each patch."""
+
+    def forward(self, samples: PatchSamples) -> Known:
+        """Return the guesses, in the unit of the field's lights."""
+        lights, variance = samples.guessed_lights, samples.guessed_light_variance
+        if lights is None or variance is None:
+            return Known()
+        length = lights.norm(dim=2)
+        known = variance.isfinite() & (length > 0)
+        ratio = samples.lights.norm(dim=2) / torch.where(known, length, torch.nan)
+        factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+        weight = torch.where(known, FIELD_VARIANCE / torch.where(known, variance, 1), 0)
+        return Known(lights=factor[..., None] * lights, light_weight=weight)
+
+
+def views_worth(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return the number of views that tell as much of an angle, or of albedo relative to itself."""
+    return (RELATIVE_NOISE**2 * information).clamp_max(MOST_VIEWS)
