@@ -9,7 +9,6 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.patches.sources import PriorMaps
-from pimper_torch.photometry.harmonics import rotate_lights
 from pimper_torch.records import Cameras, LightPrior, Observations, PatchPriors, Templates
 
 
@@ -65,7 +64,9 @@ def merged(
         rotation = templates.patch_from_world[:, None].to(lights.lights)
         if lights.frame == "camera":
             rotation = rotation @ invert_rigid(cameras.cam_from_world).to(rotation)
-        rotated = rotate_lights(rotation, lights.lights[:, None])[:, :, 0]
+        ambient = lights.lights[:, :1].expand(*shape[:1], -1, 1)
+        vectors = (rotation[..., :3, :3] @ lights.lights[:, 1:, None])[..., 0]
+        rotated = torch.cat([ambient, vectors], dim=-1)
     return PatchPriors(
         normals_patch=normalize(vector, dim=-1),
         normal_information=_scattered(information, scatter, count),

@@ -58,6 +58,11 @@ from pimper_torch.records import (
 )
 from pimper_torch.stage import Stage
 
+# Guessed normals suit the photographs better if residuals fall below this fraction: a choice. True
+# ones with smooth errors of 10 degrees lower them to 0.63 on a jar's first pass, and normals that
+# all face the camera to 0.98.
+_GUESS_GAIN = 0.95
+
 # Samples added to those of each view in the weight of its light's prior: a choice.
 BORROWED_SAMPLES = 16.0
 
@@ -165,12 +170,13 @@ class Illumination(Record):
     Attributes:
         field: Light of all views.
         caster: Of rays on the surface; ``None`` if cast shadows are not predicted.
-        guess_variance: Of what guessed normals differ from the surface's, beyond what both claim.
+        guess_variance: Of what guessed normals differ from the surface's beyond what both claim,
+            squared radians; 0 where they suit the photographs better.
     """
 
     field: LightField
     caster: RayCaster | None
-    guess_variance: float | Float[Tensor, ""] = 0.0
+    guess_variance: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -251,10 +257,16 @@ class Factorize(Stage):
                 :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
+        field, variance = self._field(seen, coarse), 0.0
         guesses = [bucket.priors for bucket in seen.buckets]
-        variance = _excess_variance(coarse, guesses)
-        pairs = zip(coarse, guesses, strict=True)
-        field = self._field(seen, [_beside_guesses(*pair, variance) for pair in pairs])
+        if any(each is not None and bool(each.normal_information.any()) for each in guesses):
+            led = [_beside_guesses(*pair) for pair in zip(coarse, guesses, strict=True)]
+            under = self._field(seen, led)
+            # The photographs decide whether the surface or the guess is nearer to the truth.
+            if _misfit(seen, under, led) < _GUESS_GAIN * _misfit(seen, field, coarse):
+                field = under
+            else:
+                variance = _excess_variance(coarse, guesses)
         caster: RayCaster | None = None
         if self.config.shadows and bool(field.point_light.any()):
             mesh = seen.patches.surface or seen.patches.coarse.mesh
@@ -399,7 +411,7 @@ class Factorize(Stage):
         refused: Bool[Tensor, " patch"],
         raster: int,
         guessed: PatchPriors | None,
-        variance: float | Float[Tensor, ""],
+        variance: float,
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
@@ -455,9 +467,25 @@ class Factorize(Stage):
         return SOLVERS[config.solver](problem.detach(), *limits)
 
 
+@torch.no_grad()
+def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ _ _ 3"]]) -> float:
+    """Return the median residual of normals under a light field, over what it predicts."""
+    found = []
+    for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
+        rows = rows_of(templates, registered, own)
+        centre = invert_rigid(templates.patch_from_world.to(own))[:, :3, 3]
+        lights = rotate_lights(templates.patch_from_world.to(own), field.lights_at(centre))
+        gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
+        predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
+        some = rows.seen & (predicted > 0)
+        found.append(((gray - predicted).abs() / predicted.clamp_min(1e-12))[some])
+    return float(torch.cat(found).median()) if sum(map(len, found)) else math.inf
+
+
+@torch.no_grad()
 def _excess_variance(
     normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
-) -> float | Float[Tensor, ""]:
+) -> float:
     """Return the variance of guessed normals about the surface's, beyond what both claim."""
     square, claimed = [], []
     for own, guess in zip(normals, guesses, strict=True):
@@ -465,30 +493,21 @@ def _excess_variance(
             some = guess.normal_information > 0
             square.append((guess.normals_patch - own)[some].square().sum(dim=-1))
             claimed.append(1 / guess.normal_information[some])
-    if sum(map(len, square)) == 0:
-        return 0.0
     # Half of the squares of two Gaussian components lie below 2 log 2 times their variance.
     found = torch.cat(square).median() / math.log(2)
-    return (found - torch.cat(claimed).median() - 1 / _SURFACE_INFORMATION).clamp_min(0)
-
-
-def _believed(
-    information: Float[Tensor, "*batch"], variance: float | Float[Tensor, ""]
-) -> Float[Tensor, "*batch"]:
-    """Lower information by a variance that is added."""
-    return information / (1 + information * variance)
+    claims = torch.cat(claimed).median() + 1 / _SURFACE_INFORMATION
+    return max(0.0, float(found - claims))
 
 
 def _beside_guesses(
-    normals: Float[Tensor, "patch height width 3"],
-    guessed: PatchPriors | None,
-    variance: float | Float[Tensor, ""],
+    normals: Float[Tensor, "patch height width 3"], guessed: PatchPriors | None
 ) -> Float[Tensor, "patch height width 3"]:
-    """Average the surface's normals with those that were guessed."""
+    """Average the surface's normals with those that were guessed, where there are any."""
     if guessed is None:
         return normals
-    information = _believed(guessed.normal_information, variance)[..., None]
-    return normalize(_SURFACE_INFORMATION * normals + information * guessed.normals_patch, dim=-1)
+    information = guessed.normal_information[..., None]
+    both = _SURFACE_INFORMATION * normals + information * guessed.normals_patch
+    return torch.where(information > 0, normalize(both, dim=-1), normals)
 
 
 def _samples(
@@ -497,7 +516,7 @@ def _samples(
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
     guessed: PatchPriors | None,
-    variance: float | Float[Tensor, ""],
+    variance: float,
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
     samples = PatchSamples(
@@ -509,11 +528,11 @@ def _samples(
     def row(raster: Float[Tensor, "patch height width"]) -> Float[Tensor, "patch sample"]:
         return raster.flatten(1).gather(1, rows.index)
 
-    normals = guessed.normals_patch.flatten(1, 2)
+    normals, information = guessed.normals_patch.flatten(1, 2), guessed.normal_information
     inlier = guessed.inlier
     return samples.replace(
         guessed_normals=normals.gather(1, rows.index[..., None].expand(-1, -1, 3)),
-        guessed_information=row(_believed(guessed.normal_information, variance)),
+        guessed_information=row(information / (1 + information * variance)),
         guessed_albedo=row(guessed.albedo),
         guessed_albedo_variance=row(guessed.albedo_variance),
         guessed_inlier=None if inlier is None else in_row(inlier, rows.index),

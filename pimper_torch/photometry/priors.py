@@ -142,6 +142,8 @@ class GuessedAlbedo(FactorPrior):
         if guess is None or variance is None:
             return Known()
         both = (guess > 0) & (samples.albedo > 0)
+        if not bool(both.any()):
+            return Known()
         ratio = torch.where(both, samples.albedo / torch.where(both, guess, 1), torch.nan)
         factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
         weight = torch.where(both, views_worth(1 / variance), 0)

@@ -12,10 +12,12 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     DepthPatches,
+    DepthPrior,
     Depths,
     FacetPoints,
     Heights,
     Mesh,
+    PatchPriors,
     Record,
     Silhouettes,
     SparseScene,
@@ -35,6 +37,8 @@ POWERS: Mapping[type[Record], Mapping[str, int]] = {
     Depths: {"depth": 1},
     DepthPatches: {"mismatch": 1},
     Heights: {"offset": 1, "information": -2},
+    PatchPriors: {"offset": 1, "offset_information": -2},
+    DepthPrior: {"depth": 1, "variance": 2},
     Surface: {"vertices_world": 1, "expected_error": 1, "height_information": -2},
 }
 """Which power of a length each field is; fields that are not named have no unit, or hold others."""

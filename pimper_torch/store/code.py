@@ -19,8 +19,8 @@ def code() -> str:
 
 
 def is_known(module: str) -> bool:
-    """Return whether :func:`code` covers a module."""
-    return module.startswith(f"{_PACKAGE.name}.")
+    """Return whether :func:`code` covers a module: one of this package, or of torch's layers."""
+    return module.startswith((f"{_PACKAGE.name}.", "torch.nn."))
 
 
 def _versions() -> str:

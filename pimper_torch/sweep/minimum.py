@@ -7,8 +7,13 @@ from torch import Tensor
 
 def parabola_minimum(
     cost: Float[Tensor, "*batch hypothesis"],
+    prior: Float[Tensor, "*batch hypothesis"] | None = None,
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
     """Fit a parabola to the least cost and the two beside it.
+
+    Args:
+        cost: Of each hypothesis.
+        prior: Added to the costs for the choice of the least one alone.
 
     Returns:
         The position of the minimum in steps from the first hypothesis, the parabola's second
@@ -22,7 +27,8 @@ def parabola_minimum(
     (tensor([2.]), tensor([2.]), tensor([True]))
     """
     last = cost.shape[-1] - 1
-    best = cost.detach().argmin(dim=-1, keepdim=True)
+    chosen_by = cost if prior is None else cost + prior
+    best = chosen_by.detach().argmin(dim=-1, keepdim=True)
     interior = (best > 0) & (best < last)
     centre = best.clamp(1, last - 1)
     before, here, after = (cost.gather(-1, centre + step)[..., 0] for step in (-1, 0, 1))

@@ -119,7 +119,8 @@ class Sweep(Stage):
     small window, which stops at cliffs and at the template's border, and the least cost is
     found to a fraction of a step. This is multi-view stereo under changing light. The inverse
     variance of a height follows from the costs of all heights: it is small with little texture,
-    or where several heights have low costs.
+    or where several heights have low costs. Depth that was guessed of the photographs chooses
+    between these, and views that likely show no diffuse reflection of a sample are left out.
 
     A height at the end of the range is none. Differentiable in photographs, cameras, templates,
     normals, lights and the patches' residuals, offsets through the parabola at the least cost;
@@ -216,6 +217,9 @@ class Sweep(Stage):
         templates, registered, photometry = bucket
         transferred = transferred_normals(coarse, templates)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
+        priors = registered.priors
+        if priors is not None and priors.inlier is not None:
+            registered = registered.replace(valid=registered.valid & (priors.inlier > 0.5))
         gray = sources.gray.finest
         fast = gray.dtype == torch.float32 and compiled_for(
             gray,
@@ -232,7 +236,7 @@ class Sweep(Stage):
         if fast:
             costs, swept = compiled_costs(
                 *given,
-                ladder=_STEP * torch.arange(-config.steps, config.steps + 1.0),
+                ladder=_STEP * self._ladder,
                 scale=self._scale(photometry),
                 num_views=config.num_views,
                 min_views=config.min_views,
@@ -248,7 +252,13 @@ class Sweep(Stage):
         costs = weight * window_mean(costs, window, _WINDOW)
         weighed = window > 0
         costs = costs.movedim(1, -1)[weighed]
-        position, curvature, found = parabola_minimum(costs)
+        guess: Float[Tensor, "sample hypothesis"] | None = None
+        if priors is not None:
+            # Where several heights agree, the guess chooses; photographs tell where it is.
+            off = _STEP * templates.spacing[:, None, None, None] * self._ladder.to(costs)
+            off = off - priors.offset[..., None]
+            guess = torch.log1p(0.5 * priors.offset_information[..., None] * off.square())[weighed]
+        position, curvature, found = parabola_minimum(costs, guess)
         variance = posterior_variance(costs, position, curvature)
         unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
         fraction = (1 / variance - 1 / unknown).clamp_min(0) / averaged
@@ -261,8 +271,13 @@ class Sweep(Stage):
             offset=none.index_put((weighed,), offset),
             information=none.index_put((weighed,), information),
             num_views=shown,
-            priors=registered.priors,
+            priors=priors,
         )
+
+    @property
+    def _ladder(self) -> Float[Tensor, " hypothesis"]:
+        """Heights that are tried, in steps."""
+        return torch.arange(-self.config.steps, self.config.steps + 1.0)
 
     def _scale(self, photometry: Photometry) -> Float[Tensor, " patch"]:
         """Return the residuals of each patch that count as large."""
@@ -278,11 +293,9 @@ class Sweep(Stage):
         sources: Sources,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
         """Return the cost of every height, and 1 where a sample is swept, else 0."""
-        config = self.config
         rows = self._rows(templates, registered, photometry, transferred, cameras)
         step = _STEP * templates.spacing
-        ladder = torch.arange(-config.steps, config.steps + 1, device=step.device).to(step)
-        moves = step[rows.patch, None] * ladder
+        moves = step[rows.patch, None] * self._ladder.to(step)
         radiance = self._look_up(rows, templates, moves, cameras, sources)
         scale = self._scale(photometry)
         cost = inconsistency(radiance, rows.shading, rows.seen, scale[rows.patch])

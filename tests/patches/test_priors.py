@@ -11,7 +11,7 @@ from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.patches.decompose import Decompose
 from pimper_torch.patches.warp import Warp
-from pimper_torch.records import DepthPrior, InlierPrior, NormalPrior
+from pimper_torch.records import DepthPrior, InlierPrior, LightPrior, NormalPrior
 from tests.patches.conftest import TILTED
 
 NORMAL = normalize(torch.tensor(TILTED.normal, dtype=torch.float64), dim=0)
@@ -187,3 +187,24 @@ def test_depth_in_no_unit_of_the_scene_is_refused(plane_scene, patches):
     loose = replace(depth_prior(plane_scene), gauge="affine")
     with pytest.raises(InputError, match="scene units"):
         guessed(plane_scene, patches, loose)
+
+
+@pytest.mark.parametrize("frame", ["camera", "world"])
+def test_lights_shade_the_same_in_the_patch_frame(plane_scene, patches, frame):
+    views, cameras = plane_scene.views, plane_scene.cameras
+    lights = torch.randn(5, 4, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    own = lights
+    if frame == "camera":
+        rotated = (cameras.cam_from_world[:, :3, :3] @ lights[:, 1:, None])[..., 0]
+        own = torch.cat([lights[:, :1], rotated], dim=1)
+    given = LightPrior(
+        lights=own[1:], variance=torch.ones(4).double(), names=views.names[1:], frame=frame
+    )
+    _, found = guessed(plane_scene, patches, given)
+    for templates, each in zip(patches.buckets, found, strict=True):
+        normal = rotate(templates.patch_from_world, NORMAL.expand(len(templates.facet), 1, 3))
+        shading = each.lights_patch[..., 0] + (each.lights_patch[..., 1:] * normal).sum(dim=-1)
+        expected = lights[:, 0] + lights[:, 1:] @ NORMAL
+        assert_close(shading[:, 1:], expected[1:].expand(len(shading), 4))
+        assert bool(each.light_variance[:, 0].isinf().all())
+        assert not each.normal_information.any()

@@ -13,16 +13,22 @@ import pimper_torch as pt
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import (
+    AlbedoPrior,
     Cameras,
     CoarseMesh,
     Convergence,
     Depths,
     FacetPoints,
     Heights,
+    InlierPrior,
+    LightPrior,
     Mesh,
+    NormalPrior,
+    PatchPriors,
     Photometry,
     Reconstruction,
     Record,
+    SilhouettePrior,
     Silhouettes,
     SparseScene,
     Surface,
@@ -40,6 +46,15 @@ WITHOUT = {
     Mesh: {"normals_world", "albedo", "confidence"},
     Templates: {"barycentric", "normals_patch"},
     Photometry: {"normals_patch", "albedo", "lights_patch", "information"},
+    PatchPriors: {
+        *("normals_patch", "normal_information", "albedo", "albedo_variance"),
+        *("inlier", "lights_patch", "light_variance"),
+    },
+    NormalPrior: {"normals", "variance"},
+    AlbedoPrior: {"albedo", "variance"},
+    InlierPrior: {"probability"},
+    SilhouettePrior: {"inside"},
+    LightPrior: {"lights", "variance"},
     Surface: {"barycentric", "normals_world", "albedo", "information"},
     Convergence: {"residual"},
 }

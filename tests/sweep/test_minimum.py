@@ -27,6 +27,14 @@ def test_a_cost_that_falls_to_the_end_of_the_range_has_no_minimum(place):
     assert float(curvature) == 0
 
 
+def test_a_prior_chooses_between_minima_and_moves_none():
+    steps = torch.arange(9, dtype=torch.float64)
+    two = torch.minimum((steps - 2.2).square(), (steps - 6.1).square() + 0.05)[None]
+    assert_close(parabola_minimum(two)[0], torch.tensor([2.2]).double())
+    told = parabola_minimum(two, 0.3 * (steps - 7.0).abs()[None])[0]
+    assert_close(told, torch.tensor([6.1]).double())
+
+
 def test_flat_costs_have_no_minimum():
     _, curvature, interior = parabola_minimum(torch.zeros(1, 5, 2, 3))
     assert not interior.any()

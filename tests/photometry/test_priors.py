@@ -1,0 +1,161 @@
+import math
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError
+from pimper_torch.evidence.metrics.derivatives import check_derivatives
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.priors import (
+    FactorPrior,
+    FieldLights,
+    GuessedAlbedo,
+    GuessedInliers,
+    GuessedLights,
+    GuessedNormals,
+    Known,
+    SurfaceNormals,
+    views_worth,
+)
+from pimper_torch.records import PatchPriors
+from tests.photometry.test_factorize import median_error
+
+
+def carried(seen, **changes):
+    """Views that carry priors, which say nothing but for what is given for every bucket."""
+    buckets = []
+    for index, bucket in enumerate(seen.buckets):
+        blank = torch.zeros_like(bucket.radiance[:, 0, 0])
+        priors = PatchPriors(
+            normals_patch=torch.stack([blank, blank, blank - 1], dim=-1),
+            normal_information=blank,
+            offset=blank,
+            offset_information=blank,
+            albedo=blank,
+            albedo_variance=torch.full_like(blank, math.inf),
+        )
+        own = {name: values[index] for name, values in changes.items()}
+        buckets.append(bucket.replace(priors=priors.replace(**own)))
+    return seen.replace(buckets=tuple(buckets))
+
+
+def test_the_default_list_is_what_the_settings_weigh(scene):
+    seen = scene(bumps=0.2).seen
+    found = Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2))(seen)
+    listed = Factorize(priors=[FieldLights(0.5), SurfaceNormals(0.2)])(seen)
+    unknowing = Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2))(carried(seen))
+    for one, *others in zip(found.buckets, listed.buckets, unknowing.buckets, strict=True):
+        for other in others:
+            assert torch.equal(one.normals_patch, other.normals_patch)
+            assert torch.equal(one.lights_patch, other.lights_patch)
+    free = Factorize(FactorizeConfig(light_prior=0.0, geometry_weight=0.2))(seen)
+    without = Factorize(priors=[SurfaceNormals(0.2)])(seen)
+    for one, other in zip(free.buckets, without.buckets, strict=True):
+        assert torch.equal(one.lights_patch, other.lights_patch)
+    with pytest.raises(ConfigError, match="derived from FactorPrior"):
+        Factorize(priors=[nn.Identity()])
+
+
+def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
+    true = scene(bumps=0.3)
+    information = [torch.full_like(each[..., 0], math.radians(2) ** -2) for each in true.normals]
+    seen = carried(true.seen, normals_patch=true.normals, normal_information=information)
+    plain, led = Factorize()(true.seen), Factorize()(seen)
+    assert median_error(led, true) < 0.8 * median_error(plain, true)
+
+
+def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
+    true = scene(bumps=0.2)
+    priors = [FieldLights(), SurfaceNormals(0.0), GuessedAlbedo()]
+    found = []
+    for unit in (1.0, 7.0):
+        albedo = [unit * each.mean(dim=-1) for each in true.albedo]
+        variance = [torch.full_like(each, 1e-4) for each in albedo]
+        seen = carried(true.seen, albedo=albedo, albedo_variance=variance)
+        found.append(Factorize(priors=priors)(seen))
+    for one, other, views in zip(*(each.buckets for each in found), true.seen.buckets, strict=True):
+        assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-3)
+        assert one.lights_patch.shape[1] == views.valid.shape[1]
+    plain = Factorize(priors=priors)(true.seen)
+    assert median_error(found[0], true) < median_error(plain, true)
+
+
+def test_guessed_inliers_leave_out_what_does_not_fit(scene):
+    true = scene(bumps=0.2)
+    spoilt, inlier = [], []
+    for bucket in true.seen.buckets:
+        wrong = torch.zeros_like(bucket.valid)
+        wrong[:, :3, ::2] = True
+        spoilt.append(bucket.replace(radiance=torch.where(wrong[:, :, None], 0.9, bucket.radiance)))
+        inlier.append((~wrong).to(bucket.radiance))
+    seen = true.seen.replace(buckets=tuple(spoilt))
+    squares = FactorizeConfig(loss="squares")
+    blind = median_error(Factorize(squares)(seen), true)
+    knowing = median_error(Factorize(squares)(carried(seen, inlier=inlier)), true)
+    assert knowing < 0.7 * blind
+    deaf = Factorize(squares, [FieldLights(), SurfaceNormals()])(carried(seen, inlier=inlier))
+    assert float(median_error(deaf, true)) > 0.9 * float(blind)
+
+
+def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
+    true = scene(bumps=0.2)
+    plain = Factorize(priors=[FieldLights(1e6)])(true.seen)
+    lights = [3.0 * bucket.lights_patch for bucket in plain.buckets]
+    wrong = [each + each.norm(dim=2, keepdim=True) * 0.3 for each in lights]
+    for variance, pulled in ((1e-6, True), (1e6, False)):
+        variances = [torch.full_like(each[..., 0], variance) for each in lights]
+        seen = carried(true.seen, lights_patch=wrong, light_variance=variances)
+        found = Factorize(priors=[FieldLights(1.0), GuessedLights()])(seen)
+        for one, given in zip(found.buckets, wrong, strict=True):
+            cosine = torch.cosine_similarity(one.lights_patch, given, dim=2)
+            assert bool((cosine > 0.9999).all()) == pulled
+
+
+class Leaning(FactorPrior):
+    """Normals of the surface, leaning by parameters."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lean = nn.Parameter(torch.tensor([0.02, -0.03, 0.0], dtype=torch.float64))
+        self.trust = nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
+
+    def forward(self, samples):
+        normals = normalize(samples.normals + self.lean, dim=-1)
+        weight = self.trust * torch.ones_like(samples.albedo)
+        inlier = torch.sigmoid(2 + self.trust * samples.radiance)
+        return Known(normals=normals, normal_weight=weight, inlier=inlier)
+
+
+def test_gradients_reach_a_prior_from_elsewhere(scene):
+    seen = scene(bumps=0.1).seen
+    part = seen.replace(
+        patches=seen.patches.replace(buckets=seen.patches.buckets[:1]), buckets=seen.buckets[:1]
+    )
+
+    def factorized(inputs):
+        prior = Leaning()
+        stage = Factorize(priors=[FieldLights(), prior])
+        found = torch.func.functional_call(
+            stage, {"priors.1.lean": inputs["lean"], "priors.1.trust": inputs["trust"]}, (part,)
+        )
+        return {"normals": found.buckets[0].normals_patch, "lights": found.buckets[0].lights_patch}
+
+    prior = Leaning()
+    checks = check_derivatives(
+        factorized,
+        {"lean": prior.lean.detach(), "trust": prior.trust.detach()[None][0]},
+        torch.Generator().manual_seed(3),
+        steps=(1e-4, 1e-5),
+    )
+    for one in checks.values():
+        assert abs(one.ratio - 1) < 1e-3
+
+
+def test_variances_are_worth_views():
+    information = torch.tensor([math.radians(5.44) ** -2, 0.0, 1e9])
+    assert_close(views_worth(information), torch.tensor([0.1, 0.0, 1.0]), rtol=0.01, atol=0)
+    assert isinstance(GuessedNormals(), FactorPrior)
+    assert isinstance(GuessedInliers(), FactorPrior)
