@@ -49,6 +49,7 @@ ROOMS = [
     "meshing",
     "size",
     "reporting",
+    "priors",
     "chains",
     "viz",
     "asset",
