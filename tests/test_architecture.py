@@ -58,6 +58,7 @@ ROOMS = [
     "outputs",
     "io",
     "exchange",
+    "prior_files",
     "viewer",
     "doctor",
     "video",
