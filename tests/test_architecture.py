@@ -82,6 +82,7 @@ SOLE_IMPORTERS = {
     "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
+    "onnxruntime": {"priors/network.py"},
 }
 
 # Where a distribution's module has another name.

@@ -228,6 +228,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/result.md", 0): a_result,
     ("docs/conventions.md", 0): nothing,
     ("docs/priors.md", 0): photographs_and_maps,
+    ("docs/priors.md", 1): photographs_and_maps,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): a_scene_and_a_mesh,
     ("docs/extending.md", 2): a_data_set_of_ones_own,

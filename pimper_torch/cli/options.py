@@ -22,8 +22,7 @@ from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
-from pimper_torch.prior_files.read_depth import DEPTH_ERROR
-from pimper_torch.prior_files.read_normals import NORMALS_ERROR_DEG, NormalAxes
+from pimper_torch.priors.from_maps import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.size.given import Unit, measured_in, number_of
 from pimper_torch.viewer.server import require_viser
 

@@ -4,7 +4,6 @@ import difflib
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 from pimper_torch.file_names import match_files
 from pimper_torch.prior_files.layers import FORMATS, VARIANCE, read_layers
+from pimper_torch.priors.from_maps import Maps, stacked
 from pimper_torch.records import Views
 
 # What estimators add to the name of a photograph.
@@ -23,22 +23,6 @@ _OF_VARIANCE = re.compile(rf"[ _.-]{VARIANCE}$", re.IGNORECASE)
 # Networks round sides to multiples of up to 32 pixels: of the shortest usual side, 518, a
 # sixteenth, up or down, of which half is off on either side.
 _OTHER_SHAPE = 0.07
-
-
-class Maps(NamedTuple):
-    """What a folder holds of photographs.
-
-    Attributes:
-        names: Of the photographs.
-        sizes_px: Width and height of each map, ``map 2``.
-        values: ``map height width channel``, padded with NaN.
-        variance: ``map height width``; NaN where the files say nothing of it.
-    """
-
-    names: tuple[str, ...]
-    sizes_px: Tensor
-    values: Tensor
-    variance: Tensor
 
 
 def read_maps(
@@ -57,37 +41,23 @@ def read_maps(
         InputError: There are none, names do not match, or a map has another shape than its
             photograph.
     """
-    paths = _matched(Path(folder), views.names)
-    found, names = [], []
-    for (name, path), (width, height) in zip(paths.items(), _sizes(views, paths), strict=True):
+    found: dict[str, tuple[Tensor, Tensor | None]] = {}
+    sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
+    for name, path in _matched(Path(folder), views.names).items():
         values, variance = read_layers(path, kinds)
         beside = [one for one in path.parent.iterdir() if _is_variance_of(one, path)]
         if beside:
             variance = read_layers(beside[0], (VARIANCE,))[0][..., 0]
         values = check(path, values)
-        _require_shape(path, values, name, width, height)
+        _require_shape(path, values, name, *sizes[name])
         if variance is not None and variance.shape != values.shape[:2]:
             raise InputError(
                 f"{path}: its variance is {variance.shape[1]} x {variance.shape[0]}; needed: "
                 f"{values.shape[1]} x {values.shape[0]}, as the map."
             )
-        found.append((values, variance))
-        names.append(name)
-    sizes = torch.tensor([values.shape[1::-1] for values, _ in found])
-    wide, high = sizes.amax(dim=0).tolist()
-    every = torch.full((len(found), high, wide, found[0][0].shape[2]), torch.nan)
-    spread = torch.full(every.shape[:3], torch.nan)
-    for index, (values, variance) in enumerate(found):
-        height, width = values.shape[:2]
-        every[index, :height, :width] = torch.from_numpy(values)
-        if variance is not None:
-            spread[index, :height, :width] = torch.from_numpy(variance)
-    return Maps(tuple(names), sizes, every, spread)
-
-
-def _sizes(views: Views, paths: dict[str, Path]) -> list[list[int]]:
-    number = {name: index for index, name in enumerate(views.names)}
-    return [views.sizes_px[number[name]].tolist() for name in paths]
+        spread = None if variance is None else torch.from_numpy(variance)
+        found[name] = torch.from_numpy(values), spread
+    return stacked(found)
 
 
 def _is_variance_of(path: Path, of: Path) -> bool:

@@ -4,17 +4,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 
-from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.prior_files.folder import read_maps
+from pimper_torch.priors.from_maps import DEPTH_ERROR, depth_from
 from pimper_torch.records import DepthPrior, Views
-
-# Root mean square that published estimators are off indoors, relative to depth: Marigold (CVPR
-# 2024) has a mean of 5.5 % on NYUv2 once factor and offset are fitted, and large errors are many.
-DEPTH_ERROR = 0.08
-_RANGE = (0.02, 0.98)  # of the values of a map: its ends may be strays
 
 
 def read_depth(
@@ -46,30 +40,8 @@ def read_depth(
     Raises:
         InputError: A file or its name, shape or values cannot be used: says which.
     """
-    require(error > 0, "error", error, "above 0")
     maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), _single)
-    values = maps.values[..., 0]
-    known = values.isfinite() & (values != 0)
-    values = torch.where(known, values, 0)
-    deviation = error * values.abs()
-    if inverse is None or gauge == "affine":
-        ranges = [
-            np.diff(np.quantile(one[mask].numpy(), _RANGE)) if bool(mask.any()) else np.zeros(1)
-            for one, mask in zip(values, known, strict=True)
-        ]
-        spans = torch.from_numpy(np.stack(ranges)).to(values)
-        deviation = (error * spans[..., None]).expand_as(values)
-    variance = torch.where(maps.variance.isfinite(), maps.variance, deviation.square())
-    return DepthPrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        undistorted=undistorted,
-        depth=values,
-        variance=torch.where(known & (variance > 0), variance, torch.inf),
-        along=along,
-        inverse=inverse,
-        gauge=gauge,
-    )
+    return depth_from(maps, inverse, along=along, gauge=gauge, error=error, undistorted=undistorted)
 
 
 def _single(path: Path, values: np.ndarray) -> np.ndarray:

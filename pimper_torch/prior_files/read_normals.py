@@ -1,25 +1,13 @@
 """Normals of an estimator."""
 
-import math
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-import torch
-from torch.nn.functional import normalize
 
-from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.prior_files.folder import read_maps
+from pimper_torch.priors.from_maps import NORMALS_ERROR_DEG, NormalAxes, normals_from
 from pimper_torch.records import NormalPrior, Views
-
-NormalAxes = Literal["auto", "opencv", "opengl", "lub", "dsine", "world"]
-# Root mean square that published estimators are off indoors: DSINE (CVPR 2024) has a mean of 16
-# degrees on NYUv2, and large errors are many.
-NORMALS_ERROR_DEG = 25.0
-# Lengths of vectors that are normals, blended where maps were resized. Grey, and the colour 0 that
-# marks nothing, are none.
-_SHORTEST, _LONGEST = 0.5, 1.5
 
 
 def read_normals(
@@ -47,33 +35,8 @@ def read_normals(
     Raises:
         InputError: A file or its name, shape or values cannot be used: says which.
     """
-    require(0 < error_deg <= 180, "error_deg", error_deg, "above 0, at most 180 degrees")
     maps = read_maps(folder, views, ("normal",), _vectors)
-    values = maps.values
-    coded = ~((values < 0).flatten(1).any(dim=1))
-    values = torch.where(coded[:, None, None, None], 2 * values - 1, values)
-    length = values.norm(dim=-1)
-    known = (length > _SHORTEST) & (length < _LONGEST)
-    variance = torch.where(maps.variance.isfinite(), maps.variance, math.radians(error_deg) ** 2)
-    return NormalPrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        undistorted=undistorted,
-        normals=torch.where(known[..., None], normalize(values, dim=-1), 0),
-        variance=torch.where(known & (variance > 0), variance, torch.inf),
-        frame="world" if axes == "world" else "camera",
-        axes=_AXES[axes],
-    )
-
-
-_AXES: dict[NormalAxes, Literal["opencv", "opengl", "lub"] | None] = {
-    "auto": None,
-    "opencv": "opencv",
-    "opengl": "opengl",
-    "lub": "lub",
-    "dsine": "lub",
-    "world": "opencv",
-}
+    return normals_from(maps, axes, error_deg=error_deg, undistorted=undistorted)
 
 
 def _vectors(path: Path, values: np.ndarray) -> np.ndarray:

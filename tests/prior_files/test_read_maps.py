@@ -12,7 +12,8 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.exchange.openexr import read_exr, write_exr
 from pimper_torch.io.decode import write_deep_png
 from pimper_torch.prior_files.read_depth import read_depth
-from pimper_torch.prior_files.read_normals import NORMALS_ERROR_DEG, read_normals
+from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.priors.from_maps import NORMALS_ERROR_DEG
 from pimper_torch.records import Views
 
 
@@ -280,5 +281,6 @@ def test_standard_errors_are_above_zero(views, normals, tmp_path):
     save(tmp_path / "a b.npy", normals)
     with pytest.raises(ConfigError, match="error_deg is 0"):
         read_normals(tmp_path, views, error_deg=0)
+    np.save(tmp_path / "a b.npy", normals[..., 0], allow_pickle=False)
     with pytest.raises(ConfigError, match="error is -1"):
         read_depth(tmp_path, views, error=-1)
