@@ -4,8 +4,7 @@ A reading says how values ``d`` of a map belong to depth ``t`` of the points tha
 observes: ``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
 """
 
-from itertools import product
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -17,12 +16,23 @@ from pimper_torch.priors.at_points import at_points, means_by
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.sfm.squares import ERRORS, standard_errors
 
+Along = Literal["axis", "ray"]
 Gauge = Literal["scene", "scale", "affine"]
-_READINGS = tuple(product((False, True), ("axis", "ray")))
-_GAUGES: tuple[Gauge, ...] = ("scene", "scale", "affine")
+_READINGS: dict[tuple[bool, Along], str] = {
+    (False, "axis"): "depth along the camera's axis",
+    (False, "ray"): "depth along the ray",
+    (True, "axis"): "one over depth (disparity) along the camera's axis",
+    (True, "ray"): "one over depth (disparity) along the ray",
+}
+_GAUGES: dict[Gauge, str] = {
+    "scene": "in the scene's unit",
+    "scale": "up to a factor a map",
+    "affine": "up to a factor and an offset a map",
+}
 # Choices: points of a map that a line is fitted to at least; steps of reweighting; by how much the
-# median error must grow for a simpler gauge, or a stated one, to be wrong.
-_FEWEST, _STEPS, _WORSE = 8, 20, 2.0
+# median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
+# are too coarse for.
+_FEWEST, _STEPS, _WORSE, _FLAT = 8, 20, 2.0, 0.03
 
 
 def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
@@ -36,84 +46,61 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
 
     Raises:
         InputError: Another reading than the stated one fits far better, none is better than no
-            depth at all, or there are too few points.
+            depth at all, or nothing tells.
     """
     where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     errors, point = _errors(prior.detach(), scene)
-    enough = errors.shape[-1] >= _FEWEST
-    if prior.inverse is not None and not enough:
-        return prior
-    if not enough:
-        raise InputError(
-            f"{where}: too few points of the cloud are seen where it is known; needed: {_FEWEST}. "
-            "State whether it is one over depth (`inverse`), and its gauge."
-        )
-    size = errors[:, -1].median(dim=-1).values.min()
+    ways, gauges = tuple(_READINGS), tuple(_GAUGES)
+    told = errors.shape[-1] >= _FEWEST
+    medians = errors.median(dim=-1).values if told else errors.new_zeros(len(ways) + 1, 1)
+    size = medians[:, -1].min()
     worth = means_by(size / (size + errors), point)
-    affine = worth[:-1, -1]
-    best = int(affine.mean(dim=-1).argmax())
+    best = int(medians[:-1, -1].argmin())
 
     def far_better(one: Tensor, other: Tensor) -> bool:
         return standard_errors(one - other) > ERRORS
 
-    if not far_better(affine[best], worth[-1, -1]):
+    def at(reading: int, gauge: int = -1) -> str:
+        return f"{float(medians[reading, gauge]):.1%}"
+
+    if not told or not far_better(worth[best, -1], worth[-1, -1]):
+        if medians[-1, -1] > _FLAT:
+            raise InputError(
+                f"{where} fits the cloud no better than a plane across the view, as depth or as "
+                "one over depth. Photographs and maps may be mixed up, or maps be of another size."
+            )
+        if prior.inverse is not None:
+            return prior
         raise InputError(
-            f"{where} fits the cloud no better than a plane across the view, as depth or as "
-            "one over depth. Photographs and maps may be mixed up, or maps be of another size."
+            f"{where}: too few points of the cloud tell what it is. State whether it is one over "
+            "depth (`inverse`), and its `gauge`."
         )
     if prior.inverse is not None:
-        stated = _READINGS.index((prior.inverse, prior.along))
-        gauge = _GAUGES.index(prior.gauge)
-        medians = errors[stated].median(dim=-1).values
-        if best != stated and far_better(affine[best], affine[stated]):
+        stated, gauge = ways.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
+        if far_better(worth[best, -1], worth[stated, -1]):
             raise InputError(
-                f"{where} is {_meaning(best)}, given as {_meaning(stated)}: the cloud shows it "
-                f"(median error {_percent(errors[best, -1])} against "
-                f"{_percent(errors[stated, -1])}). State it, or leave it open."
+                f"{where} is {_READINGS[ways[best]]}, given as {_READINGS[ways[stated]]}: the "
+                f"cloud shows it (median error {at(best)} against {at(stated)}). State what it is."
             )
-        if medians[gauge] > _WORSE * medians[-1] and far_better(
-            worth[stated, -1], worth[stated, gauge]
-        ):
+        worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
+        if worse and far_better(worth[stated, -1], worth[stated, gauge]):
             raise InputError(
-                f"{where} is no depth {_up_to(prior.gauge)}: its median error at the cloud is "
-                f"{_percent(errors[stated, gauge])}, and {_percent(errors[stated, -1])} up to a "
-                "factor and an offset a map (`gauge` affine)."
+                f"{where} is no depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
+                f"{at(stated, gauge)}, and {at(stated)} {_GAUGES['affine']} (`gauge` affine)."
             )
         return prior
-    inverse, along = _READINGS[best]
-    plain = _READINGS.index((inverse, "axis"))
-    if not far_better(affine[best], affine[plain]):
-        best, along = plain, "axis"
-    fits = [not far_better(worth[best, -1], one) for one in worth[best]]
-    gauge_found = _GAUGES[fits.index(True)]
+    plain = ways.index((ways[best][0], "axis"))
+    if not far_better(worth[best, -1], worth[plain, -1]):
+        best = plain
+    gauge = [far_better(worth[best, -1], one) for one in worth[best]].index(False)
+    (inverse, along), found = ways[best], gauges[gauge]
     caution(
-        f"{where} is taken to be {_meaning(best)} {_up_to(gauge_found)}, as the cloud shows: its "
-        f"median error at {errors.shape[-1]} observations is "
-        f"{_percent(errors[best, _GAUGES.index(gauge_found)])}. `inverse`, `along` and `gauge` "
-        "state it.",
+        f"{where} is taken to be {_READINGS[ways[best]]} {_GAUGES[found]}, as the cloud shows: its "
+        f"median error at {errors.shape[-1]} observations is {at(best, gauge)}. `inverse`, `along` "
+        "and `gauge` state it.",
         stacklevel=4,
     )
-    return prior.replace(
-        inverse=inverse, along=cast(Literal["axis", "ray"], along), gauge=gauge_found
-    )
-
-
-def _meaning(reading: int) -> str:
-    inverse, along = _READINGS[reading]
-    way = "along the camera's axis" if along == "axis" else "along the ray"
-    return f"one over depth (disparity) {way}" if inverse else f"depth {way}"
-
-
-def _up_to(gauge: Gauge) -> str:
-    return {
-        "scene": "in the scene's unit",
-        "scale": "up to a factor a map",
-        "affine": "up to a factor and an offset a map",
-    }[gauge]
-
-
-def _percent(errors: Tensor) -> str:
-    return f"{float(errors.median()):.1%}"
+    return prior.replace(inverse=inverse, along=along, gauge=found)
 
 
 @torch.no_grad()
@@ -123,18 +110,17 @@ def _errors(
     """Return relative errors of all readings, and last of none, and each observation's point."""
     seen = at_points(prior, prior.variance.isfinite(), scene)
     count = torch.bincount(seen.place[:, 0], minlength=len(prior.names))
-    kept = count[seen.place[:, 0]] >= _FEWEST
-    seen = seen.take(kept)
-    rays = torch.linalg.solve(
-        scene.cameras.intrinsics[seen.view], homogeneous(seen.pixels)[..., None]
-    )[..., 0]
-    lengths = rays.norm(dim=-1).double()
-    values = prior.depth[seen.place.unbind(dim=-1)].double()
-    found = []
-    for inverse, along in _READINGS:
-        depth = seen.depth.double() * (lengths if along == "ray" else 1)
-        found.append(_of_gauges(values, 1 / depth if inverse else depth, seen.place[:, 0]))
-    found.append(_of_gauges(torch.zeros_like(values), seen.depth.double(), seen.place[:, 0]))
+    seen = seen.take(count[seen.place[:, 0]] >= _FEWEST)
+    K, ends = scene.cameras.intrinsics[seen.view], homogeneous(seen.pixels)[..., None]
+    lengths = torch.linalg.solve(K, ends).norm(dim=1)[:, 0].double()
+    values, axis = prior.depth[seen.place.unbind(dim=-1)].double(), seen.depth.double()
+    depths = [axis * lengths if along == "ray" else axis for _, along in _READINGS]
+    truths = [
+        1 / depth if inverse else depth
+        for depth, (inverse, _) in zip(depths, _READINGS, strict=True)
+    ]
+    pairs = [*((values, truth) for truth in truths), (torch.zeros_like(values), axis)]
+    found = [_of_gauges(*pair, seen.place[:, 0]) for pair in pairs]
     return torch.stack(found), seen.point
 
 

@@ -22,7 +22,12 @@ from pimper_torch.sfm.squares import ERRORS, standard_errors
 
 _WORLD = "world"
 _NAMED: dict[str, tuple[int, int, int]] = {axes: signs for axes, (signs, _) in AXES.items()}
-_CALLED = {"opencv": "OpenCV", "opengl": "OpenGL", "lub": "DSINE (left, up, back)"}
+_CALLED = {
+    "opencv": "camera normals in axes of OpenCV",
+    "opengl": "camera normals in axes of OpenGL",
+    "lub": "camera normals in axes of DSINE (left, up, back)",
+    _WORLD: "world normals",
+}
 _OTHERS = [signs for signs in product((1, -1), repeat=3) if signs not in _NAMED.values()]
 # What normals may mean: in named axes of the camera, in the world, in axes that have no name.
 READINGS: tuple[str, ...] = (*_NAMED, _WORLD, *(str(signs) for signs in _OTHERS))
@@ -34,6 +39,7 @@ _POINTS, _NEIGHBOURS, _RIM, _WINDOW = 600, 8, 64, 9
 # of 160x120) have 0.66 to 0.83, with 30 degrees of noise 0.31 to 0.70; world normals of another
 # world 0.10 at most.
 _LEAST = 0.2
+_AGREEING = 0.9  # length of the mean of a point's normals: they are within 25 degrees of it
 
 
 def settled_normals(
@@ -48,71 +54,57 @@ def settled_normals(
         silhouettes: Where they are known; without, the cloud alone tells.
 
     Raises:
-        InputError: Other axes than the stated ones fit far better, none fit, or nothing tells
-            which do.
+        InputError: Other axes than the stated ones fit far better, or nothing tells which do.
     """
     stated = _WORLD if prior.axes and prior.frame == _WORLD else prior.axes
     where = f"The normals of {len(prior.names)} photographs ({some(prior.names, most=1)})"
-    worth, agreement = _worth(prior.detach(), scene, silhouettes)
-    best = _fitting(worth, stated, where, agreement)
-    if stated is None:
-        means = worth.mean(dim=1)[: len(_NAMED) + 1].sort().values
-        caution(
-            f"{where} are taken to be {_meaning(best)}: they fit cloud, outlines and cameras to "
-            f"{float(means[-1]):.2f} of 1, next best readings to {float(means[-2]):.2f}. If that "
-            "is wrong, state `axes`.",
-            stacklevel=4,
-        )
-    if best == _WORLD:
-        return prior.replace(frame="world", axes="opencv")
-    signs = prior.normals.new_tensor(_NAMED[best])
-    return prior.replace(normals=prior.normals * signs, frame="camera", axes="opencv")
-
-
-def _fitting(worth: Tensor, stated: str | None, where: str, agreement: str) -> str:
-    """Return the reading to take."""
-    means = worth.mean(dim=1)
+    worth, of_other_world = _worth(prior.detach(), scene, silhouettes)
+    means = worth.mean(dim=1) if worth.shape[1] else worth.new_zeros(len(READINGS))
+    best = int(means.argmax())
 
     def far_better(one: int, other: int) -> bool:
         return standard_errors(worth[one] - worth[other]) > ERRORS
 
-    best = int(means.argmax()) if worth.shape[1] else 0
-    index = None if stated is None else READINGS.index(stated)
-    if index is not None and not far_better(best, index):
-        if standard_errors(_LEAST - worth[index]) > ERRORS:
-            raise InputError(f"{where} fit the scene in no axes{agreement}")
-        return READINGS[index]
-    ways = len(_NAMED) + 1
-    if worth.shape[1] and float(means[best]) < _LEAST:
-        raise InputError(f"{where} fit the scene in no axes{agreement}")
-    if index is not None:
-        raise InputError(
-            f"{where} are {_meaning(READINGS[best])}, given as {_meaning(READINGS[index])}: they "
-            f"fit cloud, outlines and cameras to {float(means[best]):.2f} of 1 so, and to "
-            f"{float(means[index]):.2f} as they are given. State `axes`, or leave it to `auto`."
+    def refused(found: str, needed: str) -> InputError:
+        return InputError(f"{where} {found}. Cloud, outlines and cameras show it. {needed}")
+
+    if of_other_world and means[best] < _LEAST:
+        found = "fit in no axes, yet agree between views as they stand: they are world normals of "
+        needed = "Give camera normals, or the cameras of that world with `--sparse`."
+        raise refused(f"{found}another world", needed)
+    index = READINGS.index(stated) if stated else int(means[: len(_NAMED) + 1].argmax())
+    if far_better(best, index):
+        given = f"given as {_meaning(index)}" if stated else "as no known estimator has them"
+        raise refused(f"are {_meaning(best)}, {given}", "State `axes`, or turn them.")
+    doubt = float(means[index]) < _LEAST
+    if stated is None:
+        others = [one for one in range(len(_NAMED) + 1) if one != index]
+        unsure = [_meaning(one) for one in others if not far_better(index, one)]
+        if unsure or doubt:
+            what = f"are {_meaning(index)} or {unsure[0]}" if unsure else "fit in any axes"
+            raise InputError(f"{where}: nothing tells whether they {what}. State `axes`.")
+        fit, next_best = float(means[index]), float(means[others].max())
+        caution(
+            f"{where} are taken to be {_meaning(index)}: they fit cloud, outlines and cameras to "
+            f"{fit:.2f} of 1, other readings to {next_best:.2f}. If that is wrong, state `axes`.",
+            stacklevel=4,
         )
-    named = int(means[:ways].argmax()) if worth.shape[1] else 0
-    if best >= ways and far_better(best, named):
-        raise InputError(
-            f"{where} are {_meaning(READINGS[best])}, as no known estimator has them: cloud, "
-            "outlines and cameras show it. Turn them to axes of OpenCV or OpenGL."
+    elif worth.shape[1] and doubt:
+        caution(
+            f"{where} hardly fit cloud, outlines and cameras, to {float(means[index]):.2f} of 1. "
+            "Photographs and maps may be mixed up.",
+            stacklevel=4,
         )
-    rivals = [other for other in range(ways) if other != named and not far_better(named, other)]
-    if rivals:
-        raise InputError(
-            f"{where}: nothing tells whether they are {_meaning(READINGS[named])} or "
-            f"{_meaning(READINGS[rivals[0]])}; needed: more points of the cloud, or silhouettes. "
-            "State `axes`."
-        )
-    return READINGS[named]
+    if READINGS[index] == _WORLD:
+        return prior.replace(frame="world", axes="opencv")
+    signs = prior.normals.new_tensor(_NAMED[READINGS[index]])
+    return prior.replace(normals=prior.normals * signs, frame="camera", axes="opencv")
 
 
-def _meaning(reading: str) -> str:
-    if reading == _WORLD:
-        return "world normals"
-    if reading in _NAMED:
-        return f"camera normals in axes of {_CALLED[reading]}"
-    signs = zip(_OTHERS[READINGS.index(reading) - len(_NAMED) - 1], "xyz", strict=True)
+def _meaning(index: int) -> str:
+    if READINGS[index] in _CALLED:
+        return _CALLED[READINGS[index]]
+    signs = zip(_OTHERS[index - len(_CALLED)], "xyz", strict=True)
     turned = " and ".join(axis for sign, axis in signs if sign < 0)
     return f"camera normals in axes of OpenCV but for {turned}, turned round"
 
@@ -133,33 +125,25 @@ def _read(
 @torch.no_grad()
 def _worth(
     prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None
-) -> tuple[Float[Tensor, "reading sample"], str]:
-    """Return what readings are worth at points and outlines, and a remark where none should fit."""
+) -> tuple[Float[Tensor, "reading sample"], bool]:
+    """Return what readings are worth at points and outlines.
+
+    And whether normals agree between views as they stand, and better than most readings do.
+    """
     known, points = prior.variance.isfinite(), scene.points_world
-    seen = at_points(prior, known, scene)
-    normals = prior.normals[seen.place.unbind(dim=-1)].to(points)
-    rotation = scene.cameras.cam_from_world[seen.view, :3, :3]
-    found = _read(normals, rotation)
-    rays = normalize(points[seen.point] - scene.cameras.centers_world[seen.view], dim=-1)
-    ways = _ways(points)
-    chosen = ways[seen.point].isfinite().all(dim=-1).all(dim=-1)
-    found, rays, point = found[:, chosen], rays[chosen], seen.point[chosen]
-    flat = 1 - 2 * (found[:, :, None] * ways[point]).sum(dim=-1).abs().mean(dim=-1)
-    facing = (found * rays).sum(dim=-1) < 0
-    worth = means_by(torch.where(facing, flat, -1), point)
-    agreement = "; photographs and maps may be mixed up, or the cameras are wrong."
-    if len(point):
-        lengths = torch.stack([means_by(part, point) for part in found.movedim(-1, 0)], dim=-1)
-        agree = lengths.norm(dim=-1).mean(dim=1)
-        world = agree[READINGS.index(_WORLD)]
-        if bool(world > agree.sort().values[-2]):
-            agreement = (
-                ", yet agree between views as they stand: they are world normals of another world. "
-                "Give camera normals, or the cameras of that world with `--sparse`."
-            )
+    seen, ways = at_points(prior, known, scene), _ways(points)
+    seen = seen.take(ways[seen.point].isfinite().flatten(1).all(dim=1))
+    poses = scene.cameras.cam_from_world[seen.view, :3, :3]
+    found = _read(prior.normals[seen.place.unbind(dim=-1)].to(points), poses)
+    flat = 1 - 2 * (found[:, :, None] * ways[seen.point]).sum(dim=-1).abs().mean(dim=-1)
+    rays = points[seen.point] - scene.cameras.centers_world[seen.view]
+    worth = means_by(torch.where((found * rays).sum(dim=-1) < 0, flat, -1), seen.point)
+    agree = means_by(found.movedim(-1, 1), seen.point).norm(dim=1).mean(dim=-1)
+    world, second = agree[READINGS.index(_WORLD)], agree.sort().values[-2]
+    of_other_world = bool(world > max(float(second), _AGREEING))
     if silhouettes is not None and silhouettes.source != "everything":
         worth = torch.cat([worth, _at_outlines(prior, known, scene, silhouettes)], dim=1)
-    return worth, agreement
+    return worth, of_other_world
 
 
 def _ways(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point neighbour 3"]:

@@ -118,7 +118,7 @@ def test_where_nothing_tells_axes_are_to_be_stated(rendered):
         settle(bare, upside_down.replace(axes=None))
     depth = of_depth(bare, rendered.depth, inverse=True)
     assert torch.equal(settle(bare, depth).depth, depth.depth)
-    with pytest.raises(InputError, match=r"too few points of the cloud .*`inverse`"):
+    with pytest.raises(InputError, match=r"too few points of the cloud tell .*`inverse`"):
         settle(bare, depth.replace(inverse=None))
     # Outlines alone tell the axes, too.
     with pytest.warns(PimperWarning, match="in axes of DSINE"):
@@ -193,6 +193,41 @@ def test_depth_that_knows_nothing_of_the_scene_is_refused(rendered, inverse):
     given = 1 + interpolate(noise, (120, 160), mode="bilinear", align_corners=False)[:, 0]
     with pytest.raises(InputError, match="fits the cloud no better than a plane"):
         settle(rendered.scene, of_depth(rendered.scene, given, inverse=inverse))
+
+
+def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
+    """Such as a wall from the front, of which the cloud has one depth."""
+    scene = rendered.scene
+    points = scene.points_world
+    pose = scene.cameras.cam_from_world[5]
+    cam = points @ pose[:3, :3].mT + pose[:3, 3]
+    flat = torch.cat([cam[:, :2] / cam[:, 2:], torch.ones_like(cam[:, 2:])], dim=1) * 7.0
+    here = scene.observation_view == 5
+    wall = scene.replace(
+        points_world=(flat - pose[:3, 3]) @ pose[:3, :3],
+        observation_point=scene.observation_point[here],
+        observation_view=scene.observation_view[here],
+        observation_pixels=scene.observation_pixels[here],
+    )
+    generator = torch.Generator().manual_seed(8)
+    given = 1 + torch.rand(12, 120, 160, generator=generator)
+    prior = of_depth(wall, given, inverse=True)
+    assert torch.equal(settle(wall, prior).depth, prior.depth)
+    with pytest.raises(InputError, match="too few points of the cloud tell what it is"):
+        settle(wall, prior.replace(inverse=None))
+
+
+def test_normals_that_know_nothing_of_the_scene_are_doubted(rendered):
+    """Stated axes are believed with a warning; to find them is refused."""
+    generator = torch.Generator().manual_seed(8)
+    coarse = torch.randn(12, 3, 6, 8, generator=generator)
+    random = interpolate(coarse, (120, 160), mode="bilinear", align_corners=False)
+    random[:, 2] = -random[:, 2].abs() - 0.5
+    normals = normalize(random.movedim(1, -1), dim=-1)
+    with pytest.warns(PimperWarning, match="hardly fit cloud, outlines and cameras, to 0.0"):
+        settle(rendered.scene, of_normals(rendered.scene, normals))
+    with pytest.raises(InputError, match=r"nothing tells whether they .* State `axes`"):
+        settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
 
 
 def test_gradients_reach_what_was_given(rendered):
