@@ -25,8 +25,8 @@ def read_layers(path: Path, kinds: tuple[str, ...]) -> tuple[np.ndarray, np.ndar
         kinds: How names of arrays and channels begin that hold the map.
 
     Returns:
-        ``height width channel``, and ``height width``: samples of PNG in [0, 1], other values as
-        they are; NaN where PNG says that there is nothing.
+        ``height width channel``, and ``height width``: whole numbers of 8 and 16 bits in [0, 1],
+        other values as they are; NaN where PNG says that there is nothing.
 
     Raises:
         InputError: Names a file that cannot be read, or holds no map of that kind.
@@ -43,7 +43,9 @@ def read_layers(path: Path, kinds: tuple[str, ...]) -> tuple[np.ndarray, np.ndar
             f"{path}: cannot be read, {error}. Write it again, as NPY for instance."
         ) from error
     variance = layers.pop(VARIANCE, None)
-    named = [name for name in layers if name.lower().startswith(kinds)] or list(layers)
+    named = [
+        name for name in layers if any(part.startswith(kinds) for part in name.lower().split("."))
+    ] or list(layers)
     if len(named) != 1:
         raise InputError(
             f"{path}: holds {', '.join(layers) or 'nothing'}; needed: one array or channel called "
@@ -76,6 +78,8 @@ def _raster(path: Path, values: np.ndarray) -> np.ndarray:
     if values.ndim == 3 and values.shape[0] == 3 and values.shape[2] != 3:
         values = np.moveaxis(values, 0, -1)
     values = values[..., None] if values.ndim == 2 else values
+    if values.dtype in (np.uint8, np.uint16):
+        values = values / np.float32(np.iinfo(values.dtype).max)
     if values.ndim != 3 or values.shape[2] not in (1, 3) or not 0 < values.size <= 3 * MAX_PIXELS:
         raise InputError(
             f"{path}: has shape {values.shape}; needed: height width, with 3 channels before or "

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
+from pimper_torch.errors import InputError, some
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import Axes
 
@@ -127,6 +128,16 @@ def depth_from(
 
 
 def variance_of(maps: Maps, known: Tensor, default: Tensor | float) -> Tensor:
-    """Return the variance that comes along, or the default; infinite where nothing is known."""
+    """Return the variance that comes along, or the default; infinite where nothing is known.
+
+    Raises:
+        InputError: Nothing is known anywhere.
+    """
+    if not bool(known.any()):
+        low, high = maps.values.norm(dim=-1).nan_to_num(0).aminmax()
+        raise InputError(
+            f"The maps of {some(maps.names, most=3)} hold nothing that can be used: values have "
+            f"lengths from {float(low):.3g} to {float(high):.3g}; needed: unit normals, or depth."
+        )
     variance = torch.where(maps.variance.isfinite(), maps.variance, default)
     return torch.where(known & (variance > 0), variance, torch.inf)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from pimper_torch.config import require
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.parallel import side_by_side
 from pimper_torch.priors.from_maps import Maps, depth_from, normals_from, stacked, variance_of
@@ -113,7 +114,10 @@ def _prior(maps: Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -
     about: dict[str, Any] = {"names": maps.names, "sizes_px": maps.sizes_px}
     about["undistorted"] = undistorted
     if kind == "albedo":
-        variance = variance_of(maps, known, meaning.pop("error", torch.inf) ** 2)
+        error = meaning.pop("error", torch.nan)
+        told = error > 0 or bool(maps.variance.isfinite().any())
+        require(told, "error", error, "above 0, where the network returns no variance")
+        variance = variance_of(maps, known, error**2)
         return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **about, **meaning)
     if kind == "inliers":
         return InlierPrior(probability=values[..., 0], **about, **meaning)

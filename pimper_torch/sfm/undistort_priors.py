@@ -29,6 +29,7 @@ _VALUES: dict[type[MapPrior], str] = {
     InlierPrior: "probability",
     SilhouettePrior: "inside",
 }
+_Raster = Float[Tensor, "1 channel height width"]
 AnyMap = TypeVar("AnyMap", bound=MapPrior)
 _UNKNOWN = 0.5  # a probability that says nothing
 
@@ -104,15 +105,11 @@ def _sampled(raster: Tensor, places: Tensor) -> Tensor:
 
 
 def _weighted(
-    values: Float[Tensor, "1 channel height width"],
+    values: _Raster,
     variance: Float[Tensor, "1 height width"],
     places: Float[Tensor, "1 height width 2"],
     inside: Bool[Tensor, "height width"],
-) -> tuple[
-    Float[Tensor, "1 channel height width"],
-    Float[Tensor, "1 height width"],
-    Float[Tensor, "1 channel height width"],
-]:
+) -> tuple[_Raster, Float[Tensor, "1 height width"], _Raster]:
     """Return means by precision, one over the mean precision, and variances about the means."""
     known = variance.isfinite()
     precision = torch.where(known, 1 / torch.where(known, variance, 1), 0)[:, None]

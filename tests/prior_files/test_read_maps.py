@@ -258,6 +258,22 @@ def test_maps_that_are_none_are_refused(name, values, what, views, tmp_path):
         read_normals(tmp_path, views)
 
 
+def test_maps_without_a_value_are_refused(views, normals, tmp_path):
+    save(tmp_path / "a b.npy", 200 * normals)
+    with pytest.raises(InputError, match=r"hold nothing .* lengths from 0 to 200; needed: unit"):
+        read_normals(tmp_path, views)
+    np.save(tmp_path / "a b.npy", np.zeros((24, 32)), allow_pickle=False)
+    with pytest.raises(InputError, match=r"maps of a b.jpg hold nothing that can be used"):
+        read_depth(tmp_path, views)
+
+
+def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
+    coded = np.rint(65535 * (normals + 1) / 2).astype(np.uint16)
+    np.savez(tmp_path / "a b.npz", **{"View.Normals": coded, "x": coded}, allow_pickle=False)
+    found = read_normals(tmp_path, views, "opencv")
+    assert_close(found.normals[0, :23], torch.from_numpy(normals[:23]), rtol=0, atol=3e-5)
+
+
 def test_a_picture_of_depth_in_colours_is_refused(views, normals, tmp_path):
     save(tmp_path / "a b.png", normals)
     with pytest.raises(InputError, match="has colours; needed: one value a pixel"):

@@ -90,6 +90,8 @@ def test_grey_photographs_are_shown_in_three_channels(views):
     found = pt.priors_of(lambda picture: picture, grey, "albedo", linear=True, error=0.1)
     assert_close(found.albedo[0], views.images[0, :1].expand(3, -1, -1))
     assert_close(found.variance[0], torch.full((20, 30), 0.01))
+    with pytest.raises(ConfigError, match="error is nan; needed: above 0, where the network"):
+        pt.priors_of(lambda picture: picture, grey, "albedo")
 
 
 @pytest.mark.parametrize(("kind", "field"), [("inliers", "probability"), ("silhouettes", "inside")])
