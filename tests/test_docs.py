@@ -213,7 +213,7 @@ def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     for folder, shape in (("normals", (3,)), ("depth", ())):
         Path(folder).mkdir()
         for path in Path("photos").iterdir():
-            np.save(Path(folder) / f"{path.stem}.npy", np.ones((42, 56, *shape)))
+            np.save(Path(folder) / f"{path.stem}.npy", np.full((42, 56, *shape), -(3**-0.5)))
     return {"pt": pimper_torch}
 
 
