@@ -17,7 +17,7 @@ def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> Spars
         silhouettes: Of the object, where they are known.
 
     Returns:
-        Normals in our axes of the camera, or in the world; depth with its direction and gauge.
+        Normals in our axes of the camera, or in the world; depth along its axis in scene units.
         Differentiable in what priors hold.
 
     Raises:

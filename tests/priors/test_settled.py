@@ -116,7 +116,7 @@ def test_where_nothing_tells_axes_are_to_be_stated(rendered):
     assert torch.equal(settle(bare, upside_down).normals, upside_down.normals)
     with pytest.raises(InputError, match=r"nothing tells whether they are .* State `axes`"):
         settle(bare, upside_down.replace(axes=None))
-    depth = of_depth(bare, rendered.depth, inverse=True)
+    depth = of_depth(bare, rendered.depth, gauge="scene")
     assert torch.equal(settle(bare, depth).depth, depth.depth)
     with pytest.raises(InputError, match=r"too few points of the cloud tell .*`inverse`"):
         settle(bare, depth.replace(inverse=None))
@@ -147,26 +147,72 @@ def lengths_of_rays(scene):
 
 
 DEPTHS = {
-    "metres": (lambda depth, _: 3 * depth, (False, "axis", "scale")),
-    "affine": (lambda depth, _: 0.3 * depth - 0.5, (False, "axis", "affine")),
-    "scene": (lambda depth, _: depth, (False, "axis", "scene")),
-    "disparity": (lambda depth, _: 4 / depth - 0.1, (True, "axis", "affine")),
-    "inverse": (lambda depth, _: 4 / depth, (True, "axis", "scale")),
-    "distance": (lambda depth, rays: 2 * depth * rays, (False, "ray", "scale")),
+    "metres": (lambda depth, _: 3 * depth, "depth along the camera's axis up to a factor a map"),
+    "affine": (lambda depth, _: 0.3 * depth - 0.5, "axis up to a factor and an offset a map"),
+    "scene": (lambda depth, _: depth, "depth along the camera's axis in the scene's unit"),
+    "disparity": (
+        lambda depth, _: 4 / depth - 0.1,
+        "disparity. along the camera's .* an offset a map",
+    ),
+    "inverse": (
+        lambda depth, _: 4 / depth,
+        "disparity. along the camera's axis up to a factor a map",
+    ),
+    "distance": (lambda depth, rays: 2 * depth * rays, "depth along the ray up to a factor a map"),
 }
 
 
 @pytest.mark.parametrize("kind", DEPTHS)
-def test_depth_that_is_left_open_is_found_and_told(rendered, kind):
-    values, (inverse, along, gauge) = DEPTHS[kind]
+def test_depth_that_is_left_open_is_found_told_and_turned_to_scene_units(rendered, kind):
+    values, what = DEPTHS[kind]
     given = values(rendered.depth, lengths_of_rays(rendered.scene))
+    given = torch.where(rendered.depth.isfinite(), given, torch.inf)
+    # 1 % of depth: of values that are proportional to depth, or to one over it, 1 % as well.
+    spread = {"affine": 0.3 * rendered.depth, "disparity": 4 / rendered.depth}.get(kind, given)
     prior = of_depth(rendered.scene, given, inverse=None)
-    with pytest.warns(PimperWarning, match="is taken to be .* as the cloud shows: its median err"):
+    known = prior.variance.isfinite()
+    prior = prior.replace(variance=torch.where(known, (0.01 * spread) ** 2, torch.inf))
+    with pytest.warns(PimperWarning, match=f"is taken to be .*{what}, as the cloud shows: its "):
         found = settle(rendered.scene, prior)
-    assert (found.inverse, found.along, found.gauge) == (inverse, along, gauge)
-    assert torch.equal(found.depth, prior.depth)
-    # Stated as what it is, it is believed without a word.
-    assert settle(rendered.scene, found) == found
+    assert (found.inverse, found.along, found.gauge) == (False, "axis", "scene")
+    assert torch.equal(found.variance.isfinite(), known)
+    ratio = found.depth[known] / rendered.depth[known]
+    assert_close(ratio, torch.ones_like(ratio), rtol=0, atol=0.005)
+    assert_close(
+        found.variance[known].sqrt() / rendered.depth[known], 0.01 * ratio, rtol=0.01, atol=0
+    )
+    again = settle(rendered.scene, found)
+    assert again.depth is found.depth
+    assert again.variance is found.variance
+
+
+def test_a_standard_error_is_at_least_what_a_map_is_off_at_the_cloud(rendered):
+    generator = torch.Generator().manual_seed(6)
+    noise = 1 + 0.04 * torch.randn(rendered.depth.shape, generator=generator)
+    prior = of_depth(rendered.scene, rendered.depth * noise, gauge="scale")
+    found = settle(rendered.scene, prior.replace(variance=1e-4 * prior.variance))
+    known = found.variance.isfinite()
+    errors = found.variance[known].sqrt() / found.depth[known]
+    assert errors.min() > 0.025
+    assert errors.max() < 0.055
+
+
+def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
+    scene = rendered.scene
+    there = scene.observation_view != 4
+    scene = scene.replace(
+        observation_point=scene.observation_point[there],
+        observation_view=scene.observation_view[there],
+        observation_pixels=scene.observation_pixels[there],
+    )
+    depth = (3 * rendered.depth).requires_grad_()
+    found = settle(scene, of_depth(scene, depth, gauge="scale"))
+    assert found.variance[4].isinf().all()
+    assert found.variance[3].isfinite().any()
+    known = found.variance.isfinite()
+    found.depth[known].sum().backward()
+    assert (depth.grad[4] == 0).all()
+    assert_close(depth.grad[known], torch.full_like(depth.grad[known], 1 / 3), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +258,13 @@ def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
     generator = torch.Generator().manual_seed(8)
     given = 1 + torch.rand(12, 120, 160, generator=generator)
     prior = of_depth(wall, given, inverse=True)
-    assert torch.equal(settle(wall, prior).depth, prior.depth)
+    found = settle(wall, prior)
+    assert found.gauge == "scene"
+    known = found.variance[5].isfinite()
+    assert known.any()
+    assert_close(
+        found.depth[5][known], torch.full_like(found.depth[5][known], 7), rtol=1e-3, atol=0
+    )
     with pytest.raises(InputError, match="too few points of the cloud tell what it is"):
         settle(wall, prior.replace(inverse=None))
 
