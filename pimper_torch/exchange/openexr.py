@@ -66,7 +66,7 @@ def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
     data = Path(path).read_bytes()
     try:
         return _channels(data, max_samples)
-    except (struct.error, IndexError, KeyError, zlib.error) as error:
+    except (struct.error, IndexError, KeyError, OverflowError, zlib.error) as error:
         raise ValueError("it is cut short or damaged") from error
 
 
