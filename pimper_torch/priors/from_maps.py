@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, some
 from pimper_torch.records import DepthPrior, NormalPrior
-from pimper_torch.records.priors import Axes
+from pimper_torch.records.priors import AXES, Axes
 
 # Root mean squares that published estimators are off indoors. DSINE (CVPR 2024) has a mean of 16
 # degrees on NYUv2; Marigold (CVPR 2024) one of 5.5 % of depth once factor and offset are fitted.
@@ -25,14 +25,8 @@ _SHORTEST, _LONGEST = 0.5, 1.5
 _RANGE = (0.02, 0.98)  # of the values of a map: its ends may be strays
 
 NormalAxes = Literal["auto", "opencv", "opengl", "lub", "dsine", "world"]
-_AXES: dict[NormalAxes, Axes | None] = {
-    "auto": None,
-    "opencv": "opencv",
-    "opengl": "opengl",
-    "lub": "lub",
-    "dsine": "lub",
-    "world": "opencv",
-}
+_AXES: dict[NormalAxes, Axes | None] = {"auto": None, "dsine": "lub", "world": "opencv"}
+_AXES |= {axes: axes for axes in AXES}
 
 
 class Maps(NamedTuple):

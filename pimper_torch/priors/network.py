@@ -56,8 +56,10 @@ def priors_of(
         mean: That is subtracted, one for all channels or one each.
         std: That pictures are divided by then.
         meaning: What else the prior has to state: of normals ``axes`` and ``error_deg``, of depth
-            ``inverse``, ``along``, ``gauge`` and ``error``, as :func:`read_normals` and
-            :func:`read_depth` take them; of albedo ``error``, in its own units.
+            ``inverse``, ``along``, ``gauge`` and ``error``, as
+            :func:`~pimper_torch.prior_files.read_normals.read_normals` and
+            :func:`~pimper_torch.prior_files.read_depth.read_depth` take them; of albedo ``error``,
+            in its own units.
 
     Raises:
         InputError: The file is of another kind, or the network returns something else.

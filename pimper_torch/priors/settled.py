@@ -27,10 +27,16 @@ def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> Spars
         return scene
     scene = with_undistorted_priors(scene)
 
+    names = scene.views.names
+
     def decided(prior: Prior) -> Prior:
+        there = [index for index, name in enumerate(prior.names) if name in names]
+        if not there or not isinstance(prior, NormalPrior | DepthPrior):
+            return prior
+        prior = prior.take(there)
         if isinstance(prior, NormalPrior):
             return settled_normals(prior, scene, silhouettes)
-        return settled_depth(prior, scene) if isinstance(prior, DepthPrior) else prior
+        return settled_depth(prior, scene)
 
     priors = tuple(decided(prior) for prior in scene.views.priors)
     return scene.replace(views=scene.views.replace(priors=priors))

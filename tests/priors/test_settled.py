@@ -8,6 +8,7 @@ from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
+from pimper_torch.sfm.sound_views import with_views
 
 
 def noisy(normals, degrees, seed=1):
@@ -195,6 +196,22 @@ def test_a_standard_error_is_at_least_what_a_map_is_off_at_the_cloud(rendered):
     errors = found.variance[known].sqrt() / found.depth[known]
     assert errors.min() > 0.025
     assert errors.max() < 0.055
+
+
+def test_maps_of_photographs_that_were_left_out_since_are_not_looked_at(rendered):
+    scene = rendered.scene
+    ray = 2 * rendered.depth * lengths_of_rays(scene)
+    depth = of_depth(scene, ray, along="ray", gauge="scale").replace(undistorted=True)
+    normals = of_normals(scene, -rendered.camera, axes="lub").replace(undistorted=True)
+    kept = torch.arange(12) % 3 > 0
+    fewer = with_views(scene.replace(views=scene.views.replace(priors=(depth, normals))), kept)
+    depth, normals = settled(fewer).views.priors
+    assert depth.names == normals.names == fewer.views.names
+    known = depth.variance.isfinite()
+    assert_close(depth.depth[known], rendered.depth[kept][known], rtol=0.005, atol=0)
+    none = scene.replace(views=scene.views.replace(names=tuple("abcdefghijkl")))
+    alone = none.replace(views=none.views.replace(priors=(depth,)))
+    assert settled(alone) == alone
 
 
 def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
