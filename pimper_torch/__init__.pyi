@@ -32,6 +32,10 @@ from .patches.decompose import Decompose as Decompose
 from .patches.warp import Warp as Warp
 from .photometry.factorize import Factorize as Factorize
 from .photometry.factorize import FactorizeConfig as FactorizeConfig
+from .prior_files.read_depth import read_depth as read_depth
+from .prior_files.read_normals import read_normals as read_normals
+from .priors.network import priors_of as priors_of
+from .priors.settled import settled as settled
 from .radiometry import Encoding as Encoding
 from .records import AlbedoPrior as AlbedoPrior
 from .records import Cameras as Cameras

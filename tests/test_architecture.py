@@ -49,6 +49,7 @@ ROOMS = [
     "meshing",
     "size",
     "reporting",
+    "priors",
     "chains",
     "viz",
     "asset",
@@ -57,6 +58,7 @@ ROOMS = [
     "outputs",
     "io",
     "exchange",
+    "prior_files",
     "viewer",
     "doctor",
     "video",
@@ -80,6 +82,7 @@ SOLE_IMPORTERS = {
     "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
+    "onnxruntime": {"priors/network.py"},
 }
 
 # Where a distribution's module has another name.

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import tyro
@@ -207,6 +208,15 @@ def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
     return {"result": result}
 
 
+def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    a_folder_of_photographs(monkeypatch)
+    for folder, shape in (("normals", (3,)), ("depth", ())):
+        Path(folder).mkdir()
+        for path in Path("photos").iterdir():
+            np.save(Path(folder) / f"{path.stem}.npy", np.full((42, 56, *shape), -(3**-0.5)))
+    return {"pt": pimper_torch}
+
+
 # What each block of a page takes for granted, by page and number.
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
@@ -217,6 +227,8 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/parts.md", 2): a_normal_map,
     ("docs/result.md", 0): a_result,
     ("docs/conventions.md", 0): nothing,
+    ("docs/priors.md", 0): photographs_and_maps,
+    ("docs/priors.md", 1): photographs_and_maps,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): a_scene_and_a_mesh,
     ("docs/extending.md", 2): a_data_set_of_ones_own,

@@ -40,6 +40,7 @@ from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sound_views import sound
 from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
+from pimper_torch.sfm.undistort_priors import with_undistorted_priors
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
 
@@ -166,8 +167,8 @@ class Chain(Stage):
     ) -> SparseScene:
         """Return photographs with their cameras: those that come with them, or else find them.
 
-        Views that cannot be used are left out. A scene without observed points gets some, unless a
-        mesh stands in for them.
+        Views that cannot be used are left out; priors become those of undistorted views. A scene
+        without observed points gets some, unless a mesh stands in for them.
 
         Raises:
             InputError: Cameras come twice.
@@ -181,7 +182,7 @@ class Chain(Stage):
             )
         elif mesh is None and isinstance(self.reconstruct, Reconstruct):
             views = self.reconstruct.with_points(views)
-        scene = sound(self._with_points(views, mesh))
+        scene = with_undistorted_priors(sound(self._with_points(views, mesh)))
         self._watched(scene)
         return scene
 

@@ -30,6 +30,7 @@ from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
     Cameras,
@@ -135,7 +136,7 @@ class CoarseToFine(Chain):
         self.need(COARSE)
         silhouettes = self.kept(self.silhouettes, placed)
         mesh = self.given_mesh(mesh, views, placed, silhouettes)
-        scene = masked(placed, silhouettes)
+        scene = settled(masked(placed, silhouettes), silhouettes)
         cameras = scene.cameras
         contours = self.contours(silhouettes, cameras)
         coarse = self.kept(self.coarse_surface, scene, contours, mesh)

@@ -21,6 +21,7 @@ from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
     Cameras,
@@ -110,7 +111,7 @@ class Published(Chain):
         scene = self.placed(views, sparse_model, mesh)
         silhouettes = self.kept(self.silhouettes, scene)
         mesh = self.given_mesh(mesh, views, scene, silhouettes)
-        scene = masked(scene, silhouettes)
+        scene = settled(masked(scene, silhouettes), silhouettes)
         if mesh is None:
             coarse = self.kept(self.triangulate, scene)
         else:

@@ -12,9 +12,9 @@ from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.exchange.formats import Format, write_formats
-from pimper_torch.exchange.map_files import Axes
 from pimper_torch.exchange.result import read_result
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.records.priors import Axes
 from pimper_torch.reporting import stage
 
 

@@ -22,6 +22,7 @@ from pimper_torch.io.photographs import list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
+from pimper_torch.priors.from_maps import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.size.given import Unit, measured_in, number_of
 from pimper_torch.viewer.server import require_viser
 
@@ -98,6 +99,13 @@ class InputOptions:
         markers: Markers printed by `pimper markers` tell the size; their sides in millimetres, if
             others. With --sparse they are compared alone, unless their sides are given.
         unit: Of lengths that are given, and of the result where its size is known.
+        normals: Folder of normal maps of an estimator, under the photographs' names: PNG, EXR, NPZ
+            or NPY.
+        axes: Of these normals; auto finds them by cloud and outlines.
+        normals_error_deg: Root mean square that they are off, where no file has their variance.
+        depth: Folder of depth maps of an estimator; what they hold is found by the cloud.
+        depth_error: Root mean square of the range of their values that they are off, where no file
+            has their variance.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -110,6 +118,11 @@ class InputOptions:
     camera_distance: CameraDistances = ()
     markers: Markers = "auto"
     unit: Unit = "mm"
+    normals: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    axes: NormalAxes = "auto"
+    normals_error_deg: float = NORMALS_ERROR_DEG
+    depth: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    depth_error: float = DEPTH_ERROR
 
     def __post_init__(self) -> None:
         sound = isinstance(self.markers, str) or 0 < self.markers < float("inf")
@@ -130,7 +143,7 @@ class Job:
 # What few people need: `--help-all` tells of it.
 _RARE = (
     *("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
-    "--no-report",
+    *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
 )
 
 # The skull's cranium and face both show in this photograph.
@@ -262,6 +275,8 @@ def _inputs(job: Job) -> dict[str, Path | None]:
         "--masks": job.inputs.masks,
         "--sparse": job.inputs.sparse,
         "--mesh": job.inputs.mesh,
+        "--normals": job.inputs.normals,
+        "--depth": job.inputs.depth,
         "--cache": job.common.cache,
     }
 

@@ -27,7 +27,9 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.outputs.marker import STAGES
 from pimper_torch.outputs.stages import PREVIEW
-from pimper_torch.records import CoarseMesh, Reconstruction, SparseScene, Views
+from pimper_torch.prior_files.read_depth import read_depth
+from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
 from pimper_torch.size.given import measured_in
 from pimper_torch.size.scale import Scale
@@ -119,13 +121,21 @@ def _store(job: Job) -> Store:
 
 
 def _read(job: Job) -> Views:
-    return load_views(
+    inputs = job.inputs
+    views = load_views(
         job.photos,
-        masks=job.inputs.masks,
-        mask_object=job.inputs.mask_object,
+        masks=inputs.masks,
+        mask_object=inputs.mask_object,
         encoding=job.config.photographs,
         max_size_px=job.common.max_size_px,
     )
+    priors: list[Prior] = []
+    if inputs.normals is not None:
+        error_deg = inputs.normals_error_deg
+        priors.append(read_normals(inputs.normals, views, inputs.axes, error_deg=error_deg))
+    if inputs.depth is not None:
+        priors.append(read_depth(inputs.depth, views, error=inputs.depth_error))
+    return views.replace(priors=tuple(priors))
 
 
 def _examine(job: Job, views: Views) -> None:
@@ -146,6 +156,8 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequ
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
         "mesh": _text(job.inputs.mesh),
+        "normals": _text(job.inputs.normals),
+        "depth": _text(job.inputs.depth),
         "response": str(job.config.photographs.response),
         "max_size_px": job.common.max_size_px,
         "preset": job.common.preset,

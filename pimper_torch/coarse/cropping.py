@@ -16,8 +16,9 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     """Cut every photograph to its silhouette's bounding box, and mask it.
 
     The photographs share one raster: the largest box's. Views without a silhouette keep their
-    left upper corner, masked. Cameras follow; observations keep their pixels, which are those
-    of the photographs before undistortion.
+    left upper corner, masked. Cameras follow; priors are left out, as their maps cover whole
+    photographs; observations keep their pixels, which are those of the photographs before
+    undistortion.
 
     Args:
         silhouettes: Of all views; unreliable ones mask their photographs too. Silhouettes that
@@ -40,7 +41,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
         shown[view, :h, :w] = masks[view, rows, columns]
         intrinsics[view] = crop_intrinsics(intrinsics[view], float(left), float(top))
     return scene.replace(
-        views=views.replace(images=images, masks=shown, sizes_px=size),
+        views=views.replace(images=images, masks=shown, sizes_px=size, priors=()),
         cameras=scene.cameras.replace(intrinsics=intrinsics, sizes_px=size),
     )
 

@@ -7,10 +7,11 @@ from typing import Literal
 from pimper_torch.exchange.alicevision import write_alicevision
 from pimper_torch.exchange.colmap_workspace import write_workspace
 from pimper_torch.exchange.light_positions import write_lights
-from pimper_torch.exchange.map_files import Axes, write_maps
+from pimper_torch.exchange.map_files import write_maps
 from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.exchange.result import Result
 from pimper_torch.progress import part
+from pimper_torch.records.priors import Axes
 
 Format = Literal["colmap", "nerfstudio", "alicevision", "maps", "lights"]
 

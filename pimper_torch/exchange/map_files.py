@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -12,19 +11,8 @@ from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.exchange.pictures import file_names
 from pimper_torch.exchange.result import Result
 from pimper_torch.io.decode import write_deep_png
+from pimper_torch.records.priors import AXES, Axes
 from pimper_torch.viz.maps import ViewMaps, view_maps
-
-Axes = Literal["opengl", "opencv", "lub"]
-_SIGNS: dict[Axes, tuple[int, int, int]] = {
-    "opengl": (1, -1, -1),
-    "opencv": (1, 1, 1),
-    "lub": (-1, -1, -1),
-}
-_MEANING: dict[Axes, str] = {
-    "opengl": "x right, y up, z to the viewer",
-    "opencv": "x right, y down, z into the scene",
-    "lub": "x left, y up, z to the viewer",
-}
 
 
 def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
@@ -43,7 +31,7 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
     for view, file in enumerate(file_names(result.scene.views.names)):
         maps = view_maps(result.mesh, result.scene.cameras, view)
         normals, stem = with_axes(maps.normals_cam, axes), Path(file).stem
-        write_exr(normals, folder / "normals" / f"{stem}.exr", _MEANING[axes])
+        write_exr(normals, folder / "normals" / f"{stem}.exr", AXES[axes][1])
         levels = (65535 * (normals + 1) / 2).round() * maps.seen.numpy()[..., None]
         write_deep_png(levels.astype(np.uint16), folder / "normals" / file)
         depth = maps.depth.nan_to_num(0)[..., None].numpy()
@@ -58,7 +46,7 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
         )
     about = {
         "axes": axes,
-        "normals": f"unit, {_MEANING[axes]}; PNG holds (n + 1) / 2 of 65535; 0 off the surface",
+        "normals": f"unit, {AXES[axes][1]}; PNG holds (n + 1) / 2 of 65535; 0 off the surface",
         "depth": "along the camera's axis, in the result's unit; 0 off the surface, NaN in NPZ",
         "albedo": "linear, primaries of sRGB, one scale for all views; 0 off the surface",
         "cameras": "NPZ: intrinsics count the centre of the top-left pixel as (0.5, 0.5); "
@@ -69,7 +57,7 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
 
 def with_axes(normals_cam: Float[Tensor, "height width 3"], axes: Axes) -> np.ndarray:
     """Turn normals of our camera's axes to others; float32."""
-    turned = normals_cam.numpy() * np.array(_SIGNS[axes], np.float32) + np.float32(0)  # no -0
+    turned = normals_cam.numpy() * np.array(AXES[axes][0], np.float32) + np.float32(0)  # no -0
     return np.asarray(turned, np.float32)
 
 

@@ -1,14 +1,18 @@
-"""Maps of float32 as OpenEXR files: scan lines in one part, packed without loss."""
+"""Maps as OpenEXR files: scan lines in one part, packed without loss."""
 
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 _START = b"\x76\x2f\x31\x01" + struct.pack("<I", 2)  # magic number, version
 _ZIP, _LINES = 3, 16  # method of packing, and how many lines it packs together
+_LINES_OF = {0: 1, 2: 1, _ZIP: _LINES}  # of all methods that are read: none, ZIPS and ZIP
 _FLOAT = 2
+_KINDS = {0: "<u4", 1: "<f2", _FLOAT: "<f4"}
+_TILES_OR_PARTS = 0x1A00  # bits of the version
 _NAMES = {1: ("Y",), 3: ("R", "G", "B")}
 
 
@@ -47,6 +51,83 @@ def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
     at = len(header) + 8 * len(blocks)
     table = np.cumsum([at, *(len(block) for block in blocks[:-1])]).astype("<u8")
     Path(path).write_bytes(header + table.tobytes() + b"".join(blocks))
+
+
+def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
+    """Read the channels of scan lines in one part, each ``height width`` in float32.
+
+    Args:
+        max_samples: Of a picture that says it has more none is read.
+
+    Raises:
+        ValueError: Says what the file is, or holds, that is not read.
+        OSError: Of the system.
+    """
+    data = Path(path).read_bytes()
+    try:
+        return _channels(data, max_samples)
+    except (struct.error, IndexError, KeyError, OverflowError, zlib.error) as error:
+        raise ValueError("it is cut short or damaged") from error
+
+
+def _channels(data: bytes, max_samples: int) -> dict[str, np.ndarray]:
+    if data[:4] != _START[:4]:
+        raise ValueError("it is no OpenEXR file")
+    if struct.unpack_from("<I", data, 4)[0] & _TILES_OR_PARTS:
+        raise ValueError("it has tiles or several parts; needed: scan lines in one part")
+    header, at = {}, 8
+    while data[at] != 0:
+        # Names have 255 bytes at most.
+        name, kind, rest, *_ = (*data[at : at + 600].split(b"\0", 2), b"", b"")
+        (size,) = struct.unpack_from("<I", rest)
+        at += len(name) + len(kind) + 6
+        header[name] = data[at : at + size]
+        at += size
+    packing = header[b"compression"][0]
+    if packing not in _LINES_OF:
+        raise ValueError("it is packed otherwise than by ZIP; save it with ZIP, or unpacked")
+    left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
+    width, height, lines = right - left + 1, bottom - top + 1, _LINES_OF[packing]
+    channels = dict(_listed(header[b"channels"]))
+    if not (width > 0 and height > 0 and 0 < width * height * len(channels) <= max_samples):
+        raise ValueError(
+            f"it says that it has {width} x {height} pixels of {len(channels)} channels"
+        )
+    row = np.dtype([(name, kind, (width,)) for name, kind in channels.items()])
+    blocks = -(-height // lines)
+    rows: list[np.ndarray] = []
+    for start in struct.unpack_from(f"<{blocks}Q", data, at + 1):
+        count = min(lines, height - len(rows) * lines)
+        (size,) = struct.unpack_from("<I", data, start + 4)
+        packed = data[start + 8 : start + 8 + size]
+        raw = packed if size == count * row.itemsize else _unpacked(packed, count * row.itemsize)
+        if len(raw) != count * row.itemsize:
+            raise IndexError
+        rows.append(np.frombuffer(raw, row))
+    whole = np.concatenate(rows)
+    return {name: whole[name].astype(np.float32) for name in channels}
+
+
+def _listed(channels: bytes) -> Iterator[tuple[str, str]]:
+    """List names and types of channels, in the order in which lines hold them."""
+    while channels[0] != 0:
+        name, _, rest = channels.partition(b"\0")
+        kind, _, *steps = struct.unpack_from("<IIII", rest)
+        if steps != [1, 1]:
+            raise ValueError("it has channels of fewer pixels; needed: a value a pixel")
+        yield name.decode("utf-8", "replace"), _KINDS[kind]
+        channels = rest[16:]
+
+
+def _unpacked(packed: bytes, size: int) -> bytes:
+    """Undo :func:`_packed`, of a block of so many bytes."""
+    halves = np.frombuffer(zlib.decompressobj().decompress(packed, size), np.uint8).copy()
+    halves[1:] -= np.uint8(128)
+    halves = np.cumsum(halves, dtype=np.uint8)
+    plain = np.empty_like(halves)
+    middle = (len(halves) + 1) // 2
+    plain[::2], plain[1::2] = halves[:middle], halves[middle:]
+    return plain.tobytes()
 
 
 def _packed(raw: bytes) -> bytes:

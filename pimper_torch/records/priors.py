@@ -3,6 +3,7 @@
 Maps belong to photographs by name, cover the whole photograph at any resolution, and those of
 unlike sizes are padded on the right and at the bottom. Variance is infinite where nothing is
 guessed. Axes of a camera are x right, y down, z forward: what faces it has normal (0, 0, -1).
+What is left open, or has other axes, :func:`~pimper_torch.priors.settled.settled` decides.
 """
 
 from collections.abc import Iterator
@@ -14,6 +15,14 @@ from torch import Tensor
 
 from pimper_torch.records.faults import not_finite, not_unit, once, outside
 from pimper_torch.records.record import Record
+
+Axes = Literal["opengl", "opencv", "lub"]
+AXES: dict[Axes, tuple[tuple[int, int, int], str]] = {
+    "opencv": ((1, 1, 1), "x right, y down, z into the scene"),
+    "opengl": ((1, -1, -1), "x right, y up, z to the viewer"),
+    "lub": ((-1, -1, -1), "x left, y up, z to the viewer"),
+}
+"""Signs that turn normals of a camera's axes to ours, and back; and where the axes point."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -46,11 +55,13 @@ class NormalPrior(MapPrior):
         normals: Unit, outward; anything where the variance is infinite.
         variance: Mean square of their angular error, squared radians.
         frame: Of the normals: each photograph's camera, or the scene's world.
+        axes: Of the cameras; ``None`` leaves these and the frame open.
     """
 
     normals: Float[Tensor, "map height width 3"]
     variance: Float[Tensor, "map height width"]
     frame: Literal["camera", "world"] = "camera"
+    axes: Axes | None = "opencv"
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List what is no normal, and what is no variance."""
@@ -69,7 +80,8 @@ class DepthPrior(MapPrior):
         depth: Of what each pixel shows, or one over it.
         variance: Squared units of ``depth``.
         along: Whether depth counts along the camera's axis, or along the pixel's ray.
-        inverse: Whether ``depth`` is one over depth.
+        inverse: Whether ``depth`` is one over depth; ``None`` leaves this, ``along`` and ``gauge``
+            open.
         gauge: Whether ``depth`` is in scene units, up to a factor each map, or up to a factor and
             an offset each map; both are fitted.
     """
@@ -77,7 +89,7 @@ class DepthPrior(MapPrior):
     depth: Float[Tensor, "map height width"]
     variance: Float[Tensor, "map height width"]
     along: Literal["axis", "ray"] = "axis"
-    inverse: bool = False
+    inverse: bool | None = False
     gauge: Literal["scene", "scale", "affine"] = "affine"
 
     def faults(self) -> Iterator[tuple[str, str, str]]:

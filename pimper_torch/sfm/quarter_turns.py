@@ -114,7 +114,8 @@ def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:
 def turned_views(views: Views, quarters: Sequence[int]) -> Views:
     """Turn photographs clockwise by quarters, each by its own number; none are not copied.
 
-    The raster is as large as the turned photographs need.
+    The raster is as large as the turned photographs need. Priors do not turn along: they are left
+    out.
     """
     if not any(turns % 4 for turns in quarters):
         return views
@@ -137,4 +138,5 @@ def turned_views(views: Views, quarters: Sequence[int]) -> Views:
         masks=masks,
         sizes_px=torch.tensor(sizes).to(views.sizes_px),
         orientations=None,
+        priors=(),
     )

@@ -225,9 +225,10 @@ class Reconstruct(Stage):
                 of unlike sizes, or the given model does not belong to the photographs.
         """
         _require_finite(views)
+        bare = views.replace(priors=())  # which tell nothing of where cameras stand
         if sparse_model is None:
-            return placed_scene(views, find_model(views, self.config, self.store)[0])
-        return placed_scene(views, self._given(views, Path(sparse_model)))
+            return placed_scene(views, find_model(bare, self.config, self.store)[0])
+        return placed_scene(views, self._given(bare, Path(sparse_model)))
 
     def with_points(self, scene: SparseScene) -> SparseScene:
         """Triangulate points for a scene whose views observe hardly any, its cameras held fixed.
@@ -238,7 +239,8 @@ class Reconstruct(Stage):
         model = model_of_scene(scene)
         if not lacks_points(model) or not scene.lenses:
             return scene
-        found = self._triangulated(scene.views, [model], "The scene")
+        bare = scene.views.replace(priors=())
+        found = self._triangulated(bare, [model], "The scene")
         return scene if found is model else with_model_points(scene, found)
 
     def _given(self, views: Views, path: Path) -> SparseModel:

@@ -17,12 +17,13 @@ from pimper_torch.sfm.camera_in_place import least_squares_map, mapped
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reprojection import reprojection_errors
 from pimper_torch.sfm.undistort import undistort
+from pimper_torch.sfm.undistort_priors import with_undistorted_priors
 
 _RASTER = 9  # pixels each way that a map is fitted to
 
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
-    """Undistort the registered photographs and put them beside their cameras and cloud.
+    """Undistort the registered photographs and priors, and put them beside cameras and cloud.
 
     Args:
         views: All photographs, in any order.
@@ -43,7 +44,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         views.take([number[name] for name in model.names]), model.lenses
     )
     like = views.images
-    return SparseScene(
+    scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
         cameras=Cameras(
             intrinsics=intrinsics,
@@ -61,6 +62,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         offset_world=offset,
         series=model.series.to(like.device),
     )
+    return with_undistorted_priors(scene)
 
 
 def _undistorted_maps(

@@ -56,11 +56,12 @@ def undistorted(
         Radiance, and where it is valid.
     """
     alike = len(set(lenses)) == 1
-    shared = _grid(lenses[0], like=views.images) if alike else None
+    shared = source_grid(lenses[0], like=views.images) if alike else None
 
     def one(index: int) -> tuple[Tensor, Tensor]:
         lens = lenses[index]
-        return _undistort_image(views, index, lens, shared if alike else _grid(lens, views.images))
+        grid = shared if alike else source_grid(lens, like=views.images)
+        return _undistort_image(views, index, lens, grid)
 
     for found in side_by_side(one, range(views.num_views)):
         yield found
@@ -76,21 +77,27 @@ def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
 _Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
 
 
-def _grid(lens: Lens, like: Tensor) -> _Grid | None:
+def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _Grid | None:
     """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
 
-    Nothing for a lens without distortion.
+    Args:
+        lens: Of the photograph.
+        like: Of the grid's device and type.
+        width: Of a map that covers the photograph, in its own pixels; the photograph's by default.
+        height: Of the map.
+
+    Returns:
+        Places for ``grid_sample``; nothing for a lens without distortion.
     """
     if is_pinhole(lens):
         return None
-    sources = photograph_pixels(lens).to(like)
-    size = sources.new_tensor([lens.width, lens.height])
+    width, height = width or lens.width, height or lens.height
+    sources = photograph_pixels(lens, width, height).to(like)
+    size = sources.new_tensor([width, height])
     within = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN
     # Half a pixel from the edge on, the edge's own pixel continues.
     sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
-    return grid_from_pixels(torch.minimum(sources, size - 0.5), lens.width, lens.height)[
-        None
-    ], within
+    return grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)[None], within
 
 
 def _undistort_image(
@@ -143,18 +150,27 @@ def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
     return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
 
 
-def photograph_pixels(lens: Lens) -> Float[Tensor, "height width 2"]:
+def photograph_pixels(
+    lens: Lens, width: int = 0, height: int = 0
+) -> Float[Tensor, "height width 2"]:
     """Find where in the photograph each pixel of its pinhole image comes from.
 
+    Args:
+        lens: Of the photograph.
+        width: Of a map that covers the photograph; the photograph's by default.
+        height: Of the map.
+
     Returns:
-        Pixels of the photograph in float64; NaN where the lens cannot image the direction.
+        In pixels of the map, float64; NaN where the lens cannot image the direction.
     """
+    width, height = width or lens.width, height or lens.height
     K = pinhole_for(lens)
-    pixels = pixel_centers(lens.width, lens.height, like=K).reshape(-1, 2)
+    scale = K.new_tensor([lens.width / width, lens.height / height])
+    pixels = pixel_centers(width, height, like=K).reshape(-1, 2)
     found = torch.empty_like(pixels)
     parts = torch.split(pixels, _AT_ONCE), torch.split(found, _AT_ONCE)
     for some, into in zip(*parts, strict=True):
-        plane = (some - K[:2, 2]) / K.diagonal()[:2]
+        plane = (some * scale - K[:2, 2]) / K.diagonal()[:2]
         rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
-        into.copy_(distort(lens, rays))
-    return found.reshape(lens.height, lens.width, 2)
+        into.copy_(distort(lens, rays) / scale)
+    return found.reshape(height, width, 2)

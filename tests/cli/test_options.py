@@ -30,7 +30,8 @@ RUNS = {
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
-        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report"
+        "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
+        "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05"
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
@@ -124,6 +125,7 @@ def world(tmp_path_factory, dtu):
         "sparse": scene / "truth" / "sparse",
         "true_mesh": scene / "truth" / "mesh.ply",
         "dtu": dtu,
+        "maps": scene / "truth" / "maps",
         "tiny": TINY,
         "video": written(folder / "clip.mp4"),
     }

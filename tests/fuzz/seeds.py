@@ -14,7 +14,7 @@ import scipy.io
 import tifffile
 import torch
 import trimesh
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, PngImagePlugin
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 from dng import write_dng
@@ -42,12 +42,15 @@ from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import decode, write_deep_png
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.responses import read_curve
+from pimper_torch.prior_files.read_depth import read_depth
+from pimper_torch.prior_files.read_normals import read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, reconstruction_of, write_binary
@@ -74,6 +77,7 @@ def make_seeds(root: Path) -> list[Seed]:
         *_meshes(root / "mesh"),
         *_models(root / "model"),
         *_tables(root / "table"),
+        *_maps(root / "maps"),
         *_datasets(root / "dataset"),
         *_camera_files(root / "cameras"),
         *_videos(root / "video"),
@@ -272,6 +276,33 @@ def _tables(root: Path) -> list[Seed]:
         "packed.mat": matlab,
     }
     return [Seed(name, _alone(root, name), (name,), reader) for name, reader in readers.items()]
+
+
+def _maps(root: Path) -> list[Seed]:
+    root.mkdir(parents=True)
+    depth = _pixels()[..., 0].astype(np.float32)
+    normals = depth[..., None] / 300 - np.ones(3, np.float32)
+    np.save(root / "a.npy", normals)
+    np.savez(root / "a.npz", normals=normals, variance=depth)
+    write_exr(normals, root / "a.exr")
+    text = PngImagePlugin.PngInfo()
+    text.add_text("near", "0.5")
+    text.add_text("far", "9")
+    Image.fromarray(depth.astype(np.uint16)).save(root / "a.png", pnginfo=text)
+    views = Views(
+        images=torch.zeros(1, 1, 18, 24),
+        sizes_px=torch.tensor([[24, 18]]),
+        names=("a.jpg",),
+        focals_px=torch.ones(1),
+    )
+
+    def read(folder: Path) -> object:
+        if (folder / "a.png").exists():
+            return read_depth(folder, views).depth
+        return read_normals(folder, views).normals
+
+    names = ("a.npy", "a.npz", "a.exr", "a.png")
+    return [Seed(f"map {name}", _alone(root, name), (name,), read) for name in names]
 
 
 def _datasets(root: Path) -> list[Seed]:

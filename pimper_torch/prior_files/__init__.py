@@ -1,0 +1,1 @@
+"""Folders of maps that estimators write, as priors."""

@@ -1,0 +1,1 @@
+"""What guesses from elsewhere mean, and guesses of networks."""

@@ -1,0 +1,203 @@
+"""Whether maps hold depth or one over it, along which way, and up to what, by the cloud.
+
+A reading says how values ``d`` of a map belong to depth ``t`` of the points that the view
+observes: ``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.errors import InputError, caution, some
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.priors.at_points import AtPoints, at_points, means_by
+from pimper_torch.records import DepthPrior, SparseScene
+from pimper_torch.sfm.squares import ERRORS, standard_errors
+
+Along = Literal["axis", "ray"]
+Gauge = Literal["scene", "scale", "affine"]
+_READINGS: dict[tuple[bool, Along], str] = {
+    (False, "axis"): "depth along the camera's axis",
+    (False, "ray"): "depth along the ray",
+    (True, "axis"): "one over depth (disparity) along the camera's axis",
+    (True, "ray"): "one over depth (disparity) along the ray",
+}
+_GAUGES: dict[Gauge, str] = {
+    "scene": "in the scene's unit",
+    "scale": "up to a factor a map",
+    "affine": "up to a factor and an offset a map",
+}
+_OURS = (False, "axis", "scene")
+# Choices: points of a map that a line is fitted to at least; steps of reweighting; by how much the
+# median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
+# are too coarse for; relative depth that clouds are good to at best.
+_FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
+_TO_DEVIATION = 1.4826  # of the median absolute value of Gaussian noise
+
+
+def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
+    """Decide what depth means, and turn it to scene units along the camera's axis.
+
+    Where it is left open it is found, which is told in a warning: whether it is one over depth,
+    along the axis unless along the ray fits far better, and the simplest gauge that fits. Factors
+    and offsets are those that fit the cloud, map by map; standard errors are at least what a map
+    is off there. A map before which too few points are seen is left out.
+
+    Args:
+        prior: Of undistorted photographs. Depth that is so already is believed as it is.
+
+    Raises:
+        InputError: Another reading than the stated one fits far better, none is better than no
+            depth at all, or nothing tells.
+    """
+    where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
+    lines, errors, seen = _compared(prior.detach(), scene)
+    ways, gauges = tuple(_READINGS), tuple(_GAUGES)
+    told = errors.shape[-1] >= _FEWEST
+    medians = errors.median(dim=-1).values if told else errors.new_zeros(len(ways) + 1, 1)
+    size = medians[:, -1].min().clamp_min(_ROUGH)
+    worth = means_by(size / (size + errors), seen.point)
+    best = int(medians[:-1, -1].argmin())
+
+    def far_better(one: Tensor, other: Tensor) -> bool:
+        return standard_errors(one - other) > ERRORS
+
+    def at(reading: int, gauge: int = -1) -> str:
+        return f"{float(medians[reading, gauge]):.1%}"
+
+    if not told and (prior.inverse, prior.along, prior.gauge) == _OURS:
+        return prior
+    helps = told and far_better(worth[best, -1], worth[-1, -1])
+    if medians[-1, -1] > _FLAT and not helps:
+        raise InputError(
+            f"{where} fits the cloud no better than a plane across the view, as depth or as one "
+            "over depth. Photographs and maps may be mixed up, or maps be of another size."
+        )
+    if not told or (prior.inverse is None and not helps):
+        raise InputError(
+            f"{where}: too few points of the cloud tell what it is; needed: {_FEWEST} before each "
+            "map, at several depths. State whether it is one over depth (`inverse`), and its "
+            "`gauge`, or give it in scene units."
+        )
+    if prior.inverse is not None:
+        stated, gauge = ways.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
+        if helps and far_better(worth[best, -1], worth[stated, -1]):
+            raise InputError(
+                f"{where} is {_READINGS[ways[best]]}, given as {_READINGS[ways[stated]]}: the "
+                f"cloud shows it (median error {at(best)} against {at(stated)}). State what it is."
+            )
+        worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
+        if helps and worse and far_better(worth[stated, -1], worth[stated, gauge]):
+            raise InputError(
+                f"{where} is no depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
+                f"{at(stated, gauge)}, and {at(stated)} {_GAUGES['affine']} (`gauge` affine)."
+            )
+        best = stated
+    else:
+        plain = ways.index((ways[best][0], "axis"))
+        if not far_better(worth[best, -1], worth[plain, -1]):
+            best = plain
+        gauge = [far_better(worth[best, -1], one) for one in worth[best]].index(False)
+        caution(
+            f"{where} is taken to be {_READINGS[ways[best]]} {_GAUGES[gauges[gauge]]}, as the "
+            f"cloud shows: its median error at {errors.shape[-1]} observations is "
+            f"{at(best, gauge)}. `inverse`, `along` and `gauge` state it.",
+            stacklevel=4,
+        )
+    inverse, along = ways[best]
+    if (inverse, along, gauges[gauge]) == _OURS:
+        return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
+    off = lines.new_zeros(len(prior.names))
+    for one in torch.unique(seen.place[:, 0]).tolist():
+        off[one] = _TO_DEVIATION * errors[best, gauge, seen.place[:, 0] == one].median()
+    return _in_scene(prior, scene, along, inverse, lines[best, gauge], off)
+
+
+def _in_scene(
+    prior: DepthPrior, scene: SparseScene, along: Along, inverse: bool, lines: Tensor, off: Tensor
+) -> DepthPrior:
+    """Turn values to depth along the camera's axis in scene units; differentiable in them.
+
+    Args:
+        lines: Factor and offset of each map; NaN where too few points tell them.
+        off: Relative error of each map at the points, of which the standard error is at least.
+    """
+    parts = (*lines.nan_to_num(0).unbind(dim=-1), off)
+    slope, offset, off = (one[:, None, None].to(prior.depth) for one in parts)
+    truth = slope * prior.depth + offset
+    known = prior.variance.isfinite() & (truth > 0)
+    truth = torch.where(known, truth, 1)
+    relative = slope * torch.where(known, prior.variance, 1).sqrt() / truth
+    depth = 1 / truth if inverse else truth
+    if along == "ray":
+        depth = depth / _lengths(prior, scene)
+    variance = (depth * torch.maximum(relative, off)).square()
+    return prior.replace(
+        depth=torch.where(known, depth, 0),
+        variance=torch.where(known, variance, torch.inf),
+        along="axis",
+        inverse=False,
+        gauge="scene",
+    )
+
+
+def _lengths(prior: DepthPrior, scene: SparseScene) -> Float[Tensor, "map height width"]:
+    """Return how long rays through the pixels of each map are for a depth of 1."""
+    height, width = prior.depth.shape[1:]
+    views = torch.tensor([scene.views.names.index(name) for name in prior.names])
+    zoom = (scene.cameras.sizes_px[views] / prior.sizes_px)[:, None, None]
+    pixels = homogeneous(pixel_centers(width, height, like=prior.depth) * zoom.to(prior.depth))
+    inverse = torch.linalg.inv(scene.cameras.intrinsics[views]).to(pixels)
+    return (pixels @ inverse[:, None].mT).norm(dim=-1)
+
+
+@torch.no_grad()
+def _compared(
+    prior: DepthPrior, scene: SparseScene
+) -> tuple[Float[Tensor, "reading gauge map 2"], Tensor, AtPoints]:
+    """Fit all readings, and last none, to the cloud in every gauge.
+
+    Returns:
+        Factor and offset of each map, NaN where fewer points than needed tell them; relative
+        errors, ``reading gauge observation``; and the observations.
+    """
+    seen = at_points(prior, prior.variance.isfinite(), scene)
+    count = torch.bincount(seen.place[:, 0], minlength=len(prior.names))
+    seen = seen.take(count[seen.place[:, 0]] >= _FEWEST)
+    K, ends = scene.cameras.intrinsics[seen.view], homogeneous(seen.pixels)[..., None]
+    lengths = torch.linalg.solve(K, ends).norm(dim=1)[:, 0].double()
+    values, axis = prior.depth[seen.place.unbind(dim=-1)].double(), seen.depth.double()
+    depths = [axis * lengths if along == "ray" else axis for _, along in _READINGS]
+    truths = [
+        1 / depth if inverse else depth
+        for depth, (inverse, _) in zip(depths, _READINGS, strict=True)
+    ]
+    lines = values.new_full((len(truths) + 1, len(_GAUGES), len(prior.names), 2), torch.nan)
+    lines[:, 0] = lines.new_tensor([1.0, 0.0])
+    pairs = [*((values, truth) for truth in truths), (torch.zeros_like(values), axis)]
+    for one in torch.unique(seen.place[:, 0]).tolist():
+        here = seen.place[:, 0] == one
+        for reading, (given, truth) in enumerate(pairs):
+            lines[reading, 1, one] = _line(given[here], truth[here], offset=False)
+            lines[reading, 2, one] = _line(given[here], truth[here], offset=True)
+    own = lines[:, :, seen.place[:, 0]]
+    given, truth = (torch.stack(part)[:, None] for part in zip(*pairs, strict=True))
+    return lines, (own[..., 0] * given + own[..., 1] - truth).abs() / truth, seen
+
+
+def _line(
+    values: Float[Tensor, " point"], truth: Float[Tensor, " point"], *, offset: bool
+) -> Float[Tensor, "2"]:
+    """Fit ``a values + b``, ``a`` at least 0, for small absolute errors; return both."""
+    weight = torch.ones_like(truth)
+    for _ in range(_STEPS):
+        weight = weight / weight.sum()
+        means = [(weight * one).sum() * offset for one in (values, truth)]
+        across, along = values - means[0], truth - means[1]
+        squares = (weight * across.square()).sum().clamp_min(1e-300)
+        slope = ((weight * across * along).sum() / squares).clamp_min(0)
+        error = (along - slope * across).abs()
+        weight = 1 / error.clamp_min(1e-3 * float(error.median()) + 1e-12 * float(truth.mean()))
+    return torch.stack([slope, means[1] - slope * means[0]])

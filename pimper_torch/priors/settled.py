@@ -1,0 +1,42 @@
+"""Priors whose meaning is decided, and agrees with the scene."""
+
+from pimper_torch.priors.depth import settled_depth
+from pimper_torch.priors.normals import settled_normals
+from pimper_torch.records import DepthPrior, NormalPrior, Prior, Silhouettes, SparseScene
+from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+
+
+def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> SparseScene:
+    """Decide what normals and depth in ``views.priors`` mean, by cloud, cameras and silhouettes.
+
+    Priors of the original photographs are undistorted before. What was left open is found, and
+    told in a warning; what contradicts the scene by far is refused by name. Where the scene tells
+    nothing, what is stated is believed.
+
+    Args:
+        silhouettes: Of the object, where they are known.
+
+    Returns:
+        Normals in our axes of the camera, or in the world; depth along its axis in scene units.
+        Differentiable in what priors hold.
+
+    Raises:
+        InputError: Names what contradicts, or what has to be stated.
+    """
+    if not scene.views.priors:
+        return scene
+    scene = with_undistorted_priors(scene)
+
+    names = scene.views.names
+
+    def decided(prior: Prior) -> Prior:
+        there = [index for index, name in enumerate(prior.names) if name in names]
+        if not there or not isinstance(prior, NormalPrior | DepthPrior):
+            return prior
+        prior = prior.take(there)
+        if isinstance(prior, NormalPrior):
+            return settled_normals(prior, scene, silhouettes)
+        return settled_depth(prior, scene)
+
+    priors = tuple(decided(prior) for prior in scene.views.priors)
+    return scene.replace(views=scene.views.replace(priors=priors))

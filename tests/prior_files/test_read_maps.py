@@ -1,0 +1,302 @@
+import math
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, PngImagePlugin
+from torch.testing import assert_close
+
+from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.exchange.openexr import read_exr, write_exr
+from pimper_torch.io.decode import write_deep_png
+from pimper_torch.prior_files.read_depth import read_depth
+from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.priors.from_maps import NORMALS_ERROR_DEG
+from pimper_torch.records import Views
+
+
+@pytest.fixture
+def views():
+    names = ("a b.jpg", "cup_1.png")
+    return Views(
+        images=torch.zeros(2, 3, 24, 32),
+        sizes_px=torch.tensor([[32, 24], [24, 24]]),
+        names=names,
+        focals_px=torch.full((2,), torch.nan),
+    )
+
+
+@pytest.fixture
+def normals():
+    """Normals of a photograph of 32 x 24, the last row of them missing."""
+    drawn = np.random.default_rng(4).normal(size=(24, 32, 3)).astype(np.float32)
+    drawn /= np.linalg.norm(drawn, axis=-1, keepdims=True)
+    drawn[-1] = 0
+    return drawn
+
+
+def save(path, values):
+    if path.suffix == ".exr":
+        write_exr(values, path)
+    elif path.suffix == ".npz":
+        np.savez(path, normals=values, albedo=np.ones((2, 2)), allow_pickle=False)
+    elif path.suffix == ".npy":
+        np.save(path, values, allow_pickle=False)
+    elif "8" in path.name:
+        Image.fromarray(np.rint(255 * (values + 1) / 2).astype(np.uint8)).save(path)
+    else:
+        write_deep_png(np.rint(65535 * (values + 1) / 2).astype(np.uint16), path)
+
+
+@pytest.mark.parametrize(
+    ("file", "tolerance"),
+    [
+        ("a_b.npy", 1e-6),
+        ("a b.npz", 1e-6),
+        ("A B.exr", 1e-6),
+        ("a b.png", 3e-5),
+        ("a b.jpg.npy", 1e-6),
+    ],
+)
+def test_normals_of_every_format_are_what_was_written(file, tolerance, views, normals, tmp_path):
+    save(tmp_path / file, normals)
+    found = read_normals(tmp_path, views, "opencv")
+    assert found.names == ("a b.jpg",)
+    assert (found.axes, found.frame, found.undistorted) == ("opencv", "camera", False)
+    assert_close(found.normals[0], torch.from_numpy(normals), rtol=0, atol=tolerance)
+    assert found.variance[0, -1].isinf().all()
+    expected = torch.full((23, 32), math.radians(NORMALS_ERROR_DEG) ** 2)
+    assert_close(found.variance[0, :-1], expected)
+    found.check("test")
+
+
+def test_eight_bits_and_arrays_in_unit_range_are_decoded(views, normals, tmp_path):
+    normals = normals[:, :24]
+    Image.fromarray(np.rint(255 * (normals + 1) / 2).astype(np.uint8)).save(tmp_path / "cup_1.png")
+    np.save(
+        tmp_path / "a b.npy",
+        ((normals + 1) / 2).transpose(2, 0, 1)[None, :, :18],
+        allow_pickle=False,
+    )
+    found = read_normals(tmp_path, views, "dsine", error_deg=10)
+    assert found.sizes_px.tolist() == [[24, 18], [24, 24]]
+    assert found.axes == "lub"
+    assert_close(found.normals[1], torch.from_numpy(normals), rtol=0, atol=0.01)
+    assert_close(found.normals[0, :17], torch.from_numpy(normals[:17]), rtol=0, atol=1e-6)
+    assert found.variance[0, 18:].isinf().all()  # the padding
+    assert_close(found.variance[1, 0, 0], torch.tensor(math.radians(10.0) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("axes", "stored"),
+    [
+        ("auto", (None, "camera")),
+        ("opengl", ("opengl", "camera")),
+        ("lub", ("lub", "camera")),
+        ("world", ("opencv", "world")),
+    ],
+)
+def test_axes_are_kept_as_they_are_stated(axes, stored, views, normals, tmp_path):
+    save(tmp_path / "a b.npy", normals)
+    found = read_normals(tmp_path, views, axes)
+    assert (found.axes, found.frame) == stored
+
+
+def test_a_variance_beside_a_map_or_in_its_file_counts(views, normals, tmp_path):
+    variance = np.full((24, 32), 0.5, np.float32)
+    variance[0, 0], variance[1, 0], variance[2, 0] = 0, np.inf, np.nan
+    np.savez(tmp_path / "a b.npz", normals=normals, variance=variance, allow_pickle=False)
+    save(tmp_path / "cup_1_normal.npy", normals[:, :24])
+    np.save(tmp_path / "cup_1_variance.npy", variance[:, :24], allow_pickle=False)
+    found = read_normals(tmp_path, views)
+    for index, width in ((0, 32), (1, 24)):
+        got = found.variance[index, :, :width]
+        assert got[0, 0] == torch.inf  # no error is no variance
+        assert got[1, 0] == math.radians(NORMALS_ERROR_DEG) ** 2 or got[1, 0].isinf()
+        assert (got[3:23] == 0.5).all()
+        assert got[23].isinf().all()
+    np.save(tmp_path / "cup_1_variance.npy", variance[:, :8], allow_pickle=False)
+    with pytest.raises(InputError, match="its variance is 8 x 24; needed: 24 x 24"):
+        read_normals(tmp_path, views)
+
+
+def test_depth_of_every_format_is_what_was_written(views, tmp_path):
+    drawn = np.random.default_rng(4).uniform(2, 5, size=(24, 32)).astype(np.float32)
+    drawn[0, :3] = 0, np.nan, np.inf
+    write_exr(drawn[..., None], tmp_path / "a b_depth.exr")
+    np.savez(tmp_path / "cup_1.npz", depth=drawn[:, :24], normals=drawn, allow_pickle=False)
+    found = read_depth(tmp_path, views, False, gauge="scale", error=0.1)
+    for index, width in ((0, 32), (1, 24)):
+        expected = torch.from_numpy(drawn[:, :width])
+        assert found.variance[index, 0, :3].isinf().all()
+        assert_close(found.depth[index, 1:, :width], expected[1:])
+        assert_close(found.variance[index, 1:, :width], (0.1 * expected[1:]) ** 2)
+    assert (found.inverse, found.along, found.gauge) == (False, "axis", "scale")
+    found.check("test")
+    left_open = read_depth(tmp_path, views, error=0.1)
+    assert left_open.inverse is None
+    # Where maps have an offset of their own, relative to their range without its ends: 0.96 x 3.
+    span = math.sqrt(float(left_open.variance[0, 5, 5])) / 0.1
+    assert span == pytest.approx(0.96 * 3, rel=0.05)
+
+
+def test_depth_in_levels_of_sixteen_bits_is_up_to_its_scale(views, tmp_path):
+    levels = np.random.default_rng(4).integers(0, 65536, size=(24, 32)).astype(np.uint16)
+    levels[0, 0] = 0
+    Image.fromarray(levels).save(tmp_path / "a b.png")
+    found = read_depth(tmp_path, views)
+    assert_close(found.depth[0] * 65535, torch.from_numpy(levels.astype(np.float32)))
+    assert found.variance[0, 0, 0].isinf()
+
+
+def test_logarithmic_depth_of_moge_is_metres(views, tmp_path):
+    """As its authors write it: 1 to 65534 are logarithms from near to far, 0 is nothing."""
+    near, far = 0.7, 12.5
+    depth = np.random.default_rng(4).uniform(near, far, size=(24, 32))
+    levels = (1 + np.round(np.log(depth / near) / np.log(far / near) * 65533)).astype(np.uint16)
+    levels[0, 0], levels[0, 1] = 0, 65535
+    text = PngImagePlugin.PngInfo()
+    text.add_text("near", str(near))
+    text.add_text("far", str(far))
+    Image.fromarray(levels).save(tmp_path / "a b.png", pnginfo=text)
+    found = read_depth(tmp_path, views)
+    assert found.variance[0, 0, :2].isinf().all()
+    expected = torch.from_numpy(depth.astype(np.float32))
+    assert_close(found.depth[0, 1:], expected[1:], rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("packing", [0, 2, 3])
+def test_open_exr_of_others_is_read(packing, tmp_path):
+    """Half floats and a window that does not begin at 0, in the order of channels' names."""
+    values = np.random.default_rng(4).normal(size=(19, 13, 2))
+    half, whole = values[..., 0].astype("<f2"), values[..., 1].astype("<u4")
+    listed = b"".join(
+        name + b"\0" + struct.pack("<IIII", kind, 0, 1, 1)
+        for name, kind in ((b"Depth.V", 1), (b"id", 0))
+    )
+    window = struct.pack("<4i", -4, 7, 8, 25)
+    header = b"\x76\x2f\x31\x01" + struct.pack("<I", 2)
+    for name, data in (
+        (b"channels", listed + b"\0"),
+        (b"compression", bytes([packing])),
+        (b"dataWindow", window),
+    ):
+        header += name + b"\0kind\0" + struct.pack("<I", len(data)) + data
+    header += b"\0"
+    step = {0: 1, 2: 1, 3: 16}[packing]
+    blocks = []
+    for first in range(0, 19, step):
+        rows = range(first, min(first + step, 19))
+        raw = b"".join(half[row].tobytes() + whole[row].tobytes() for row in rows)
+        plain = np.frombuffer(raw, np.uint8).astype(np.int64)
+        order = np.concatenate([plain[::2], plain[1::2]])
+        coded = np.concatenate([order[:1], np.diff(order) + 128]) % 256
+        packed = zlib.compress(coded.astype(np.uint8).tobytes()) if packing else raw
+        packed = raw if len(packed) >= len(raw) else packed
+        blocks.append(struct.pack("<iI", 7 + first, len(packed)) + packed)
+    at = len(header) + 8 * len(blocks)
+    table = np.cumsum([at, *map(len, blocks[:-1])]).astype("<u8").tobytes()
+    path = tmp_path / "x.exr"
+    path.write_bytes(header + table + b"".join(blocks))
+    found = read_exr(path, 1000)
+    assert np.array_equal(found["Depth.V"], half.astype(np.float32))
+    assert np.array_equal(found["id"], whole.astype(np.float32))
+    with pytest.raises(ValueError, match="it says that it has 13 x 19 pixels of 2 channels"):
+        read_exr(path, 400)
+    data = path.read_bytes()
+    for cut in (*range(0, len(header), 7), len(header) + 9, len(data) - 20):
+        path.write_bytes(data[:cut])
+        with pytest.raises(ValueError, match=r"cut short or damaged|no OpenEXR"):
+            read_exr(path, 1000)
+
+
+def test_open_exr_that_is_not_read_says_what_it_is(tmp_path):
+    path = tmp_path / "x.exr"
+    write_exr(np.ones((4, 4, 1), np.float32), path)
+    data = bytearray(path.read_bytes())
+    data[5] = 2
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="has tiles or several parts"):
+        read_exr(path, 1000)
+    data[5] = 0
+    at = data.index(b"compression\0compression\0") + 28
+    data[at] = 4
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="packed otherwise than by ZIP"):
+        read_exr(path, 1000)
+
+
+def test_names_that_match_nothing_are_refused_with_the_nearest(views, normals, tmp_path):
+    save(tmp_path / "a b.npy", normals)
+    save(tmp_path / "cupp_1.npy", normals)
+    with pytest.raises(InputError, match=r"no map for cup_1.png, .* nearest .* is cupp_1.npy"):
+        read_normals(tmp_path, views)
+    (tmp_path / "cupp_1.npy").unlink()
+    assert read_normals(tmp_path, views).names == ("a b.jpg",)
+    # Maps of photographs that were left out since are no mistake.
+    alone = views.take([1])
+    save(tmp_path / "cup_1.npy", normals[:, :24])
+    assert read_normals(tmp_path, alone).names == ("cup_1.png",)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "what"),
+    [
+        ("a b.npy", np.ones((24, 32), np.float32), "has one value a pixel; .* Is it depth"),
+        ("a b.npy", np.ones((32, 24, 3), np.float32), "is 24 x 32, .* the file stores; turn them"),
+        ("a b.npy", np.ones((24, 24, 3), np.float32), "is 24 x 24, .* of its shape, at any size"),
+        ("a b.npy", np.ones((2, 24, 32, 5), np.float32), "has shape .*; needed: height width"),
+        ("a b.npy", np.full((24, 32, 3), "x"), "holds <U1; needed: real numbers"),
+        ("a b.npy", np.full((24, 32, 3), None), "cannot be read, it holds objects of Python"),
+    ],
+)
+def test_maps_that_are_none_are_refused(name, values, what, views, tmp_path):
+    np.save(tmp_path / name, values, allow_pickle=values.dtype == object)
+    with pytest.raises(InputError, match=what):
+        read_normals(tmp_path, views)
+
+
+def test_maps_without_a_value_are_refused(views, normals, tmp_path):
+    save(tmp_path / "a b.npy", 200 * normals)
+    with pytest.raises(InputError, match=r"hold nothing .* lengths from 0 to 200; needed: unit"):
+        read_normals(tmp_path, views)
+    np.save(tmp_path / "a b.npy", np.zeros((24, 32)), allow_pickle=False)
+    with pytest.raises(InputError, match=r"maps of a b.jpg hold nothing that can be used"):
+        read_depth(tmp_path, views)
+
+
+def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
+    coded = np.rint(65535 * (normals + 1) / 2).astype(np.uint16)
+    np.savez(tmp_path / "a b.npz", **{"View.Normals": coded, "x": coded}, allow_pickle=False)
+    found = read_normals(tmp_path, views, "opencv")
+    assert_close(found.normals[0, :23], torch.from_numpy(normals[:23]), rtol=0, atol=3e-5)
+
+
+def test_a_picture_of_depth_in_colours_is_refused(views, normals, tmp_path):
+    save(tmp_path / "a b.png", normals)
+    with pytest.raises(InputError, match="has colours; needed: one value a pixel"):
+        read_depth(tmp_path, views)
+
+
+def test_folders_and_archives_without_maps_are_refused(views, tmp_path):
+    with pytest.raises(InputError, match="found nothing; needed: a folder of maps"):
+        read_normals(tmp_path / "none", views)
+    with pytest.raises(InputError, match=r"holds no maps; needed: files ending in .npz"):
+        read_normals(tmp_path, views)
+    np.savez(tmp_path / "a b.npz", x=np.ones(3), y=np.ones(3), allow_pickle=False)
+    with pytest.raises(InputError, match="holds x, y; needed: one array or channel called depth"):
+        read_depth(tmp_path, views)
+    (tmp_path / "a b.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"a b.npz: cannot be read, it is no archive"):
+        read_depth(tmp_path, views)
+
+
+def test_standard_errors_are_above_zero(views, normals, tmp_path):
+    save(tmp_path / "a b.npy", normals)
+    with pytest.raises(ConfigError, match="error_deg is 0"):
+        read_normals(tmp_path, views, error_deg=0)
+    np.save(tmp_path / "a b.npy", normals[..., 0], allow_pickle=False)
+    with pytest.raises(ConfigError, match="error is -1"):
+        read_depth(tmp_path, views, error=-1)

@@ -1,0 +1,197 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.records import (
+    AlbedoPrior,
+    DepthPrior,
+    InlierPrior,
+    Lens,
+    LightPrior,
+    NormalPrior,
+    SilhouettePrior,
+)
+from pimper_torch.sfm.quarter_turns import turned_views
+from pimper_torch.sfm.undistort import photograph_pixels
+from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+
+SIZE = 60, 40
+BARREL = Lens(camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40)
+PINCUSHION = BARREL.replace(params=(40.0, 31.0, 19.0, 2.0))  # looks past the edge
+
+
+@pytest.fixture
+def scene(reconstruction):
+    return reconstruction.scene.replace(lenses=(BARREL, PINCUSHION, BARREL))
+
+
+def placed(scene, *priors):
+    scene = scene.replace(views=scene.views.replace(priors=priors))
+    found = with_undistorted_priors(scene).views.priors
+    assert all(prior.undistorted for prior in found)
+    return found
+
+
+@pytest.mark.parametrize("size", [(60, 40), (30, 20), (90, 80)])
+def test_maps_of_any_size_move_with_the_photograph(scene, size):
+    """A ramp shows where every pixel came from; both ends count in pixels of the map."""
+    width, height = size
+    ramp = pixel_centers(width, height, like=torch.zeros(()))
+    raster = torch.full((1, height + 3, width + 5), torch.nan)
+    raster[:, :height, :width] = ramp[..., 0]
+    prior = DepthPrior(
+        names=("a.png",),
+        sizes_px=torch.tensor([size]),
+        depth=raster,
+        variance=torch.full_like(raster, 0.01),
+    )
+    (found,) = placed(scene, prior)
+    factor = torch.tensor([60 / width, 40 / height], dtype=torch.float64)
+    expected = photograph_pixels(BARREL, width, height)
+    whole = photograph_pixels(BARREL)
+    if size == (60, 40):
+        assert_close(expected, whole)
+    # The lens itself, in pixels of the photograph: f (1 + k r^2) x + c.
+    f, cx, cy, k = BARREL.params
+    plane = (ramp.double() * factor - torch.tensor([cx, cy])) / f
+    lens = f * (1 + k * plane.square().sum(-1, keepdim=True)) * plane + torch.tensor([cx, cy])
+    assert_close(expected, lens / factor, rtol=0, atol=1e-9)
+    inner = (expected >= 0.5).all(-1) & (expected <= torch.tensor(size) - 0.5).all(-1)
+    assert inner.float().mean() > 0.95
+    got = found.depth[0, :height, :width].double()
+    assert_close(got[inner], expected[..., 0][inner], rtol=0, atol=1e-4)
+    assert (found.sizes_px == prior.sizes_px).all()
+    # Of a ramp, neighbours differ by 1 at most: a quarter of that squared is added.
+    assert (found.variance[0, :height, :width] >= 0.01 - 1e-6).all()
+    assert (found.variance[0, :height, :width] <= 0.26 + 1e-6).all()
+
+
+def test_what_looks_past_the_edge_is_unknown(scene):
+    ones = torch.ones(1, 40, 60)
+    names, sizes = ("b.png",), torch.tensor([SIZE])
+    depth = DepthPrior(names=names, sizes_px=sizes, depth=ones, variance=ones)
+    inside = SilhouettePrior(names=names, sizes_px=sizes, inside=ones)
+    inlier = InlierPrior(names=names, sizes_px=sizes, probability=ones)
+    depth, inside, inlier = placed(scene, depth, inside, inlier)
+    source = photograph_pixels(PINCUSHION)
+    past = ~((source >= 0) & (source <= torch.tensor(SIZE))).all(-1)
+    assert 0.02 < past.float().mean() < 0.5
+    assert torch.equal(depth.variance[0].isinf(), past)
+    assert_close(depth.variance[0][~past], ones[0][~past])
+    for probability in (inside.inside, inlier.probability):
+        assert (probability[0][past] == 0.5).all()
+        assert_close(probability[0][~past], ones[0][~past])
+
+
+def test_values_count_by_their_precision(scene):
+    """A column that is not known counts for nothing; one that is hardly known, for hardly more."""
+    columns = torch.arange(60.0).expand(1, 40, 60)
+    odd = (columns % 2 == 1) & (columns > 0)
+    values = torch.where(odd, 7.0, 3.0)
+    names, sizes = ("a.png",), torch.tensor([SIZE])
+
+    def resampled(variance):
+        weight = torch.where(odd, variance, 0.04)
+        prior = AlbedoPrior(names=names, sizes_px=sizes, albedo=values[:, None], variance=weight)
+        (found,) = placed(scene, prior)
+        return found.albedo[:, 0], found.variance
+
+    unknown, variance = resampled(torch.inf)
+    known = variance.isfinite()
+    assert known.float().mean() > 0.8
+    assert_close(unknown[known], torch.full_like(unknown[known], 3.0))
+    assert (variance[known] >= 0.04 - 1e-6).all()
+    (vague, _), (evenly, mixed) = resampled(4.0), resampled(0.04)
+    assert ((vague - 3).abs() <= (evenly - 3).abs() + 1e-5).all()
+    # In the middle between 3 and 7, which is nowhere, the mean is 2 off either of them.
+    middle = (evenly - 5).abs() < 0.05
+    assert middle.any()
+    assert_close(mixed[middle], torch.full_like(mixed[middle], 4.04), rtol=0.01, atol=0)
+
+
+def test_normals_stay_unit_and_their_spread_counts(scene, generator):
+    normals = torch.randn(2, 20, 30, 3, generator=generator)
+    normals = normalize(normals, dim=-1)
+    prior = NormalPrior(
+        names=("z.png", "c.png"),
+        sizes_px=torch.tensor([[30, 20], [30, 20]]),
+        normals=normals,
+        variance=torch.full((2, 20, 30), 0.01),
+    )
+    (found,) = placed(scene, prior)
+    assert found.names == ("c.png",)  # of a photograph that is not in the scene there is nothing
+    found.check("test")
+    # Of unit vectors that are merged, the mean square about the mean is 1 - |mean|^2.
+    at = photograph_pixels(BARREL, 30, 20)[9, 14] - 0.5
+    column, row = (int(value) for value in at.floor())
+    part = at - at.floor()
+    weights = torch.tensor([[1 - part[1]], [part[1]]]) * torch.tensor([1 - part[0], part[0]])
+    corner = normals[1, row : row + 2, column : column + 2].double()
+    mean = (weights[..., None] * corner).sum(dim=(0, 1))
+    assert_close(found.normals[0, 9, 14].double(), normalize(mean, dim=0), rtol=0, atol=1e-5)
+    expected = 0.01 + 1 - mean.square().sum()
+    assert_close(found.variance[0, 9, 14].double(), expected, rtol=0, atol=1e-5)
+
+
+def test_a_photograph_without_distortion_keeps_its_map_bit_for_bit(reconstruction, generator):
+    depth = torch.rand(1, 13, 17, generator=generator)
+    prior = DepthPrior(
+        names=("a.png",),
+        sizes_px=torch.tensor([[17, 13]]),
+        depth=depth,
+        variance=depth + 1,
+    )
+    for lenses in (reconstruction.scene.lenses, ()):
+        (found,) = placed(reconstruction.scene.replace(lenses=lenses), prior)
+        assert torch.equal(found.depth, depth)
+        assert torch.equal(found.variance, depth + 1)
+
+
+def test_maps_of_undistorted_photographs_and_lights_stay(scene):
+    ones = torch.ones(1, 4, 4)
+    inside = SilhouettePrior(
+        names=("a.png",), sizes_px=torch.tensor([[4, 4]]), inside=ones, undistorted=True
+    )
+    lights = LightPrior(lights=torch.ones(1, 4), variance=torch.ones(1), names=("a.png",))
+    given = scene.replace(views=scene.views.replace(priors=(inside, lights)))
+    assert with_undistorted_priors(given) is given
+
+
+def test_gradients_reach_values_and_variances(scene):
+    lens = BARREL.replace(width=6, height=5, params=(6.0, 3.0, 2.5, 1.0))
+    scene = scene.replace(lenses=(lens,) * 3)
+
+    def resampled(normals, variance):
+        prior = NormalPrior(
+            names=("a.png",),
+            sizes_px=torch.tensor([[6, 5]]),
+            normals=normals,
+            variance=variance,
+        )
+        (found,) = placed(scene, prior)
+        known = found.variance.isfinite()
+        return found.normals[known], found.variance[known]
+
+    generator = torch.Generator().manual_seed(3)
+    normals = torch.randn(1, 5, 6, 3, generator=generator).double().requires_grad_()
+    variance = torch.rand(1, 5, 6, generator=generator).double() + 1
+    assert torch.autograd.gradcheck(resampled, (normals, variance.requires_grad_()))
+    # An unknown value, even one that is no number, sends none back.
+    hole = variance.detach().clone()
+    hole[0, 2, 3] = torch.inf
+    broken = normals.detach().clone()
+    broken[0, 2, 3] = torch.nan
+    broken.requires_grad_()
+    resampled(broken, hole)[0].sum().backward()
+    assert broken.grad.isfinite().all()
+    assert (broken.grad[0, 2, 3] == 0).all()
+
+
+def test_turned_photographs_carry_no_priors(scene):
+    ones = torch.ones(1, 4, 4)
+    prior = SilhouettePrior(names=("a.png",), sizes_px=torch.tensor([[4, 4]]), inside=ones)
+    views = scene.views.replace(priors=(prior,))
+    assert turned_views(views, [0, 0, 0]).priors == (prior,)
+    assert turned_views(views, [1, 0, 0]).priors == ()
