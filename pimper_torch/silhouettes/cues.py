@@ -23,6 +23,7 @@ from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
 from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictures
 from pimper_torch.silhouettes.seeds import MIN_POINTS
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.silhouettes.soft_masks import FEW, SoftMasks, soft_masks_of
 
 _PROBES = 5  # places along each side of a region that photographs are asked for
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
@@ -41,6 +42,7 @@ class Cues(Record):
         agreement: With the texture of plane and room, the better of both.
         fixation: Where the cameras look.
         box_world: The object is inside.
+        soft: Masks that the photographs come with as priors.
     """
 
     pictures: Pictures
@@ -51,6 +53,7 @@ class Cues(Record):
     agreement: Float[Tensor, "view height width"] | None
     fixation: Fixation
     box_world: Float[Tensor, "2 3"]
+    soft: SoftMasks | None
 
     @property
     def num_views(self) -> int:
@@ -81,6 +84,34 @@ class Cues(Record):
         if found is None or self.agreement is None:
             return self
         return self.replace(agreement=torch.where(found.isnan(), self.agreement, found))
+
+    def without(
+        self, doubted: Bool[Tensor, " view"]
+    ) -> tuple["Cues", Bool[Tensor, " view"] | None]:
+        """Leave soft masks out, and find the views that have one; ``None`` where they are few."""
+        if self.soft is None:
+            return self, None
+        given = self.soft.given & ~doubted
+        voting = given if int(given.sum()) >= FEW else None
+        return self.replace(soft=self.soft.replace(given=given)), voting
+
+    def looked_at(self) -> "Cues":
+        """Point at the fixation point in every view."""
+        if self.soft is None:
+            return self
+        cameras, place = self.pictures.cameras, self.fixation.fixation_world[None]
+        pixels, _ = project(place, cameras.cam_from_world, cameras.intrinsics)
+        return self.replace(soft=self.soft.replace(seeds_px=tuple(pixels)))
+
+    def seen_in(self, seen: Float[Tensor, "view height width"]) -> "Cues":
+        """Keep points inside the hull alone where soft masks tell of the object."""
+        if self.soft is None:
+            return self
+        kept = []
+        for pixels, margin in zip(self.object_px, seen, strict=True):
+            column, row = pixels.floor().long().unbind(dim=1)
+            kept.append(pixels[margin[row, column] > 0])
+        return self.replace(object_px=tuple(kept))
 
     def observed(self) -> "Cues":
         """Learn the backgrounds' texture, if there are any."""
@@ -127,6 +158,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
         agreement=None,
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
+        soft=soft_masks_of(scene.views, pictures),
     ).observed()
 
 

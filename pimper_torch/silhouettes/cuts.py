@@ -1,7 +1,7 @@
 """Alternate cuts of every view with a vote of all views on their visual hull."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -27,15 +27,21 @@ from pimper_torch.silhouettes.seeds import (
     is_deep,
     labels_from_hull,
     labels_from_points,
+    labels_from_soft,
     not_seen_through,
     off_level,
     off_plane,
+    surely_on_plane,
 )
 from pimper_torch.silhouettes.settings import SilhouetteDetails
+from pimper_torch.silhouettes.soft_masks import FEW, pointed_at
 
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut
 _SPECK = 2e-4  # fraction of the picture
+# Fractions of the views that may lack what the others have in common, tried in turn until that
+# takes so much of a median mask; a mask that shows less than this of it is of something else.
+_DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
@@ -50,13 +56,15 @@ class Cuts(Record):
         exposed: Fraction of each cut that shows a background for certain.
         held: Fraction of the object's points that each cut holds.
         on_plane: Whether the object stands on a plane.
+        doubted: Views whose soft mask was not used.
     """
 
     masks: Bool[Tensor, "view height width"]
     margins_px: Float[Tensor, "view height width"]
     exposed: Float[Tensor, " view"]
     held: Float[Tensor, " view"]
-    on_plane: bool = False
+    on_plane: bool
+    doubted: Bool[Tensor, " view"]
 
 
 def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
@@ -70,23 +78,27 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
         ``None`` where the cuts have nothing in common.
     """
     masks, unknown = _first(cues), _unknown(cues)
+    doubted = _doubted(cues, masks, details)
+    cues, voting = cues.without(doubted)
     for _ in range(details.iterations):
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
-        seen = _voted(cues, masks | _likely(cues), details, unknown)
+        seen = _voted(cues, masks | _likely(cues), details, unknown, voting)
         if seen is None:
             return None
+        cues, voting = cues.seen_in(seen), None
         masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
     seen = _voted(cues, masks, details)
-    return None if seen is None else cuts_of(cues, masks, seen)
+    return None if seen is None else cuts_of(cues.seen_in(seen), masks, seen, doubted)
 
 
 def cuts_of(
     cues: Cues,
     masks: Bool[Tensor, "view height width"],
     margins_px: Float[Tensor, "view height width"],
+    doubted: Bool[Tensor, " view"],
 ) -> Cuts:
     """Compare cuts with backgrounds and points."""
 
@@ -100,6 +112,7 @@ def cuts_of(
         exposed=of_views(exposed, len(masks)),
         held=of_views(lambda view: held_fraction(masks[view], cues.object_px[view]), len(masks)),
         on_plane=cues.plane is not None,
+        doubted=doubted,
     )
 
 
@@ -118,13 +131,16 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
 
     So they do where hardly any points are the object's.
 
-    Every other pixel is enough: all are cut again.
+    Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
     """
     height, width = cues.pictures.grey.shape[1:]
 
     def first(view: int) -> Bool[Tensor, "height width"]:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
+        if cues.soft is not None and cues.soft.given[view]:
+            mask = cues.soft.masks[view]
+            return mask if agreement is None else mask & ~surely_on_plane(agreement)
         if agreement is not None and (cues.all_round or not cues.has_points):
             return off_plane(agreement) | not_seen_through(object_px, agreement)
         labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
@@ -146,6 +162,8 @@ def _again(
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
+        if cues.soft is not None and cues.soft.given[view]:
+            labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
         cut = _cut(grab_cut, cues, view, labels, seen[view])
         return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
 
@@ -184,6 +202,23 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
     return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
+def _doubted(
+    cues: Cues, masks: Bool[Tensor, "view height width"], details: SilhouetteDetails
+) -> Bool[Tensor, " view"]:
+    """Find soft masks that lack most of what most of them have in common; all if that is little."""
+    if cues.soft is None or int(cues.soft.given.sum()) < FEW:
+        return torch.zeros(len(masks), dtype=torch.bool)
+    given = cues.soft.given
+    for disagreeing in (details.disagreeing, *_DISAGREEING):
+        seen = _voted(cues, masks, replace(details, disagreeing=disagreeing), None, given)
+        if seen is not None:
+            common = seen > 0
+            shown, own = (one.sum(dim=(1, 2)).clamp_min(1) for one in (common, masks))
+            if (shown / own)[given].median() >= _COMMON:
+                return given & ((masks & common).sum(dim=(1, 2)) < _HELD * shown)
+    return given
+
+
 def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
     """Find what a first cut by parallax knows nothing of, as beyond the plane."""
     if cues.agreement is None or cues.has_points:
@@ -196,12 +231,17 @@ def _voted(
     masks: Bool[Tensor, "view height width"],
     details: SilhouetteDetails,
     unknown: Bool[Tensor, "view height width"] | None = None,
+    voting: Bool[Tensor, " view"] | None = None,
 ) -> Float[Tensor, "view height width"] | None:
-    """Build the hull above the plane, and see it in every view."""
+    """Build the hull above the plane, of what is pointed at, and see it in every view.
+
+    Args:
+        voting: Views that do; all by default.
+    """
     cameras = cues.pictures.cameras
-    silhouettes = Silhouettes(
-        inside=masks.float(), reliable=torch.ones(len(masks), dtype=torch.bool), source="found"
-    )
+    if voting is None:
+        voting = torch.ones(len(masks), dtype=torch.bool)
+    silhouettes = Silhouettes(inside=masks.float(), reliable=voting, source="found")
     hull = visual_hull(
         silhouettes,
         cameras,
@@ -214,6 +254,8 @@ def _voted(
         return None
     if cues.plane is not None:
         hull = hull.above(cues.plane.normal_world, cues.plane.offset)
+    if cues.soft is not None:
+        hull = pointed_at(hull, cameras, cues.soft.seeds_px)
     height, width = masks.shape[1:]
 
     def margin(view: int) -> Float[Tensor, "height width"]:

@@ -13,13 +13,14 @@ from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.contours import box_round
 from pimper_torch.silhouettes.contradictions import contradictory
 from pimper_torch.silhouettes.cues import Cues, cues_of
-from pimper_torch.silhouettes.cuts import cut_in_iterations
+from pimper_torch.silhouettes.cuts import Cuts, cut_in_iterations
 from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.probabilities import silhouettes_of
 from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.stage import Stage
 
 _USED = 0.25  # probability above which a pixel is used as the object's
+_UNLIKE = "its soft mask lacks most of what the others have in common"
 _BY_HULL = "The hull of the other masks stands in for them, and they do not constrain the surface"
 
 
@@ -97,17 +98,25 @@ class FindSilhouettes(Stage):
     def _found(self, scene: SparseScene) -> Silhouettes:
         """Find silhouettes in photographs between which the object was not moved."""
         cues = cues_of(scene, self.config, self.details)
-        cuts = None
-        if cues.agreement is not None or cues.has_points:
-            cuts = cut_in_iterations(cues, self.details)
-        doubt = "the views' silhouettes have nothing in common"
-        if cuts is not None:
-            doubt = self._doubt(agreement_of(cuts))
-        leave_out("silhouettes.doubt", cuts is None or bool(doubt))
+        cuts, doubt = self._cut(cues)
+        if doubt and cues.soft is not None and not cues.soft.points:
+            # Several things stand apart: the one that cameras look at is likelier than all.
+            cuts, doubt = self._cut(cues.looked_at())
+        leave_out("silhouettes.doubt", bool(doubt))
         if cuts is None or doubt:
             _warn(doubt, cues.plane is not None)
             return Silhouettes.everything(scene.views, self._top(cues))
+        _tell(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
         return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
+
+    def _cut(self, cues: Cues) -> tuple[Cuts | None, str]:
+        """Cut all views, and state why the cuts are unreliable, or nothing."""
+        cuts = None
+        if cues.agreement is not None or cues.has_points or cues.soft is not None:
+            cuts = cut_in_iterations(cues, self.details)
+        if cuts is None:
+            return None, "the views' silhouettes have nothing in common"
+        return cuts, self._doubt(agreement_of(cuts))
 
     def _top(self, cues: Cues) -> Float[Tensor, "plane 4"] | None:
         """Return the upper side of the supporting plane, as thick as its points are rough."""

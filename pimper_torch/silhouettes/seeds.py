@@ -28,6 +28,7 @@ _THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
 _MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
 _GRAIN = 1 / 200  # what is smaller in parallax is noise
 _GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
+_BAND = 1 / 160  # about the border of a soft mask
 _FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
 # Half a window of agreement: next to the object a window that holds some of it agrees no more. On
 # rendered scenes of 24 views (armadillo, mug, balls, potatoes) twice as much is no better.
@@ -57,7 +58,7 @@ def labels_from_points(
     region = convex_hull_of(object_px, size_px)
     labels = torch.full(size_px[::-1], PERHAPS_BACKGROUND, dtype=torch.uint8)
     if agreement is not None:
-        labels[_surely_on_plane(agreement)] = BACKGROUND
+        labels[surely_on_plane(agreement)] = BACKGROUND
         region &= ~_shows_plane(agreement)
     else:
         strip = max(1, round(_STRIP * longer))
@@ -89,13 +90,25 @@ def labels_from_hull(
         region &= ~_shows_plane(agreement)
     labels[region] = PERHAPS_OBJECT
     if agreement is not None:
-        labels[_surely_on_plane(agreement)] = BACKGROUND
+        labels[surely_on_plane(agreement)] = BACKGROUND
         labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
     beyond = margin < -_BEYOND * longer
     labels[beyond if unknown is None else beyond & ~unknown] = BACKGROUND
     discs = discs_at(object_px, _DISC * longer, (width, height))
     labels[discs & (margin > 0)] = OBJECT
     return labels
+
+
+def labels_from_soft(
+    labels: UInt8[Tensor, "height width"],
+    mask: Bool[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
+    border, reach = signed_distance(mask), _BAND * max(mask.shape)
+    labels = torch.where((border > reach) & (margin > 0), OBJECT, labels)
+    outside = (border < -reach) & ~is_deep(margin) | (margin < -2 * reach)
+    return torch.where(outside, BACKGROUND, labels)
 
 
 def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
@@ -143,7 +156,7 @@ def exposed_fraction(
     """Return the fraction of a cut that shows a background for certain; 0 where none is known."""
     if agreement is None:
         return torch.zeros((), dtype=torch.float64)
-    return (cut & _surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
+    return (cut & surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
 
 
 def held_fraction(
@@ -157,7 +170,7 @@ def held_fraction(
     return cut[row.clamp(0, height - 1), column.clamp(0, width - 1)].double().mean()
 
 
-def _surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Find the plane, but not what is next to something else: the object's foot agrees, too."""
     sure = _grainless(agreement > _ON_PLANE)
     return signed_distance(sure) > _FOOT * max(agreement.shape)

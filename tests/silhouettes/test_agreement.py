@@ -27,6 +27,7 @@ def cuts_of(changed, on_plane=True, margin=None):
         exposed=torch.zeros(len(masks)).double(),
         held=torch.ones(len(masks)).double(),
         on_plane=on_plane,
+        doubted=torch.zeros(len(masks), dtype=torch.bool),
     )
 
 

@@ -175,6 +175,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
         exposed=torch.zeros(12).double(),
         held=torch.ones(12).double(),
         on_plane=True,
+        doubted=torch.zeros(12, dtype=torch.bool),
     )
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
@@ -199,6 +200,8 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
         margins_px=projections,
         exposed=torch.zeros(12).double(),
         held=torch.ones(12).double(),
+        on_plane=False,
+        doubted=torch.zeros(12, dtype=torch.bool),
     )
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
@@ -216,7 +219,7 @@ def test_silhouettes_that_all_err_alike_are_not_trusted(staged, monkeypatch, gro
     margins = torch.where(masks, 5.0, -5.0)
 
     def agreed(cues, _):
-        return cuts_of(cues.relearned(masks), masks, margins)
+        return cuts_of(cues.relearned(masks), masks, margins, torch.zeros(12, dtype=torch.bool))
 
     monkeypatch.setattr(find, "cut_in_iterations", agreed)
     with pytest.warns(PimperWarning, match=why):

@@ -1,0 +1,136 @@
+import pytest
+import torch
+from torch.nn.functional import interpolate
+
+from pimper_torch.errors import PimperWarning
+from pimper_torch.records import SilhouettePrior
+from pimper_torch.silhouettes.find import FindSilhouettes
+from pimper_torch.silhouettes.hull import margins, visual_hull
+from pimper_torch.silhouettes.pictures import working_pictures
+from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.silhouettes.soft_masks import pointed_at, soft_masks_of
+from tests.silhouettes.shapes import HEIGHT, WIDTH, all_round, silhouettes_of
+
+SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
+
+
+def overlap(found, truth):
+    return (found & truth).sum(dim=(1, 2)) / (found | truth).sum(dim=(1, 2))
+
+
+def guessed(names, inside):
+    height, width = inside.shape[-2:]
+    sizes = torch.tensor([[width, height]] * len(names))
+    return SilhouettePrior(names=names, sizes_px=sizes, inside=inside, undistorted=True)
+
+
+def with_priors(scene, *priors):
+    return scene.replace(views=scene.views.replace(priors=priors))
+
+
+def soft(truth, size=(180, 240)):
+    """Masks as a segmenter has them: 8 bits, soft at their borders."""
+    small = interpolate(truth[None].float(), size, mode="area")[0]
+    return (255 * (0.02 + 0.96 * small)).round() / 255
+
+
+def without_any_hint(scene):
+    """One colour, no point: nothing but masks tells of the object."""
+    images = torch.full_like(scene.views.images, 0.3)
+    none = scene.observation_point[:0]
+    scene = scene.replace(
+        observation_point=none, observation_view=none, observation_pixels=torch.zeros(0, 2)
+    )
+    return scene.replace(views=scene.views.replace(images=images))
+
+
+def test_masks_of_half_the_size_are_followed(staged):
+    scene = without_any_hint(staged.scene)
+    prior = guessed(scene.views.names, soft(staged.truth, (90, 120)))
+    found = FindSilhouettes(*SMALL)(with_priors(scene, prior))
+    assert found.source == "found"
+    assert found.reliable.all()
+    # Without colours the cut lies anywhere within 1.5 pixels of the mask's border: 0.89 of 50.
+    assert overlap(found.masks, staged.truth).min() > 0.9
+
+
+def test_what_single_masks_take_along_the_others_leave_out(staged):
+    scene, wide = without_any_hint(staged.scene), staged.truth.clone()
+    for view in (1, 4, 8):
+        wide[view, 60:170, 20 + 5 * view : 60 + 5 * view] = True
+    assert overlap(wide, staged.truth)[[1, 4, 8]].max() < 0.8
+    found = FindSilhouettes(*SMALL)(with_priors(scene, guessed(scene.views.names, soft(wide))))
+    assert overlap(found.masks, staged.truth).min() > 0.9
+
+
+@pytest.mark.parametrize("views", [[3], [0, 6, 7]])
+def test_masks_of_another_thing_are_doubted_by_name(staged, views):
+    wrong = staged.truth.clone()
+    for view in views:
+        wrong[view] = False
+        wrong[view, 120:170, 20:70] = True
+    prior = guessed(staged.scene.views.names, soft(wrong))
+    names = ", ".join(staged.scene.views.names[view] for view in views)
+    with pytest.warns(PimperWarning, match=rf"\(views? {names}\): its soft mask lacks"):
+        found = FindSilhouettes(*SMALL)(with_priors(staged.scene, prior))
+    assert overlap(found.masks, staged.truth).min() > 0.95
+
+
+def test_masks_of_some_photographs_tell_of_all(staged):
+    names = staged.scene.views.names
+    prior = guessed((*names[::3], "another.png"), soft(staged.truth)[[0, 3, 6, 9, 0]])
+    found = FindSilhouettes(*SMALL)(with_priors(staged.scene, prior))
+    assert overlap(found.masks, staged.truth).min() > 0.95
+
+
+def test_log_odds_of_two_maps_of_a_view_add_up(staged):
+    views, (first, second) = staged.scene.views, (0.8 * torch.ones(1, 9, 12), 0.3)
+    first[0, 0, 0], second = 0.1, torch.full((1, 9, 12), second)
+    views = views.replace(priors=(guessed(("04.png",), first), guessed(("04.png",), second)))
+    merged = soft_masks_of(views, working_pictures(views, staged.scene.cameras, 240))
+    assert merged is not None
+    assert merged.given.nonzero().tolist() == [[4]]
+    odds = 0.8 / 0.2 * 0.3 / 0.7
+    assert merged.inside[4, 100, 100] == pytest.approx(odds / (1 + odds), abs=1e-4)
+    assert (merged.inside[[3, 5]] == 0.5).all()
+
+
+def test_a_map_without_background_points_at_the_object(staged):
+    pointing = torch.full((1, 180, 240), 0.5)
+    pointing[0, 80:83, 100:103] = 1
+    views = staged.scene.views.replace(priors=(guessed(("02.png",), pointing),))
+    merged = soft_masks_of(views, working_pictures(views, staged.scene.cameras, 240))
+    assert merged is not None
+    assert not merged.given.any()
+    assert merged.seeds_px[2].mean(dim=0).tolist() == pytest.approx([101.5, 81.5])
+    assert sum(len(pixels) for pixels in merged.seeds_px) == 9
+
+
+def test_the_component_that_a_click_meets_first_is_kept():
+    cameras = all_round().to(torch.float32)
+    places = torch.tensor([[-0.35, 0.0, 0.0], [0.35, 0.0, 0.0]])
+
+    def ball(index):
+        return lambda points: (points - places[index].to(points)).norm(dim=-1) - 0.2
+
+    def both(points):
+        return torch.minimum(ball(0)(points), ball(1)(points))
+
+    box = torch.tensor([[-0.8] * 3, [0.8] * 3])
+    hull = visual_hull(silhouettes_of(both, cameras), cameras, box, num_voxels=500_000)
+    assert hull is not None
+    alone = silhouettes_of(ball(1), cameras).masks
+    view = int((silhouettes_of(ball(0), cameras).masks & alone).sum(dim=(1, 2)).argmin())
+    seeds = [torch.zeros(0, 2)] * cameras.num_views
+    seeds[view] = torch.tensor([[0.5, 0.5]])
+    assert pointed_at(hull, cameras, seeds) is hull  # it meets nothing
+    seeds[view] = alone[view].nonzero().float().mean(dim=0).flip(0)[None] + 0.5
+    kept = pointed_at(hull, cameras, seeds)
+    assert kept.holds(places).tolist() == [False, True]
+    inside = kept.occupied
+    assert torch.equal(kept.distance[inside], hull.distance[inside])
+    own = visual_hull(silhouettes_of(ball(1), cameras), cameras, box, num_voxels=500_000)
+    assert own is not None
+    lens = cameras.intrinsics[view], cameras.cam_from_world[view], (WIDTH, HEIGHT)
+    shown, alone_shown = (margins(one, *lens) > 0 for one in (kept, own))
+    assert overlap(shown[None], alone_shown[None]).item() > 0.95  # voxels of other sizes
