@@ -2,25 +2,31 @@
 
 Run as ``python benchmarks/silhouettes.py PHOTOS=MASKS [PHOTOS=MASKS ...]``; prints a Markdown
 table, one row a folder of photographs. Masks go by the photographs' names; alpha channels serve.
-With ``--overlays DIR`` every photograph is written there with its silhouette drawn in.
+With ``--overlays DIR`` every photograph is written there with its silhouette drawn in. With
+``--soft DIR`` (one a folder of photographs, in their order) soft masks of a segmenter are followed
+as ``pimper reconstruct --silhouettes`` does, and compared by themselves, too: ``raw``.
 """
 
 import argparse
 import sys
 import time
 import warnings
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
 from pimper_torch.errors import PimperWarning
 from pimper_torch.io.photographs import load_views
+from pimper_torch.prior_files.read_silhouettes import read_silhouettes
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.records import SilhouettePrior, Silhouettes, SparseScene
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 
 
@@ -32,35 +38,42 @@ def main() -> None:
     parser.add_argument("--size-px", type=int, default=SilhouetteConfig().size_px)
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--overlays", type=Path)
+    parser.add_argument("--soft", type=Path, nargs="+", default=())
     options = parser.parse_args()
-    say("| photographs | views | reliable | found | worst | CPU s a view |")
-    say("|---|--:|--:|--:|--:|--:|")
+    say("| photographs | views | reliable | raw | worst | found | worst | CPU s a view |")
+    say("|---|--:|--:|--:|--:|--:|--:|--:|")
     config = CoarseToFineConfig(silhouettes=SilhouetteConfig(size_px=options.size_px))
     chain = CoarseToFine(config, cache=options.cache)
-    for pair in options.folders:
+    for pair, soft in zip_longest(options.folders, options.soft):
         photos, _, masks = pair.partition("=")
-        scene = chain.placed(load_views(photos, max_size_px=options.max_size_px), None)
+        views, raw = load_views(photos, max_size_px=options.max_size_px), "| |"
+        if soft:
+            views = views.replace(priors=(read_silhouettes(soft, views),))
+        scene = chain.placed(views, None)
         known = known_masks(masks, scene)
+        if soft:
+            alone = overlaps(soft_masks(scene), known)
+            raw = f"| {alone.mean():.4f} | {alone.min():.4f} "
         began = time.process_time()
         with warnings.catch_warnings(record=True) as cautions:
             warnings.simplefilter("always", PimperWarning)
             silhouettes = chain.silhouettes(scene)
         seconds = (time.process_time() - began) / scene.views.num_views
         if silhouettes.source == "everything":
-            say(f"| {photos} | {scene.views.num_views} | none: {cautions[-1].message} | | | |")
+            say(f"| {photos} | {scene.views.num_views} | none: {cautions[-1].message} {raw}| | | |")
             continue
-        overlap = overlaps(silhouettes, known)
+        overlap = overlaps(silhouettes.masks, known)
         say(
             f"| {photos} | {scene.views.num_views} | {int(silhouettes.reliable.sum())} "
-            f"| {overlap.mean():.4f} | {overlap.min():.4f} | {seconds:.2f} |",
+            f"{raw}| {overlap.mean():.4f} | {overlap.min():.4f} | {seconds:.2f} |",
         )
         if options.overlays:
             draw(silhouettes, scene, options.overlays / Path(photos).parent.name)
 
 
-def overlaps(silhouettes: Silhouettes, known: list[Tensor]) -> Tensor:
-    """Give the intersection over union of every view."""
-    pairs = zip(silhouettes.masks, known, strict=True)
+def overlaps(found: Iterable[Tensor], known: list[Tensor]) -> Tensor:
+    """Return the intersection over union of every view."""
+    pairs = zip(found, known, strict=True)
     return torch.stack([(mask & true).sum() / (mask | true).sum() for mask, true in pairs])
 
 
@@ -85,6 +98,21 @@ def known_masks(folder: str, scene: SparseScene) -> list[Tensor]:
         mask[:height, :width] = torch.from_numpy(drawn)
         found.append(mask)
     return found
+
+
+def soft_masks(scene: SparseScene) -> Iterator[Tensor]:
+    """Cut the soft masks of a scene at one half; nothing where there is none."""
+    prior = scene.views.priors[0]
+    assert isinstance(prior, SilhouettePrior)
+    for name, (width, height) in zip(scene.views.names, scene.views.sizes_px.tolist(), strict=True):
+        mask = torch.zeros(scene.views.images.shape[-2:], dtype=torch.bool)
+        if name in prior.names:
+            index = prior.names.index(name)
+            wide, high = prior.sizes_px[index].tolist()
+            inside = prior.inside[index, None, None, :high, :wide]
+            small = interpolate(inside, (height, width), mode="bilinear", antialias=True)
+            mask[:height, :width] = small[0, 0] > 0.5
+        yield mask
 
 
 def draw(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:

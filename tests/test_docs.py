@@ -210,7 +210,7 @@ def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     a_folder_of_photographs(monkeypatch)
-    for folder, shape in (("normals", (3,)), ("depth", ())):
+    for folder, shape in (("normals", (3,)), ("depth", ()), ("masks", ())):
         Path(folder).mkdir()
         for path in Path("photos").iterdir():
             np.save(Path(folder) / f"{path.stem}.npy", np.full((42, 56, *shape), -(3**-0.5)))
@@ -229,6 +229,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/conventions.md", 0): nothing,
     ("docs/priors.md", 0): photographs_and_maps,
     ("docs/priors.md", 1): photographs_and_maps,
+    ("docs/priors.md", 2): photographs_and_maps,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): a_scene_and_a_mesh,
     ("docs/extending.md", 2): a_data_set_of_ones_own,

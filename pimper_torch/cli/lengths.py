@@ -1,4 +1,4 @@
-"""Known lengths on a command line: three words each, as often as there are lengths."""
+"""Places in photographs, and known lengths, on a command line: as often as there are some."""
 
 from typing import Annotated, Any, Literal
 
@@ -25,6 +25,19 @@ def _bar(words: list[str]) -> ScaleBar:
 def _distance(words: list[str]) -> CameraDistance:
     first, second, length = words
     return CameraDistance(first=first, second=second, length=_number(length, "--camera-distance"))
+
+
+_Place = Annotated[
+    Mark,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME,x,y",
+        instance_from_str=lambda words: Mark.read(words[0]),
+        is_instance=lambda one: isinstance(one, Mark),
+        str_from_instance=lambda one: [str(one)],
+    ),
+]
+Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar="NAME,x,y")]
 
 
 def _three_words(read: Any, kind: type) -> Any:  # noqa: ANN401 - of tyro's marks

@@ -12,7 +12,7 @@ import tyro
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
-from pimper_torch.cli.lengths import CameraDistances, Markers, ScaleBars
+from pimper_torch.cli.lengths import CameraDistances, Markers, Places, ScaleBars
 from pimper_torch.cli.option import options_of
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import presets, require
@@ -99,6 +99,9 @@ class InputOptions:
         markers: Markers printed by `pimper markers` tell the size; their sides in millimetres, if
             others. With --sparse they are compared alone, unless their sides are given.
         unit: Of lengths that are given, and of the result where its size is known.
+        silhouettes: Folder of soft masks of a segmenter, for some photographs or all, any size:
+            PNG, JPEG, EXR, NPZ or NPY. What the other views deny is not followed.
+        object_at: Pixel of a photograph that shows the object; again for more.
         normals: Folder of normal maps of an estimator, under the photographs' names: PNG, EXR, NPZ
             or NPY.
         axes: Of these normals; auto finds them by cloud and outlines.
@@ -118,6 +121,8 @@ class InputOptions:
     camera_distance: CameraDistances = ()
     markers: Markers = "auto"
     unit: Unit = "mm"
+    silhouettes: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    object_at: Places = ()
     normals: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     axes: NormalAxes = "auto"
     normals_error_deg: float = NORMALS_ERROR_DEG
@@ -127,6 +132,12 @@ class InputOptions:
     def __post_init__(self) -> None:
         sound = isinstance(self.markers, str) or 0 < self.markers < float("inf")
         require(sound, "markers", self.markers, "auto, off, or a length in millimetres above 0")
+        require(
+            self.masks is None or not (self.silhouettes or self.object_at),
+            "--silhouettes or --object-at",
+            str(self.silhouettes or (*self.object_at, "")[0]),
+            "none beside --masks, which are followed as they are",
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,6 +155,7 @@ class Job:
 _RARE = (
     *("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
+    *("--silhouettes", "--object-at"),
 )
 
 # The skull's cranium and face both show in this photograph.
@@ -263,7 +275,8 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     )
     for name in _references(job.config):
         view_named(name, present)
-    for name in measured_in(job.inputs.scale_bar, job.inputs.camera_distance):
+    pointed = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
+    for name in (*measured_in(job.inputs.scale_bar, job.inputs.camera_distance), *pointed):
         number_of(name, present)
     return job
 
@@ -275,6 +288,7 @@ def _inputs(job: Job) -> dict[str, Path | None]:
         "--masks": job.inputs.masks,
         "--sparse": job.inputs.sparse,
         "--mesh": job.inputs.mesh,
+        "--silhouettes": job.inputs.silhouettes,
         "--normals": job.inputs.normals,
         "--depth": job.inputs.depth,
         "--cache": job.common.cache,

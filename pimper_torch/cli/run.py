@@ -13,7 +13,7 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output
-from pimper_torch.cli.size import bars_in_files, sized, told_size
+from pimper_torch.cli.size import bars_in_files, in_files, sized, told_size
 from pimper_torch.cli.view import tell_place
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
@@ -29,6 +29,7 @@ from pimper_torch.outputs.marker import STAGES
 from pimper_torch.outputs.stages import PREVIEW
 from pimper_torch.prior_files.read_depth import read_depth
 from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
 from pimper_torch.size.given import measured_in
@@ -130,6 +131,10 @@ def _read(job: Job) -> Views:
         max_size_px=job.common.max_size_px,
     )
     priors: list[Prior] = []
+    if inputs.silhouettes is not None:
+        priors.append(read_silhouettes(inputs.silhouettes, views))
+    if inputs.object_at:
+        priors.append(object_at([in_files(job, views, mark) for mark in inputs.object_at], views))
     if inputs.normals is not None:
         error_deg = inputs.normals_error_deg
         priors.append(read_normals(inputs.normals, views, inputs.axes, error_deg=error_deg))
@@ -156,6 +161,8 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequ
         "masks": _text(job.inputs.masks),
         "sparse": _text(job.inputs.sparse),
         "mesh": _text(job.inputs.mesh),
+        "silhouettes": _text(job.inputs.silhouettes),
+        "object_at": [str(mark) for mark in job.inputs.object_at],
         "normals": _text(job.inputs.normals),
         "depth": _text(job.inputs.depth),
         "response": str(job.config.photographs.response),

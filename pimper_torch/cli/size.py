@@ -12,8 +12,8 @@ from pimper_torch.size.scale import Scale
 from pimper_torch.size.scaled import scaled
 
 
-def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
-    """Return scale bars with the sizes of the files, whose pixels they are in.
+def in_files(job: Job, views: Views, mark: Mark) -> Mark:
+    """Return a place with the sizes of the files, whose pixels it is in.
 
     People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
 
@@ -28,11 +28,13 @@ def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
         require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 
-    def sized_mark(mark: Mark) -> Mark:
-        return Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
+    return Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
 
+
+def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
+    """Return scale bars as :func:`in_files`."""
     return tuple(
-        replace(bar, first=sized_mark(bar.first), second=sized_mark(bar.second))
+        replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
         for bar in job.inputs.scale_bar
     )
 

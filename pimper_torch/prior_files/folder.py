@@ -17,7 +17,9 @@ from pimper_torch.records import Views
 
 # What estimators add to the name of a photograph.
 _ADDED = re.compile(
-    r"([ _.-](normals?|norm|depth|disparity|pred|raw|map|npy|16bit|fp32))+$", re.IGNORECASE
+    r"([ _.-](normals?|norm|depth|disparity|pred|raw|map|npy|16bit|fp32"
+    r"|mask|alpha|matte|silhouette|segmentation|cutout|rmbg|nobg))+$",
+    re.IGNORECASE,
 )
 _OF_VARIANCE = re.compile(rf"[ _.-]{VARIANCE}$", re.IGNORECASE)
 # Networks round sides to multiples of up to 32 pixels: of the shortest usual side, 518, a
@@ -30,12 +32,15 @@ def read_maps(
     views: Views,
     kinds: tuple[str, ...],
     check: Callable[[Path, np.ndarray], np.ndarray],
+    *,
+    cut_out: bool = False,
 ) -> Maps:
     """Read the maps of photographs, matched by name.
 
     Args:
         kinds: How names of arrays begin that hold the maps, such as ``normal``.
         check: Refuses a map that cannot be of that kind, and returns the channels that count.
+        cut_out: Whether pictures that are somewhere transparent hold the map as their opacity.
 
     Raises:
         InputError: There are none, names do not match, or a map has another shape than its
@@ -44,7 +49,7 @@ def read_maps(
     found: dict[str, tuple[Tensor, Tensor | None]] = {}
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
     for name, path in _matched(Path(folder), views.names).items():
-        values, variance = read_layers(path, kinds)
+        values, variance = read_layers(path, kinds, cut_out)
         beside = [one for one in path.parent.iterdir() if _is_variance_of(one, path)]
         if beside:
             variance = read_layers(beside[0], (VARIANCE,))[0][..., 0]
@@ -58,6 +63,19 @@ def read_maps(
         spread = None if variance is None else torch.from_numpy(variance)
         found[name] = torch.from_numpy(values), spread
     return stacked(found)
+
+
+def single(path: Path, values: np.ndarray) -> np.ndarray:
+    """Return the one channel of a map, also where a file has it three times.
+
+    Raises:
+        InputError: It has colours.
+    """
+    if not (values == values[..., :1]).all(where=np.isfinite(values)):
+        raise InputError(
+            f"{path}: has colours; needed: one value a pixel, not a picture of it in colours."
+        )
+    return values[..., :1]
 
 
 def _is_variance_of(path: Path, of: Path) -> bool:

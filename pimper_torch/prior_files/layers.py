@@ -10,19 +10,23 @@ from pimper_torch.exchange.openexr import read_exr
 from pimper_torch.io.decode import MAX_PIXELS, decode
 from pimper_torch.numpy_files import read_npy, read_npz
 
-FORMATS = (".npz", ".npy", ".exr", ".png")
+PICTURES = (".png", ".jpg", ".jpeg")
+FORMATS = (".npz", ".npy", ".exr", *PICTURES)
 """Of several files of one photograph, the first of these is read: least is lost in it."""
 
 VARIANCE = "variance"
 _MOGE_LEVELS = 65533  # of 65535: 0 is unknown, the last is infinitely far
 
 
-def read_layers(path: Path, kinds: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
+def read_layers(
+    path: Path, kinds: tuple[str, ...], cut_out: bool = False
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Read a map and, where the file has it, its variance.
 
     Args:
-        path: NPZ, NPY, EXR or PNG.
+        path: NPZ, NPY, EXR, PNG or JPEG.
         kinds: How names of arrays and channels begin that hold the map.
+        cut_out: Whether a picture that is somewhere transparent holds the map as its opacity.
 
     Returns:
         ``height width channel``, and ``height width``: whole numbers of 8 and 16 bits in [0, 1],
@@ -33,8 +37,8 @@ def read_layers(path: Path, kinds: tuple[str, ...]) -> tuple[np.ndarray, np.ndar
     """
     try:
         suffix = path.suffix.lower()
-        if suffix == ".png":
-            return _png(path), None
+        if suffix in PICTURES:
+            return _picture(path, cut_out), None
         if suffix == ".npy":
             return _raster(path, read_npy(path)), None
         layers = read_npz(path) if suffix == ".npz" else _grouped(read_exr(path, MAX_PIXELS))
@@ -88,11 +92,13 @@ def _raster(path: Path, values: np.ndarray) -> np.ndarray:
     return np.asarray(values, np.float32)
 
 
-def _png(path: Path) -> np.ndarray:
+def _picture(path: Path, cut_out: bool) -> np.ndarray:
     """Read samples; depth that MoGe wrote, whose levels are logarithms, as depth."""
     decoded = decode(path)
+    if cut_out and decoded.alpha is not None and bool((decoded.alpha < 1).any()):
+        return decoded.alpha.numpy()[..., None]
     values = decoded.samples.numpy().transpose(1, 2, 0)
-    with Image.open(path, formats=("PNG",)) as image:
+    with Image.open(path, formats=("PNG", "JPEG")) as image:
         near, far = (image.info.get(name) for name in ("near", "far"))
     if near is not None and far is not None and decoded.bits == 16:
         levels = np.rint(values * decoded.full)

@@ -3,10 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from pimper_torch.errors import InputError
-from pimper_torch.prior_files.folder import read_maps
+from pimper_torch.prior_files.folder import read_maps, single
 from pimper_torch.priors.from_maps import DEPTH_ERROR, depth_from
 from pimper_torch.records import DepthPrior, Views
 
@@ -40,13 +37,5 @@ def read_depth(
     Raises:
         InputError: A file or its name, shape or values cannot be used: says which.
     """
-    maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), _single)
+    maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), single)
     return depth_from(maps, inverse, along=along, gauge=gauge, error=error, undistorted=undistorted)
-
-
-def _single(path: Path, values: np.ndarray) -> np.ndarray:
-    if not (values == values[..., :1]).all(where=np.isfinite(values)):
-        raise InputError(
-            f"{path}: has colours; needed: one value a pixel, not a picture of it in colours."
-        )
-    return values[..., :1]

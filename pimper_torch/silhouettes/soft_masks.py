@@ -20,6 +20,7 @@ from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.silhouettes.pictures import Pictures
 
 FEW = 3  # soft masks: fewer have no majority
+_SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
 _SURE = 1e-3  # probabilities nearer to 0 or 1 than this count no more: 8 bits hold no finer ones
 
 
@@ -71,8 +72,8 @@ def soft_masks_of(views: Views, pictures: Pictures) -> SoftMasks | None:
                 align_corners=False,
                 antialias=True,
             )
-            if bool((inside >= 0.5).all()):
-                seeds[view, :high, :wide] |= small[0, 0] > 0.5
+            if float(inside.min()) > 0.5 - _SAYS_NOTHING:
+                seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _SAYS_NOTHING
             else:
                 odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(_SURE, 1 - _SURE))
                 given[view] = True

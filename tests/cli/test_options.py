@@ -31,7 +31,9 @@ RUNS = {
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
-        "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05"
+        "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
+        "{photos} --out {out} --sparse {sparse} --max-size-px 48 --scales (0.5,) "
+        "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25",
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "

@@ -1,0 +1,86 @@
+"""Silhouettes of a segmenter, and those that a person points at."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pimper_torch.errors import InputError
+from pimper_torch.prior_files.folder import read_maps, single
+from pimper_torch.records import SilhouettePrior, Views
+from pimper_torch.size.given import Mark, number_of, require_inside
+
+_BYTE = 255
+_MOST_LABELS = 32  # files of 8 bits whose levels are all below hold labels: all but 0 is object
+_KINDS = ("mask", "silhouette", "alpha", "inside")  # how names of arrays begin
+_RASTER, _REACH = 512, 1  # longer side of a click's map, and its pixels to each side
+
+
+def read_silhouettes(
+    folder: Path | str, views: Views, *, undistorted: bool = False
+) -> SilhouettePrior:
+    """Read soft masks of photographs from a folder: PNG or JPEG of 8 or 16 bits, EXR, NPZ or NPY.
+
+    A mask has the photograph's name, with what segmenters append, its shape, and any size; some
+    photographs may have none. It is 1 on the object, in full scale. In pictures that are somewhere
+    transparent it is their opacity. NaN says nothing.
+
+    Args:
+        undistorted: Whether they are of the photographs as a run undistorts them.
+
+    Raises:
+        InputError: A file or its name, shape or values cannot be used: says which.
+    """
+    maps = read_maps(folder, views, _KINDS, _chance, cut_out=True)
+    return SilhouettePrior(
+        names=maps.names,
+        sizes_px=maps.sizes_px,
+        inside=maps.values[..., 0].nan_to_num(0.5),
+        undistorted=undistorted,
+    )
+
+
+def _chance(path: Path, values: np.ndarray) -> np.ndarray:
+    values = single(path, values)
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if low < 0 or high > 1:
+        raise InputError(
+            f"{path}: holds values from {low:g} to {high:g}; needed: the probability of the "
+            "object, from 0 to 1. A network's logits go through a sigmoid first."
+        )
+    levels = _BYTE * known
+    if 0 < high < _MOST_LABELS / _BYTE and np.allclose(levels, np.rint(levels), atol=1e-3):
+        return (values > 0).astype(np.float32)
+    return values
+
+
+def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
+    """Make maps of pixels that show the object, and say nothing elsewhere.
+
+    Args:
+        marks: Places on it, in one photograph or more each.
+
+    Raises:
+        InputError: No such photograph, or a pixel outside of it.
+    """
+    maps: dict[int, torch.Tensor] = {}
+    for pointer in (one for mark in marks for one in mark.pointers):
+        view = number_of(pointer.name, views.names)
+        size = views.sizes_px[view].tolist()
+        full = pointer.size_px or size
+        require_inside(pointer, *full)
+        scale = min(1.0, _RASTER / max(size))
+        width, height = (max(1, round(scale * side)) for side in size)
+        inside = maps.setdefault(view, torch.full((height, width), 0.5))
+        column = min(int(pointer.x * width / full[0]), width - 1)
+        row = min(int(pointer.y * height / full[1]), height - 1)
+        around = slice(max(0, row - _REACH), row + _REACH + 1)
+        inside[around, max(0, column - _REACH) : column + _REACH + 1] = 1
+    sizes = torch.tensor([one.shape[::-1] for one in maps.values()])
+    padded = torch.full((len(maps), int(sizes[:, 1].max()), int(sizes[:, 0].max())), 0.5)
+    for index, one in enumerate(maps.values()):
+        padded[index, : one.shape[0], : one.shape[1]] = one
+    names = tuple(views.names[view] for view in maps)
+    return SilhouettePrior(names=names, sizes_px=sizes, inside=padded)
