@@ -107,9 +107,10 @@ class Cues(Record):
         """Keep points inside the hull alone where soft masks tell of the object."""
         if self.soft is None:
             return self
+        last = torch.tensor(seen.shape[:0:-1]) - 1
         kept = []
         for pixels, margin in zip(self.object_px, seen, strict=True):
-            column, row = pixels.floor().long().unbind(dim=1)
+            column, row = torch.minimum(pixels.floor().long().clamp_min(0), last).unbind(dim=1)
             kept.append(pixels[margin[row, column] > 0])
         return self.replace(object_px=tuple(kept))
 
