@@ -210,10 +210,11 @@ def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     a_folder_of_photographs(monkeypatch)
-    for folder, shape in (("normals", (3,)), ("depth", ()), ("masks", ())):
+    unit = 3**-0.5
+    for folder, shape, value in (("normals", (3,), -unit), ("depth", (), -unit), ("masks", (), 1)):
         Path(folder).mkdir()
         for path in Path("photos").iterdir():
-            np.save(Path(folder) / f"{path.stem}.npy", np.full((42, 56, *shape), -(3**-0.5)))
+            np.save(Path(folder) / f"{path.stem}.npy", np.full((42, 56, *shape), value))
     return {"pt": pimper_torch}
 
 
