@@ -35,9 +35,10 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer
+from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours
-from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.store import Store, opened
 
@@ -108,14 +109,16 @@ class Published(Chain):
     ) -> Iterator[Step]:
         """Run once through the stages."""
         scene = self.placed(views, sparse_model, mesh)
-        silhouettes = self.kept(self.silhouettes, scene)
-        mesh = self.given_mesh(mesh, views, scene, silhouettes)
-        scene = masked(scene, silhouettes)
+        few = one_view_a_pose(scene, tuple(self.references()))
+        outlines = self.kept(self.silhouettes, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
+        shown = masked(few.scene, outlines)
         if mesh is None:
-            coarse = self.kept(self.triangulate, scene)
+            coarse = self.kept(self.triangulate, shown)
         else:
-            contours = Contours.none(silhouettes, scene.cameras)
-            coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+            contours = Contours.none(outlines, shown.cameras)
+            coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+        scene, silhouettes, coarse = of_all_photographs(scene, few, outlines, coarse)
         self.show(scene, coarse)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
         self.need(PHOTOMETRY)

@@ -17,6 +17,7 @@ from pimper_torch.asset.make import few_enough, textured
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.io.estimates import mask_path
 from pimper_torch.io.finish import Finished, MeshFiles, finished
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.io.reports import lights_report, summary_report
@@ -232,7 +233,9 @@ def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> 
     names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
     for name, mask, (width, height) in zip(names, silhouettes.masks, sizes, strict=True):
         drawn = mask[:height, :width].to(torch.uint8) * 255
-        Image.fromarray(drawn.numpy()).save(folder / f"{Path(name).stem}.png")
+        path = mask_path(folder, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(drawn.numpy()).save(path)
 
 
 def _write_maps(result: Reconstruction, folder: Path) -> None:

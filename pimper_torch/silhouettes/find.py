@@ -7,7 +7,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
 from pimper_torch.ledger import leave_out
-from pimper_torch.records import Failure, Silhouettes, SparseScene
+from pimper_torch.records import CoarseMesh, Failure, Silhouettes, SparseScene
+from pimper_torch.sfm.poses import OneAPose
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.contours import box_round
@@ -156,6 +157,25 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene
     return scene.replace(views=scene.views.replace(masks=used))
+
+
+def of_all_photographs(
+    scene: SparseScene, few: OneAPose, found: Silhouettes, coarse: CoarseMesh
+) -> tuple[SparseScene, Silhouettes, CoarseMesh]:
+    """Carry what was found of one photograph a pose to all photographs of the scene.
+
+    Args:
+        found: In the photographs of ``few``.
+        coarse: Made of them.
+
+    Returns:
+        The scene with these silhouettes for masks, see :func:`masked`; silhouettes of its views;
+        facets with the reference among these.
+    """
+    if few.scene is not scene:
+        found = found.take(few.of)
+        coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
+    return masked(scene, found), found, coarse
 
 
 def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:

@@ -7,6 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, OutputError, PimperWarning
+from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.frame import render_frame
 from pimper_torch.evidence.scenes.maps import unpack_maps
@@ -168,3 +169,7 @@ def test_several_lights_a_pose_are_one_camera_and_a_folder_each(ball, tmp_path):
     assert torch.equal(views.masks[::2], views.masks[1::2])
     lights = torch.tensor(json.loads((folder / "truth/lights.json").read_text())["positions_world"])
     assert len(lights.unique(dim=0)) == 6
+    capture = read_rendered(folder)
+    assert torch.equal(capture.views.images, views.images)
+    assert capture.position.tolist() == capture.views.poses.tolist() == views.poses.tolist()
+    assert capture.truth.depth.shape == (6, 36, 48)
