@@ -9,7 +9,6 @@ from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
 from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, write_idr
 from pimper_torch.evidence.datasets.llff import read_llff
 from pimper_torch.evidence.datasets.middlebury import read_middlebury
-from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.evidence.datasets.programs import read_meshroom, read_metashape, read_transforms
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.datasets.sampling import one_light_per_position
@@ -34,8 +33,6 @@ __all__ = [
     "read_rendered",
     "read_scale_mats",
     "read_transforms",
-    "read_uw_ps",
-    "read_yale_b",
     "write_colmap",
     "write_idr",
     "write_transforms",

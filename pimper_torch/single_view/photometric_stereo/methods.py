@@ -11,7 +11,6 @@ from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
-from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
 from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
 from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
 from pimper_torch.single_view.photometric_stereo.hayakawa import (
@@ -36,13 +35,6 @@ def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
     images, mask = _reliable(given, found)
     groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
     relief = resolve_by_albedo_entropy(found.shading[:, found.reliability > 0], groups)
-    return convex(relief, found.shading, found.reliability, given.mask)
-
-
-def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _reliable(given, found)
-    known = found.shading[:, found.reliability > 0]
-    relief = resolve_by_colour_profiles(images, mask, known, found.lights)
     return convex(relief, found.shading, found.reliability, given.mask)
 
 
@@ -81,7 +73,6 @@ RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "equal_strength": lambda given, found: relief_from_strength(
         found.lights, found.shading, found.reliability, given.mask
     ),
-    "colour_profiles": _by_profiles,
     "diffuse_maxima": _by_maxima,
 }
 _FACTOR = "a factor between albedo and light"

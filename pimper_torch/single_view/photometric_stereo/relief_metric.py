@@ -23,12 +23,6 @@ from pimper_torch.single_view.factorization.bas_relief import BasRelief
 _FLAT = 1e-12
 
 
-def metric_row(shading: Float[Tensor, "3 pixel"]) -> Float[Tensor, "pixel 4"]:
-    """Return the coefficients of the square of albedo, ``b^T M b``, by the entries of ``M``."""
-    x, y, z = shading
-    return torch.stack([x * x + y * y, 2 * x * z, 2 * y * z, z * z], dim=-1)
-
-
 def relief_of_metric(metric: Float[Tensor, "*batch 4"]) -> BasRelief:
     """Return the transformation, with lambda above zero, that a metric belongs to.
 
