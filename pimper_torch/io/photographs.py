@@ -381,7 +381,7 @@ def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
     if missing:
         raise InputError(
             f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
-            f"name (such as {Path(missing[0]).with_suffix('.png')}). There are "
+            f"name (such as {missing[0].rpartition('.')[0]}.png). There are "
             f"{some([path.name for path in by_stem.values()])}."
         )
     return [mask for mask in found if mask is not None]
