@@ -31,7 +31,7 @@ from pimper_torch.single_view.integration.steps import Steps, orthographic_steps
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
 # Occluding contours divide it into parts; normals say nothing of their distances.
 SPLIT = "goblet"
-METHODS = ("frankot-chellappa", "cosine", "weighted", "discontinuities")
+METHODS = ("weighted", "discontinuities")
 # At the true depth residuals are noise and rounding; what is beyond is a jump.
 TRUE_SCALE_PX = 0.1
 
