@@ -11,7 +11,6 @@ from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
-from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
 from pimper_torch.single_view.photometric_stereo.equal_lengths import (
     relief_from_albedo,
     relief_from_strength,
@@ -33,13 +32,6 @@ def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
     return convex(relief, found.shading, found.reliability, given.mask)
 
 
-def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _reliable(given, found)
-    known = found.shading[:, found.reliability > 0]
-    relief = resolve_by_diffuse_maxima(images, mask, known, found.lights)
-    return convex(relief, found.shading, found.reliability, given.mask)
-
-
 def _reliable(
     given: Problem, found: Surfaced
 ) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
@@ -57,8 +49,8 @@ def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]
 
 
 # Methods that resolve the bas-relief ambiguity; "rounded" is a convention. Entropy comes first, as
-# the default: nearest to known lights on the rendered objects and, with diffuse maxima, on the
-# photographs (benchmarks/photometric_stereo.py).
+# the default: nearest to known lights on the rendered objects
+# (benchmarks/photometric_stereo.py).
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "albedo_entropy": _by_entropy,
     "rounded": lambda given, found: rounded_relief(found.shading, found.reliability, given.mask),
@@ -68,7 +60,6 @@ RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "equal_strength": lambda given, found: relief_from_strength(
         found.lights, found.shading, found.reliability, given.mask
     ),
-    "diffuse_maxima": _by_maxima,
 }
 _FACTOR = "a factor between albedo and light"
 

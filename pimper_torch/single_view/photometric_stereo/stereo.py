@@ -85,8 +85,8 @@ def photometric_stereo(
     ==================  ==========================================  =================
 
     Convex is chosen. ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a
-    ball), ``equal_albedo``, ``equal_strength``, ``albedo_entropy`` (few albedos)
-    or ``diffuse_maxima``.
+    ball), ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few
+    albedos).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
