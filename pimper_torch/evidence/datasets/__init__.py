@@ -8,7 +8,6 @@ from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protoc
 from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
 from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, write_idr
 from pimper_torch.evidence.datasets.llff import read_llff
-from pimper_torch.evidence.datasets.middlebury import read_middlebury
 from pimper_torch.evidence.datasets.programs import read_meshroom, read_metashape, read_transforms
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.datasets.sampling import one_light_per_position
@@ -28,7 +27,6 @@ __all__ = [
     "read_llff",
     "read_meshroom",
     "read_metashape",
-    "read_middlebury",
     "read_normal_map",
     "read_rendered",
     "read_scale_mats",
