@@ -24,8 +24,6 @@ from pimper_torch.evidence.scenes.one_view import OneView, photograph, point_lig
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
-from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
-from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 
 NOISES = (0.0, 0.005, 0.01)
@@ -44,12 +42,6 @@ def entropy_and_colour(made: OneView, shading: Tensor, _: Tensor) -> BasRelief:
 RESOLVERS: dict[str, Resolver] = {
     "entropy": lambda _, shading, __: resolve_by_albedo_entropy(shading),
     "entropy + colour": entropy_and_colour,
-    "profiles": lambda made, shading, lights: resolve_by_colour_profiles(
-        made.images, made.mask, shading, lights
-    ),
-    "maxima": lambda made, shading, lights: resolve_by_diffuse_maxima(
-        made.images, made.mask, shading, lights
-    ),
 }
 
 

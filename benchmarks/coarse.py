@@ -35,7 +35,7 @@ from pimper_torch.coarse.fine_surface import (
 from pimper_torch.coarse.matched import matched_cloud
 from pimper_torch.coarse.oriented import OrientedPoints
 from pimper_torch.coarse.reference import reference_view
-from pimper_torch.coarse.surface import CoarseSurface
+from pimper_torch.coarse.surface import CoarseSurface, reliable_points
 from pimper_torch.coarse.trim import point_distances, view_counts
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
@@ -96,7 +96,7 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     builder = CoarseSurface()
     contours = TraceContours()(silhouettes, scene.cameras)
     hull = contours.hull
-    reliable = builder.reliable(scene)
+    reliable = reliable_points(scene)
     inside = reliable[hull.depth_of(scene.points_world[reliable]) > 0]
     part = cropped(scene, silhouettes)
     cloud, maps, pixel = matched_cloud(part, inside, builder.densify, POINT_PX)

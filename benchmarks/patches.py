@@ -16,18 +16,15 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.photometry.bilinear import Bilinear, objective
-from pimper_torch.photometry.factorize import PART_ENTRIES
-from pimper_torch.photometry.factorize import SOLVERS as CHAIN
+from pimper_torch.photometry.factorize import PART_ENTRIES, SOLVERS
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
-from pimper_torch.single_view.factorization import solve_alternation
 
 # How strongly lights are held to their start, as a fraction of what the data say, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))
-LIMITS = {"variable-projection": 60, "alternation": 300, "balm": 300}
-SOLVERS = {**CHAIN, "alternation": solve_alternation}
-TOLERANCES = {"variable-projection": 1e-4, "alternation": 1e-4, "balm": 1e-3}
+LIMITS = {"variable-projection": 60, "balm": 300}
+TOLERANCES = {"variable-projection": 1e-4, "balm": 1e-3}
 
 
 def main() -> None:

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from one_viewpoint import read_uw_ps, read_yale_b
 from reliefs import align_reliefs
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import PimperError
-from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.scene_object import Texture

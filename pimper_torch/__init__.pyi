@@ -11,6 +11,7 @@ from .chains.published import Published as Published
 from .chains.published import PublishedConfig as PublishedConfig
 from .coarse.remesh import Remesh as Remesh
 from .coarse.surface import CoarseSurface as CoarseSurface
+from .coarse.surface import facets_of as facets_of
 from .errors import ConfigError as ConfigError
 from .errors import InputError as InputError
 from .errors import OutputError as OutputError
@@ -62,6 +63,8 @@ from .records import Views as Views
 from .records.stored import load_record as load_record
 from .records.stored import save_record as save_record
 from .sfm.reconstruct import Reconstruct as Reconstruct
+from .silhouettes.contours import Contours as Contours
+from .silhouettes.contours import TraceContours as TraceContours
 from .silhouettes.find import FindSilhouettes as FindSilhouettes
 from .single_view.integration import integrate_normal_map as integrate_normal_map
 from .single_view.photometric_stereo.stereo import photometric_stereo as photometric_stereo

@@ -27,6 +27,7 @@ from pimper_torch.evidence.scenes import (
 )
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
+from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
@@ -55,6 +56,7 @@ log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figur
 
 PUBLISHED_ERROR = 11.15  # per cent: the potatoes of the published table
 PRESETS = ("paper", "default")
+REFERENCES = {"fast": "coarse_surface", "paper": "triangulate"}
 # Pictures of 80 x 60 pixels are too small to be matched densely: facets span the cloud.
 SMALL = {
     "paper": {"triangulate": {"num_points": 20}},
@@ -390,3 +392,22 @@ def test_a_georeferenced_model_gives_the_figures_of_the_plain_one(small_set, wit
     assert errors[0] < (0.003 if with_mesh else 0.005)
     near, far = (len(result.mesh.vertices_world) for result in results)
     assert abs(far / near - 1) < 0.01
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(preset):
+    cameras = ball.all_round().take(torch.arange(24) // 2)
+    scene = ball.photographed(cameras)
+    vertices, faces = icosphere(2)
+    step = next(pt.load_chain(preset).steps(scene, mesh=Mesh(vertices_world=vertices, faces=faces)))
+    assert step.scene.views.poses.tolist() == [view - view % 2 for view in range(24)]
+    assert torch.equal(step.silhouettes.inside[::2], step.silhouettes.inside[1::2])
+    lights = torch.cat([bucket.lights_patch for bucket in step.photometric.buckets])
+    both = (lights[:, ::2] != 0).any(dim=2) & (lights[:, 1::2] != 0).any(dim=2)
+    assert int(both.sum()) > 200
+    assert bool((lights[:, ::2] != lights[:, 1::2]).any(dim=2)[both].all())
+    names = scene.views.names
+    again = pt.load_chain(preset, {REFERENCES[preset]: {"reference": names[7]}})
+    named = next(again.steps(scene, mesh=Mesh(vertices_world=vertices, faces=faces)))
+    assert named.coarse.reference == 7

@@ -222,7 +222,8 @@ def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
     ("docs/python.md", 0): a_folder_of_photographs,
-    ("docs/python.md", 1): a_scene_in_tensors,
+    ("docs/python.md", 1): a_scene_and_a_mesh,
+    ("docs/python.md", 2): a_scene_in_tensors,
     ("docs/parts.md", 0): a_matrix_and_patches,
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,

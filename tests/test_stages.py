@@ -137,9 +137,36 @@ def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 3000
     for record in (found.patches, seen, found):
         pt.plot_patch(record[3]).savefig(tmp_path / "b.png")
+    assert [axes.get_title() for axes in pt.plot_patch(found[3]).axes][:2] == ["albedo", "normals"]
     with pytest.raises(pt.InputError, match="one value a patch"):
         pt.by_facet(found, "albedo")
     with pytest.raises(pt.InputError, match="needed: one for each of"):
         pt.plot_in_view(coarse, scene.cameras, 0, residuals[1:])
     with pytest.raises(pt.InputError, match="needed: one, such as"):
         pt.plot_patch(found)
+
+
+def test_residuals_and_the_light_of_a_sample_are_drawn_beside_photometry(factorized):
+    _, seen, found = factorized
+    views, own = seen[3].buckets[0], found[3].buckets[0]
+    counted = (views.valid[0] & own.observed[0]).sum(dim=0)
+    row, column = divmod(int(counted.argmax()), counted.shape[1])
+    figure = pt.plot_patch(found[3], seen[3], (row, column))
+    panels = {axes.get_title(): axes for axes in figure.axes}
+    assert "residual" in panels
+    observed, predicted = panels[f"sample {row}, {column}"].lines
+    shown = views.valid[0, :, row, column].nonzero()[:, 0]
+    assert observed.get_xdata().tolist() == shown.tolist()
+    torch.testing.assert_close(
+        torch.from_numpy(observed.get_ydata()), views.gray[0, shown, row, column]
+    )
+    light, normal = own.lights_patch[0, shown], own.normals_patch[0, row, column]
+    shading = light[:, 0] + light[:, 1:] @ normal
+    torch.testing.assert_close(
+        torch.from_numpy(predicted.get_ydata()), own.albedo[0, row, column].mean() * shading
+    )
+    assert pt.plot_patch(found[3], seen[3]).axes[-1].get_title() != "residual"
+    with pytest.raises(pt.InputError, match="photometry of one patch, and views of the same"):
+        pt.plot_patch(found[3], seen[4])
+    with pytest.raises(pt.InputError, match="no view has sample"):
+        pt.plot_patch(found[3], seen[3], (0, 0))

@@ -37,6 +37,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
+from pimper_torch.sfm.poses import with_poses
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sound_views import sound
 from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
@@ -182,7 +183,8 @@ class Chain(Stage):
             )
         elif mesh is None and isinstance(self.reconstruct, Reconstruct):
             views = self.reconstruct.with_points(views)
-        scene = with_undistorted_priors(sound(self._with_points(views, mesh)))
+        scene = with_poses(sound(self._with_points(views, mesh)))
+        scene = with_undistorted_priors(scene)
         self._watched(scene)
         return scene
 

@@ -43,9 +43,10 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer
+from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours, TraceContours
-from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.store import Store, opened
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
@@ -134,12 +135,17 @@ class CoarseToFine(Chain):
         needed = (*self.references(), *self.needed)
         placed, held_out = held_apart(every, self.config.hold_out, needed)
         self.need(COARSE)
-        silhouettes = self.kept(self.silhouettes, placed)
-        mesh = self.given_mesh(mesh, views, placed, silhouettes)
-        scene = settled(masked(placed, silhouettes), silhouettes)
+        few = one_view_a_pose(placed, needed)
+        outlines = self.kept(self.silhouettes, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        scene = settled(scene, silhouettes)
+        shown = scene if few.scene is placed else masked(few.scene, outlines)
+        contours = self.contours(outlines, shown.cameras)
+        coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+        if shown is not scene:
+            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         cameras = scene.cameras
-        contours = self.contours(silhouettes, cameras)
-        coarse = self.kept(self.coarse_surface, scene, contours, mesh)
         self.show(scene, coarse)
         self.need((*PHOTOMETRY, *SWEEP))
         sources = Prepared(self.warp, scene.views)

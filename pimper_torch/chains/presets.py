@@ -64,7 +64,7 @@ _FORMER = {
     "factorize.light_pull": "`factorize.light_prior`",
     "factorize.start": "no setting: lights and normals start at the coarse mesh",
     "factorize.rank": "no setting: light is of first order; see single_view.factorization",
-    "factorize.colour": "no setting: see solve_in_colour of single_view.factorization",
+    "factorize.colour": "no setting: normals come from gray, albedo from every channel",
     **{
         f"triangulate.{name}": "a constant"
         for name in [

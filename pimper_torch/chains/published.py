@@ -36,9 +36,10 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer
+from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours
-from pimper_torch.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.store import Store, opened
 
@@ -108,15 +109,20 @@ class Published(Chain):
         self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
     ) -> Iterator[Step]:
         """Run once through the stages."""
-        scene = self.placed(views, sparse_model, mesh)
-        silhouettes = self.kept(self.silhouettes, scene)
-        mesh = self.given_mesh(mesh, views, scene, silhouettes)
-        scene = settled(masked(scene, silhouettes), silhouettes)
+        placed = self.placed(views, sparse_model, mesh)
+        few = one_view_a_pose(placed, tuple(self.references()))
+        outlines = self.kept(self.silhouettes, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        scene = settled(scene, silhouettes)
+        shown = scene if few.scene is placed else masked(few.scene, outlines)
         if mesh is None:
-            coarse = self.kept(self.triangulate, scene)
+            coarse = self.kept(self.triangulate, shown)
         else:
-            contours = Contours.none(silhouettes, scene.cameras)
-            coarse = self.kept(self.coarse_surface, scene, contours, mesh)
+            contours = Contours.none(outlines, shown.cameras)
+            coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+        if shown is not scene:
+            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         self.show(scene, coarse)
         patches = self.decompose(coarse, scene.cameras, None, 1.0)
         self.need(PHOTOMETRY)

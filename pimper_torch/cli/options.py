@@ -18,7 +18,7 @@ from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import presets, require
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.io.finish import MeshFiles
-from pimper_torch.io.photographs import list_images
+from pimper_torch.io.photographs import image_name, list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.outputs.names import require_name
@@ -264,7 +264,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
         if folder is not None:
             for path in list_images(folder):
                 require_name(path, InputError)
-    present = [path.name for path in list_images(job.photos)]
+    present = [image_name(path, job.photos) for path in list_images(job.photos)]
     least = job.config.factorize.min_views
     require(
         len(present) >= least,

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from pimper_torch.cli.options import Job
 from pimper_torch.io.decode import read_header
-from pimper_torch.io.photographs import list_images
+from pimper_torch.io.photographs import image_name, list_images
 from pimper_torch.records import Reconstruction, Views
 from pimper_torch.size.find import find_scale
 from pimper_torch.size.given import Mark, Pointer, ScaleBar, number_of, require_inside
@@ -20,7 +20,7 @@ def in_files(job: Job, views: Views, mark: Mark) -> Mark:
     Raises:
         InputError: A pixel outside of its photograph.
     """
-    paths = {path.name: path for path in list_images(job.photos)}
+    paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
     def sized_pointer(pointer: Pointer) -> Pointer:
         name = views.names[number_of(pointer.name, views.names)]

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.coarse.covariances import point_covariances
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.fine_surface import FineSurfaceConfig, fine_surface, min_fraction
-from pimper_torch.coarse.given_mesh import oriented_outward
+from pimper_torch.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.coarse.matched import pixel_size
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.trim import supported_components
@@ -21,7 +21,7 @@ from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
-from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
+from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
@@ -91,7 +91,7 @@ class CoarseSurface(Stage):
                 support no face.
         """
         reference = reference_view(scene, self.config.reference)
-        reliable, count = self.reliable(scene), self.config.num_facets
+        reliable, count = reliable_points(scene), self.config.num_facets
         if mesh is not None:
             vertices, faces = oriented_outward(mesh, scene.cameras)
             vertices, faces = _facets(vertices, faces, count)
@@ -118,30 +118,47 @@ class CoarseSurface(Stage):
             used, faces = torch.unique(faces[kept], return_inverse=True)
             vertices = vertices[used]
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
-        return CoarseMesh(
-            mesh=Mesh(
-                vertices_world=vertices,
-                faces=faces,
-                normals_world=smoothed_normals(vertices, faces),
-            ),
-            reference=reference,
-            is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
-            covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
-            points=_on_facets(scene, reliable, vertices, faces, _ON_FACET_PX * pixel),
-            support=support,
+        near = _ON_FACET_PX * pixel
+        return _with_points(scene, reliable, reference, vertices, faces, near).replace(
+            support=support
         )
 
-    def reliable(self, scene: SparseScene) -> Int[Tensor, " reliable"]:
-        """List the points of the cloud with enough views, small residuals and wide angles."""
-        observed = scene.observed
-        angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
-        reliable = (
-            (observed.sum(dim=1) >= _MIN_TRACK)
-            & (scene.reprojection_errors_px <= _MAX_ERROR_PX)
-            & (angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG)))
-        )
-        leave_out("coarse.reliable", ~reliable, at=scene.points_world)
-        return reliable.nonzero()[:, 0]
+
+@torch.no_grad()
+def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh:
+    """Take the faces of a mesh for facets, with the points of the cloud that lie on them.
+
+    Vertices at one place are welded, faces without area or that stand twice are left out, fronts
+    turned to the cameras. The number of faces stays: a chain wants some hundreds to thousands.
+
+    Args:
+        mesh: In the scene's frame.
+        scene: Cameras and photographs; points where it has some.
+        reference: Name or stem of the frontal photograph; empty chooses it.
+
+    Raises:
+        InputError: The mesh is no surface, in another frame than the cameras, or seen by none; no
+            one photograph has the reference's name.
+    """
+    view = reference_view(scene, reference)
+    mesh, _ = prepared(mesh, scene, Silhouettes.everything(scene.views))
+    vertices, faces = oriented_outward(mesh, scene.cameras)
+    reliable = reliable_points(scene)
+    near = _ON_FACET_PX * pixel_size(scene, reliable) if len(reliable) else 0.0
+    return _with_points(scene, reliable, view, vertices, faces, near)
+
+
+def reliable_points(scene: SparseScene) -> Int[Tensor, " reliable"]:
+    """List the points of the cloud with enough views, small residuals and wide angles."""
+    observed = scene.observed
+    angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
+    reliable = (
+        (observed.sum(dim=1) >= _MIN_TRACK)
+        & (scene.reprojection_errors_px <= _MAX_ERROR_PX)
+        & (angle >= torch.deg2rad(angle.new_tensor(_MIN_ANGLE_DEG)))
+    )
+    leave_out("coarse.reliable", ~reliable, at=scene.points_world)
+    return reliable.nonzero()[:, 0]
 
 
 def smoothed_normals(
@@ -170,22 +187,28 @@ def two_faces_an_edge(
         faces = torch.cat([faces[:smallest], faces[smallest + 1 :]])
 
 
-def _on_facets(
+def _with_points(
     scene: SparseScene,
     reliable: Int[Tensor, " reliable"],
+    reference: int,
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
     max_distance: float,
-) -> FacetPoints:
-    """List the reliable points of the cloud that lie near a facet."""
-    found = NearestSurface(Mesh(vertices_world=vertices, faces=faces)).query(
-        scene.points_world[reliable]
-    )
+) -> CoarseMesh:
+    """Put the reliable points of the cloud that lie near a facet beside the facets."""
+    mesh = Mesh(vertices_world=vertices, faces=faces)
+    found = NearestSurface(mesh).query(scene.points_world[reliable])
     near = found.distance <= max_distance
-    return FacetPoints(
-        points_world=scene.points_world[reliable[near]],
-        covariance_world=point_covariances(scene, reliable[near]),
-        facet=found.face[near],
+    return CoarseMesh(
+        mesh=mesh.replace(normals_world=smoothed_normals(vertices, faces)),
+        reference=reference,
+        is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
+        covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
+        points=FacetPoints(
+            points_world=scene.points_world[reliable[near]],
+            covariance_world=point_covariances(scene, reliable[near]),
+            facet=found.face[near],
+        ),
     )
 
 

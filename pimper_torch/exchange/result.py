@@ -12,9 +12,9 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import read_json
 from pimper_torch.config import build, read_mapping
 from pimper_torch.errors import InputError, PimperWarning, some
-from pimper_torch.io.estimates import read_lights, read_reference
+from pimper_torch.io.estimates import mask_path, read_lights, read_reference
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import list_images, load_views, read_mask
+from pimper_torch.io.photographs import image_name, list_images, load_views, read_mask
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model
@@ -116,7 +116,7 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
             "Name it by `--photos DIR` (`photographs=`)."
         )
     path = Path(named)
-    names = {file.name for file in list_images(path)} if path.is_dir() else set()
+    names = {image_name(file, path) for file in list_images(path)} if path.is_dir() else set()
     missing = [name for name in model.names if name not in names]
     if missing:
         raise InputError(
@@ -154,7 +154,7 @@ def _silhouettes(
         return Silhouettes.everything(views)
     inside = torch.zeros_like(views.images[:, 0])
     for index, (name, size) in enumerate(zip(views.names, views.sizes_px.tolist(), strict=True)):
-        path = folder / "masks" / f"{Path(name).stem}.png"
+        path = mask_path(folder / "masks", name)
         mask = read_mask(path)
         width, height = size
         if mask.shape != (height, width):

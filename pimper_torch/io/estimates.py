@@ -1,7 +1,7 @@
 """Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
 
 import json
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import torch
 from jaxtyping import Float
@@ -135,3 +135,13 @@ def read_reference(path: Path | str) -> str | None:
             f"{path}: cannot be read ({error}); needed: an .npz file with `name`, the reference "
             "view. Remove the file to do without one."
         ) from error
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """Return where the mask of a photograph is written: under its name, never outside the folder.
+
+    >>> mask_path(Path("masks"), "pose_03/../light_02.jpg").as_posix()
+    'masks/pose_03/light_02.png'
+    """
+    parts = PurePosixPath(name.replace("\\", "_")).with_suffix(".png").parts
+    return folder.joinpath(*(part for part in parts if part not in ("/", "..")))

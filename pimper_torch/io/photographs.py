@@ -4,12 +4,12 @@ import os
 import re
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning, caution, some
@@ -61,6 +61,9 @@ def load_views(
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
+    Of a folder without photographs but with folders of them, three at least, each of these holds
+    the photographs of one pose of the camera, each under another light.
+
     JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette, HEIC and camera raw where their
     extras are installed, of one photograph raw before JPEG; links are followed. Other files,
     hidden ones and folders inside are passed over, with a warning where they look like
@@ -106,7 +109,8 @@ def load_views(
     _tell_passed_over(Path(folder), paths)
     headers = [read_header(path) for path in paths]
     tell_cautions(Path(folder), paths, headers, encoding)
-    mask_paths = _match_masks(paths, Path(masks)) if masks is not None else None
+    names = tuple(image_name(path, folder) for path in paths)
+    mask_paths = _match_masks(names, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
     pictures = read_pictures(paths, headers, sizes, encoding)
     images = pictures.images
@@ -124,7 +128,6 @@ def load_views(
             drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
-    names = tuple(path.name for path in paths)
     _refuse_black(images, sizes, names, Path(folder))
     if has_masks and not opacities:
         _tell_alpha(pictures.opaque, names, Path(folder))
@@ -138,8 +141,28 @@ def load_views(
         masks=drawn if has_masks else None,
         focals_px=shrunk_focals(headers, sizes),
         orientations=torch.tensor([header.orientation for header in headers]),
+        poses=_poses(paths, Path(folder)),
         folder=_named_path(folder),
     )
+
+
+def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
+    """Number the folders of photographs, each of which holds those of one pose of the camera."""
+    folders = list(dict.fromkeys(path.parent for path in paths))
+    if folders == [folder]:
+        return None
+    caution(
+        f"{folder}: the {len(paths)} photographs in its {len(folders)} folders are taken for "
+        f"{len(folders)} poses of the camera, each under several lights. If the camera moved "
+        "between photographs of one folder, put all photographs in one folder.",
+        stacklevel=3,
+    )
+    return torch.tensor([folders.index(path.parent) for path in paths])
+
+
+def image_name(path: Path, folder: Path | str) -> str:
+    """Return the name of an image of a folder, with the folder inside that it lies in."""
+    return path.relative_to(folder).as_posix()
 
 
 def _named_path(folder: Path | str) -> str:
@@ -150,6 +173,9 @@ def _named_path(folder: Path | str) -> str:
 def list_images(folder: Path | str) -> list[Path]:
     """List the image files of a folder in natural order: ``img2`` before ``img10``.
 
+    Of a folder that holds none, those of the folders inside, if three at least hold some: each
+    holds the photographs of one pose of the camera.
+
     Raises:
         InputError: No such folder, no images in it, or two of one stem.
     """
@@ -159,28 +185,36 @@ def list_images(folder: Path | str) -> list[Path]:
         found = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {found}; needed: a folder of images.")
     try:
-        entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        entries = _visible(folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
     paths = _readable(entries)
+    if not paths:
+        inside = [path for path in sorted(entries) if path.is_dir() and _holds_images(path)]
+        if len(inside) >= MIN_PHOTOGRAPHS:
+            paths = [image for one in inside for image in _readable(_visible(one))]
     if not paths:
         _refuse_absent(entries)
         _refuse_video(entries)
         content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
         raise InputError(
             f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
-            f"{_MORE}, not those in folders inside."
+            f"{_MORE}; or those in three folders inside at least, one a pose of the camera."
         )
-    paths.sort(key=lambda path: _natural(path.name))
-    stems: dict[str, Path] = {}
+    paths.sort(key=lambda path: _natural(image_name(path, folder)))
+    stems: dict[Path, Path] = {}
     for path in paths:
-        other = stems.setdefault(path.stem, path)
+        other = stems.setdefault(path.with_suffix(""), path)
         if other is not path:
             raise InputError(
-                f"{folder}: {other.name} and {path.name} differ only in their suffix; masks and "
-                "results go by the name without it. Rename or remove one."
+                f"{path.parent}: {other.name} and {path.name} differ only in their suffix; masks "
+                "and results go by the name without it. Rename or remove one."
             )
     return paths
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if not path.name.startswith(".")]
 
 
 def _readable(entries: Sequence[Path]) -> list[Path]:
@@ -223,7 +257,7 @@ def _refuse_video(entries: Sequence[Path]) -> None:
 
 def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
-    names = {path.name for path in read}
+    names = {path.relative_to(folder).parts[0] for path in read}
     raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
     kinds: Counter[str] = Counter()
     examples: list[str] = []
@@ -327,33 +361,37 @@ def shrunk_focals(
     return torch.tensor(focals, dtype=torch.float32) * torch.tensor(scales)
 
 
-def _match_masks(paths: list[Path], folder: Path) -> list[Path]:
+def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``.
 
     Those not found so are looked for as another program may have written the name.
     """
-    by_stem = {path.stem: path for path in list_images(folder)}
-    found = [
-        by_stem.get(path.stem) or by_stem.get(path.name) or by_stem.get(f"{path.stem}_mask")
-        for path in paths
-    ]
-    lost = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
+    by_stem = {image_name(path.with_suffix(""), folder): path for path in list_images(folder)}
+    found = [_mask_of(name, by_stem) for name in names]
+    lost = [name for name, mask in zip(names, found, strict=True) if mask is None]
     if lost:
         free = {_MASK.sub(r"\1", mask.name): mask for mask in by_stem.values() if mask not in found}
         others = match_files(lost, list(free), where=str(folder), what="mask")
-        names = dict(zip(lost, others, strict=True))
+        places = dict(zip(lost, others, strict=True))
         found = [
-            mask if mask or (at := names[path.name]) is None else list(free.values())[at]
-            for path, mask in zip(paths, found, strict=True)
+            mask if mask or (at := places[name]) is None else list(free.values())[at]
+            for name, mask in zip(names, found, strict=True)
         ]
-    missing = [path.name for path, mask in zip(paths, found, strict=True) if mask is None]
+    missing = [name for name, mask in zip(names, found, strict=True) if mask is None]
     if missing:
         raise InputError(
             f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
-            f"name (such as {Path(missing[0]).stem}.png). There are "
+            f"name (such as {missing[0].rpartition('.')[0]}.png). There are "
             f"{some([path.name for path in by_stem.values()])}."
         )
     return [mask for mask in found if mask is not None]
+
+
+def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
+    """Find a photograph's mask by exact names; one may be for all photographs of a pose."""
+    stem, folder = name.rpartition(".")[0], name.rpartition("/")[0]
+    names = (stem, name, f"{stem}_mask", folder)
+    return next((by_stem[one] for one in names if one in by_stem), None)
 
 
 def _is_dark(

@@ -4,7 +4,6 @@ import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,13 +16,14 @@ from pimper_torch.asset.make import few_enough, textured
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.io.estimates import mask_path
 from pimper_torch.io.finish import Finished, MeshFiles, finished
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.io.reports import lights_report, summary_report
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
+from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
 from pimper_torch.relighting.held_out import Relighting, relight
 from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import asset_within, write_page
@@ -153,8 +153,19 @@ def write_result(
         _write_json(summary, staging / "summary.json", indent=2)
         with part(7, _PARTS):
             if report:
-                title = folder.absolute().name
-                _write_page(whole, few, asset, relighting, staging, title=title, summary=summary)
+                write_page(
+                    staging / "report.html",
+                    title=folder.absolute().name,
+                    headline=headline(whole),
+                    asset=asset_within(asset, staging / "asset.glb"),
+                    scene=whole.scene,
+                    silhouettes=whole.silhouettes,
+                    reference=whole.coarse.reference,
+                    predictions=predictions(few, whole.scene, relighting),
+                    layers=surface_layers(asset.mesh),
+                    summary=summary,
+                    settings=(staging / "config.yaml").read_text(encoding="utf-8"),
+                )
 
 
 def _with_textures(relighting: Relighting, asset: Textured, result: Reconstruction) -> Relighting:
@@ -162,37 +173,6 @@ def _with_textures(relighting: Relighting, asset: Textured, result: Reconstructi
     if result.held_out is not None:
         return relighting.with_textures(asset, result.held_out, None)
     return relighting.with_textures(asset, result.scene, result.silhouettes)
-
-
-def _write_page(
-    result: Reconstruction,
-    few: Mesh,
-    asset: Textured,
-    relighting: Relighting,
-    folder: Path,
-    *,
-    title: str,
-    summary: Mapping[str, Any],
-) -> None:
-    """Write the page of a result whose other files are in a folder already.
-
-    Args:
-        few: The mesh that the relighting is of.
-    """
-    scene = result.scene
-    write_page(
-        folder / "report.html",
-        title=title,
-        headline=headline(result),
-        asset=asset_within(asset, folder / "asset.glb"),
-        scene=scene,
-        silhouettes=result.silhouettes,
-        reference=result.coarse.reference,
-        predictions=predictions(few, scene, relighting),
-        layers=surface_layers(asset.mesh),
-        summary=summary,
-        settings=(folder / "config.yaml").read_text(encoding="utf-8"),
-    )
 
 
 def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
@@ -232,7 +212,9 @@ def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> 
     names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
     for name, mask, (width, height) in zip(names, silhouettes.masks, sizes, strict=True):
         drawn = mask[:height, :width].to(torch.uint8) * 255
-        Image.fromarray(drawn.numpy()).save(folder / f"{Path(name).stem}.png")
+        path = mask_path(folder, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(drawn.numpy()).save(path)
 
 
 def _write_maps(result: Reconstruction, folder: Path) -> None:

@@ -108,11 +108,33 @@ def _inconsistency(
     return 0.5 * cost
 
 
+@compiled("int64(float32[::1], int64[::1], float32[::1])")
+def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
+    """See :func:`~pimper_torch.sweep.selection.poses_first`; views of rating 0 are not usable.
+
+    Returns:
+        How many poses have a usable view.
+    """
+    distinct = 0
+    for view in range(len(ratings)):
+        better = 0
+        if ratings[view] > 0 and len(poses):
+            for other in range(len(ratings)):
+                if poses[other] == poses[view] and (
+                    ratings[other] > ratings[view]
+                    or (ratings[other] == ratings[view] and other < view)
+                ):
+                    better += 1
+        demoted[view] = ratings[view] - np.float32(better)
+        distinct += ratings[view] > 0 and better == 0
+    return distinct
+
+
 @compiled(
     "void(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,:,::1],"
     "float64[:,::1], float64[::1], float64[:,::1], float64[::1], float32[:,:,::1],"
     "float32[:,:,:,::1], float32[:,:,:,::1], float32[:,:,::1], boolean[:,:,:,::1],"
-    "boolean[:,:,::1], float32[::1], float64[::1], int64, int64, float64,"
+    "boolean[:,:,::1], float32[::1], float64[::1], int64[::1], int64, int64, float64,"
     "float32[:,:,:,::1], float32[:,:,::1])"
 )
 def costs(
@@ -132,6 +154,7 @@ def costs(
     tested: Array,
     scale: Array,
     ladder: Array,
+    poses: Array,
     num_views: int,
     min_views: int,
     min_facing: float,
@@ -153,6 +176,7 @@ def costs(
         tested: Samples that may be swept.
         scale: Of the robust loss, for every patch.
         ladder: Height hypotheses, in units of ``spacing``.
+        poses: Number of each view's pose; empty where every view has its own.
         num_views: Maximum number of views of a sample.
         min_views: A sample with fewer views is not swept.
         min_facing: Lower bound of the cosine that shrinks footprints.
@@ -164,6 +188,8 @@ def costs(
     shading = np.empty(views, np.float32)
     score = np.empty(limit, np.float32)
     chosen = np.empty(limit, np.int64)
+    ratings = np.empty(views, np.float32)
+    demoted = np.empty(views, np.float32)
     facings = np.empty(views, np.float64)
     footprints = np.empty(views, np.float64)
     lit = np.empty(limit, np.float32)
@@ -198,8 +224,8 @@ def costs(
                     shading[view] = shade
                     mean_shading += max(shade, np.float32(0))
                 mean_shading /= np.float32(views)
-                num_chosen = 0
                 for view in range(views):
+                    ratings[view] = 0
                     if not valid[patch, view, row, column] or not shading[view] > 0:
                         continue
                     center = centers_patch[patch * views + view]
@@ -213,7 +239,13 @@ def costs(
                     footprint = spacing[patch] * focals[view] / max(z_cam, tiny)
                     facings[view], footprints[view] = facing, footprint
                     rating = facing * min(footprint, 1.0) * min(shading[view] / mean_shading, 1.0)
-                    rating = np.float32(rating)
+                    ratings[view] = np.float32(rating)
+                num_distinct = _after_other_poses(ratings, poses, demoted)
+                num_chosen = 0
+                for view in range(views):
+                    rating = demoted[view]
+                    if not ratings[view] > 0:
+                        continue
                     if num_chosen == limit and not rating > score[limit - 1]:
                         continue
                     index = min(num_chosen, limit - 1)
@@ -222,7 +254,7 @@ def costs(
                         index -= 1
                     score[index], chosen[index] = rating, view
                     num_chosen = min(num_chosen + 1, limit)
-                if num_chosen < min_views:
+                if min(num_chosen, num_distinct) < min_views:
                     continue
                 for slot in range(num_chosen):
                     view = chosen[slot]

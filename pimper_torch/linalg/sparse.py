@@ -4,6 +4,9 @@ The one place that talks to cholespy (CHOLMOD underneath). Systems are factored 
 in float64 whatever the device and dtype of the tensors; solutions go back to both.
 """
 
+import atexit
+from weakref import WeakSet
+
 import numpy as np
 import torch
 from cholespy import CholeskySolverD, MatrixType
@@ -17,6 +20,10 @@ from pimper_torch.linalg.singular import WORST_RESIDUAL, SingularSystemError
 # Above this the solution has fewer than three digits in float64; an exactly singular
 # matrix that survives elimination by rounding lands at 1e15 and more.
 _WORST_CONDITION = 1e13
+
+# Factors whose CHOLMOD part is still to be let go of when Python ends. A result with gradients
+# holds its factor in a graph of torch, which then frees nothing, and cholespy prints what leaks.
+_ALIVE: WeakSet["SparseCholesky"] = WeakSet()
 
 
 class SparseCholesky(PreparedMatrix):
@@ -47,6 +54,7 @@ class SparseCholesky(PreparedMatrix):
         scale = self._scale.numpy()
         scaled.data *= scale[scaled.row] * scale[scaled.col]
         self._solver = self._factor(scaled) if size else None
+        _ALIVE.add(self)
         self._check_condition()
 
     def _factor(self, matrix: coo_array) -> CholeskySolverD:
@@ -95,3 +103,9 @@ class SparseCholesky(PreparedMatrix):
                 "finite: anchor the unknowns, and look for invalid samples in the input."
             )
         return (answer * self._scale[:, None]).reshape(rhs.shape).to(rhs)
+
+
+@atexit.register
+def _release_factors() -> None:
+    for factor in _ALIVE:
+        factor._solver = None

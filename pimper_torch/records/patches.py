@@ -8,7 +8,7 @@ plane z = 0 and its outward normal is -z. A depth on the template is a coordinat
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeVar
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.errors import InputError
 from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
@@ -79,6 +80,10 @@ class OverPatches(Record):
 
     def __len__(self) -> int:
         return self._templates.num_patches
+
+    def lengths(self) -> dict[str, int]:
+        """Return the number of patches: their rasters differ."""
+        return {"patch": len(self)}
 
     def __getitem__(self: AnyPatches, facet: int) -> AnyPatches:
         for index, bucket in enumerate(self._templates.buckets):
@@ -327,6 +332,13 @@ class Photometry(Record):
             yield "information", found, "an inverse variance, 0 where unknown"
 
     @property
+    def predicted(self) -> Float[Tensor, "patch view channel height width"]:
+        """Radiance of every sample in every view, as albedo, normal and light say."""
+        basis = torch.cat([torch.ones_like(self.normals_patch[..., :1]), self.normals_patch], -1)
+        shading = torch.einsum("pvi,phwi->pvhw", self.lights_patch, basis)
+        return shading[:, :, None] * self.albedo.movedim(-1, 1)[:, None]
+
+    @property
     def observed(self) -> Bool[Tensor, "patch height width"]:
         """Where views show the sample lit, so that it has albedo, with or without a normal."""
         return (self.albedo > 0).any(dim=-1)
@@ -349,6 +361,61 @@ class PhotometricPatches(OverPatches):
     patches: PatchSet
     buckets: tuple[Photometry, ...]
 
+    @classmethod
+    def of(
+        cls,
+        patches: "PatchSet | PatchViews",
+        *,
+        normals: Sequence[Float[Tensor, "patch height width 3"]],
+        lights: Float[Tensor, "view 4"] | Sequence[Float[Tensor, "patch view 4"]],
+        albedo: Sequence[Float[Tensor, "patch height width channel"]] | None = None,
+        information: Sequence[Float[Tensor, "patch height width"]] | float = 1
+        / math.radians(8) ** 2,
+    ) -> "PhotometricPatches":
+        """Put normals, albedo and lights of one's own on patches.
+
+        Samples inside their templates whose normal is finite, not zero, and faces the viewer are
+        valid. A patch without any is ``UNSEEN``.
+
+        Args:
+            patches: Templates, or views on them: then a sample has to be seen, too, and residuals
+                are those of the views. Of templates alone they are 0.
+            normals: Patch frame (x right, y down, z into the surface), of any length; one tensor a
+                bucket.
+            lights: First-order harmonics, radiance = albedo * l . (1, n): of every view in the
+                world frame, or of every view on every patch in the patch frame, one tensor a
+                bucket.
+            albedo: Linear; one tensor a bucket. 1 unless given.
+            information: Inverse variance of the normals, one over squared radians: one tensor a
+                bucket, or a number for all. A standard error of 8 degrees unless given.
+
+        Raises:
+            InputError: A number of buckets, a shape or a value that does not belong to the patches.
+        """
+        templates = patches._templates.buckets
+        lights = [lights] * len(templates) if isinstance(lights, Tensor) else lights
+        columns: dict[str, Sequence[Any]] = {
+            "normals": normals,
+            "lights": lights,
+            "albedo": [None] * len(templates) if albedo is None else albedo,
+            "information": information
+            if isinstance(information, Sequence)
+            else [information] * len(templates),
+            "views": patches.buckets
+            if isinstance(patches, PatchViews)
+            else [None] * len(templates),
+        }
+        for name, values in columns.items():
+            if len(values) != len(templates):
+                raise InputError(
+                    f"PhotometricPatches.of: {name} are {len(values)}; needed: one tensor for each "
+                    f"of {len(templates)} buckets of patches, in their order."
+                )
+        rows = zip(templates, *columns.values(), strict=True)
+        found = cls(patches=patches._templates, buckets=tuple(_given(*row) for row in rows))
+        found.check("PhotometricPatches.of")
+        return found
+
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List normals of another floating-point type than the templates, too."""
         yield from super(PhotometricPatches, self).faults()
@@ -359,6 +426,55 @@ class PhotometricPatches(OverPatches):
             if found != needed:
                 name = f"buckets[{index}].normals_patch"
                 yield name, f"is of {found}", f"{needed}, as its templates"
+
+
+def _given(
+    templates: Templates,
+    normals: Tensor,
+    lights: Tensor,
+    albedo: Tensor | None,
+    information: Tensor | float,
+    views: Observations | None,
+) -> Photometry:
+    """Make the photometry of a bucket, see :meth:`PhotometricPatches.of`."""
+    like = templates.depth
+    normals = normals.to(like)
+    if normals.shape != (*like.shape, 3):
+        raise InputError(
+            f"PhotometricPatches.of: normals of a bucket have shape {tuple(normals.shape)}; "
+            f"needed: patch, height, width, 3: {(*like.shape, 3)}."
+        )
+    length = normals.norm(dim=-1)
+    valid = templates.inside & normals.isfinite().all(dim=-1) & (length > 0) & (normals[..., 2] < 0)
+    if views is not None:
+        valid = valid & views.valid.any(dim=1)
+    facing = torch.tensor([0.0, 0.0, -1.0]).to(like)
+    unit = torch.where(valid[..., None], normals / length[..., None], facing)
+    lights = lights.to(like)
+    if lights.ndim == 2:
+        rotated = torch.einsum("pij,vj->pvi", templates.patch_from_world[:, :3, :3], lights[:, 1:])
+        lights = torch.cat([lights[:, :1].expand(len(like), -1, 1), rotated], dim=-1)
+    determined = valid.flatten(1).any(dim=1)
+    none = torch.zeros_like(templates.facet)
+    found = Photometry(
+        normals_patch=unit,
+        albedo=torch.ones_like(like)[..., None] if albedo is None else albedo.to(like),
+        lights_patch=lights,
+        valid=valid,
+        information=torch.as_tensor(information).to(like) * valid,
+        status=torch.where(determined, int(PatchStatus.DETERMINED), int(PatchStatus.UNSEEN)),
+        convergence=Convergence(
+            iterations=none,
+            residual=torch.zeros_like(templates.spacing),
+            cause=torch.where(determined, int(StopCause.CONVERGED), int(StopCause.EMPTY)),
+        ),
+    )
+    if views is None:
+        return found
+    counted = views.valid & valid[:, None]
+    off = torch.where(counted, views.gray - found.predicted.mean(dim=2), 0).flatten(1)
+    square = off.square().sum(dim=1) / counted.flatten(1).sum(dim=1).clamp_min(1)
+    return found.replace(convergence=found.convergence.replace(residual=square.sqrt()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -157,6 +157,35 @@ class Record:
                 changes[name] = torch.cat(values)
         return records[0].replace(**changes)
 
+    def __str__(self) -> str:
+        shown = [field for field in dataclasses.fields(self) if field.repr]
+        lines = [f"  {field.name}: {_told(getattr(self, field.name))}" for field in shown]
+        return "\n".join([type(self).__name__, *lines])
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:  # noqa: ANN401 - IPython's
+        printer.text("..." if cycle else str(self))
+
+    def lengths(self) -> dict[str, int]:
+        """Return the length of every named axis, of its own tensors before those of records inside.
+
+        >>> from pimper_torch.records import Mesh
+        >>> Mesh(vertices_world=torch.zeros(4, 3), faces=torch.zeros(2, 3).long()).lengths()
+        {'vertex': 4, 'face': 2}
+        """
+        found: dict[str, int] = {}
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        for name, hint in _arrays(type(self)).items():
+            if values[name] is not None:
+                words = _array_of(hint).dim_str.split()
+                found |= {
+                    word: size
+                    for word, size in zip(words, values[name].shape, strict=False)
+                    if word.isidentifier() and size
+                }
+        for value in values.values():
+            found = found | value.lengths() | found if isinstance(value, Record) else found
+        return found
+
     def __repr__(self) -> str:
         fields = ", ".join(
             f"{field.name}={_brief(getattr(self, field.name))}"
@@ -270,6 +299,15 @@ def _brief(value: object) -> str:
     if isinstance(value, tuple) and len(value) > 3:
         return f"({_brief(value[0])}, ... {len(value)} in all)"
     return repr(value)
+
+
+def _told(value: object) -> str:
+    if isinstance(value, Record):
+        axes = ", ".join(f"{axis} {size:,}" for axis, size in value.lengths().items())
+        return f"{type(value).__name__}({axes})"
+    if isinstance(value, tuple) and value and isinstance(value[0], Record):
+        return f"{len(value)} {type(value[0]).__name__}"
+    return _brief(value)
 
 
 def _wanted(hint: Any) -> str:  # noqa: ANN401

@@ -28,6 +28,8 @@ class Views(Record):
         orientations: EXIF's number of the orientation that was applied to each file's pixels;
             ``None`` where none was.
         folder: Path that the files lie in, by which a model's images of one name are told apart.
+        poses: Number of the pose that each photograph was taken from, where several were, each
+            under another light; ``None`` where every photograph has a pose of its own.
         priors: What is guessed of some photographs, such as normals by a network. Maps of
             photographs that are left out are not looked at.
     """
@@ -39,6 +41,7 @@ class Views(Record):
     focals_px: Float[Tensor, " view"]
     orientations: Int[Tensor, " view"] | None = None
     folder: str = field(default="", repr=False, compare=False)
+    poses: Int[Tensor, " view"] | None = None
     priors: tuple[Prior, ...] = ()
 
     @property

@@ -30,6 +30,7 @@ from pimper_torch.sfm.mapping import MapSettings
 from pimper_torch.sfm.matching import MatchSettings
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.one_lens import doubt_one_lens
+from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
 from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
 from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
@@ -227,7 +228,8 @@ class Reconstruct(Stage):
         _require_finite(views)
         bare = views.replace(priors=())  # which tell nothing of where cameras stand
         if sparse_model is None:
-            return placed_scene(views, find_model(bare, self.config, self.store)[0])
+            model, _ = find_model(pictures_of_poses(bare), self.config, self.store)
+            return placed_scene(views, of_photographs(model, views))
         return placed_scene(views, self._given(bare, Path(sparse_model)))
 
     def with_points(self, scene: SparseScene) -> SparseScene:

@@ -8,6 +8,7 @@ from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Failure, Silhouettes, SparseScene
+from pimper_torch.sfm.poses import OneAPose
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
 from pimper_torch.silhouettes.by_series import by_series
 from pimper_torch.silhouettes.contours import box_round
@@ -165,6 +166,23 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene
     return scene.replace(views=scene.views.replace(masks=used))
+
+
+def of_all_photographs(
+    scene: SparseScene, few: OneAPose, found: Silhouettes
+) -> tuple[SparseScene, Silhouettes]:
+    """Carry silhouettes of one photograph a pose to all photographs of the scene.
+
+    Args:
+        found: In the photographs of ``few``.
+
+    Returns:
+        The scene with these silhouettes for masks, see :func:`masked`, and silhouettes of its
+        views.
+    """
+    if few.scene is not scene:
+        found = found.take(few.of)
+    return masked(scene, found), found
 
 
 def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:

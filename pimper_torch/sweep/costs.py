@@ -1,7 +1,7 @@
 """What hands a bucket's samples to the compiled sweep, and takes the costs of all heights."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.geometry.frames import invert_rigid, transform
@@ -17,6 +17,7 @@ def compiled_costs(
     transferred: Float[Tensor, "patch height width 3"],
     cameras: Cameras,
     sources: Sources,
+    poses: Int[Tensor, " view"] | None,
     *,
     ladder: Float[Tensor, " hypothesis"],
     scale: Float[Tensor, " patch"],
@@ -29,6 +30,7 @@ def compiled_costs(
     Args:
         registered: Which views have which samples.
         photometry: Normals and lights.
+        poses: Number of each view's pose, where some have several.
         transferred: Normals that samples are swept along.
         ladder: Heights that are tried, in samples.
         scale: Of the robust cost, in units of radiance.
@@ -61,6 +63,7 @@ def compiled_costs(
         as_array(photometry.observed & templates.inside),
         as_array(scale, torch.float32),
         as_array(ladder, torch.float64),
+        as_array(torch.zeros(0, dtype=torch.long) if poses is None else poses),
         num_views,
         min_views,
         min_facing,

@@ -22,6 +22,35 @@ def best_views(
     return best.indices, best.values > -torch.inf
 
 
+def poses_first(
+    score: Float[Tensor, "sample view"],
+    usable: Bool[Tensor, "sample view"],
+    poses: Int[Tensor, " view"],
+) -> Float[Tensor, "sample view"]:
+    """Rate the best usable view of every pose before the second of any, and so on.
+
+    Views of one pose say nothing of a height: they agree whatever it is.
+
+    Args:
+        score: In [0, 1].
+        poses: Number of each view's pose.
+
+    Returns:
+        The score, less the number of better views of the same pose.
+
+    >>> score, poses = torch.tensor([[0.9, 0.8, 0.3]]), torch.tensor([0, 0, 1])
+    >>> poses_first(score, torch.ones(1, 3, dtype=torch.bool), poses)
+    tensor([[ 0.9000, -0.2000,  0.3000]])
+    """
+    rated = torch.where(usable, score, -torch.inf)
+    found = score.clone()
+    for pose in sorted(set(poses.tolist())):
+        (own,) = torch.nonzero(poses == pose, as_tuple=True)
+        order = rated[:, own].argsort(dim=1, descending=True, stable=True)
+        found[:, own] -= order.argsort(dim=1)
+    return found
+
+
 def view_scores(
     facing: Float[Tensor, "sample view"],
     footprint: Float[Tensor, "sample view"],

@@ -37,7 +37,7 @@ from pimper_torch.stage import Stage
 from pimper_torch.sweep.consistency import inconsistency
 from pimper_torch.sweep.costs import compiled_costs
 from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
-from pimper_torch.sweep.selection import best_views, view_scores
+from pimper_torch.sweep.selection import best_views, poses_first, view_scores
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 
 # Samples whose noise is correlated, as they are interpolated between the same pixels: with 4 the
@@ -74,7 +74,7 @@ class SweepConfig:
         steps: Tried on each side of the template.
         num_views: Largest number of views that a sample is compared in: the best by angle,
             resolution and light of those that have it.
-        min_views: A sample that fewer usable views have gets no height.
+        min_views: A sample that fewer usable views have, of distinct poses, gets no height.
     """
 
     steps: Annotated[int, Range(least=1, most=1000)] = 4
@@ -147,7 +147,7 @@ class Sweep(Stage):
         """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
         coarse = photometric.patches.coarse
-        one = partial(self._swept, cameras, sources or prepare(views), coarse)
+        one = partial(self._swept, cameras, sources or prepare(views), coarse, views.poses)
         return SweptPatches(
             photometric=photometric,
             buckets=tuple(side_by_side(one, list(buckets))),
@@ -159,6 +159,7 @@ class Sweep(Stage):
         cameras: Cameras,
         sources: Sources,
         coarse: CoarseMesh,
+        poses: Int[Tensor, " view"] | None,
         bucket: tuple[Templates, Observations, Photometry],
     ) -> Heights:
         """Sweep a bucket; patches that cannot be have no heights."""
@@ -177,7 +178,7 @@ class Sweep(Stage):
         def work(some: slice) -> Heights:
             templates, registered, photometry = bucket
             part = templates.take(some), registered.take(some), photometry.take(some)
-            return self._sweep(cameras, sources, coarse, part)
+            return self._sweep(cameras, sources, coarse, poses, part)
 
         found = over_patches(work, templates.facet, "sweep", lost, _NO_HEIGHTS)
         usable = bucket[1].valid.sum(dim=1)
@@ -211,6 +212,7 @@ class Sweep(Stage):
         cameras: Cameras,
         sources: Sources,
         coarse: CoarseMesh,
+        poses: Int[Tensor, " view"] | None,
         bucket: tuple[Templates, Observations, Photometry],
     ) -> Heights:
         config = self.config
@@ -232,7 +234,7 @@ class Sweep(Stage):
             photometry.lights_patch,
             photometry.convergence.residual,
         )
-        given = templates, registered, photometry, transferred, cameras, sources
+        given = templates, registered, photometry, transferred, cameras, sources, poses
         if fast:
             costs, swept = compiled_costs(
                 *given,
@@ -291,9 +293,10 @@ class Sweep(Stage):
         transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         sources: Sources,
+        poses: Int[Tensor, " view"] | None,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
         """Return the cost of every height, and 1 where a sample is swept, else 0."""
-        rows = self._rows(templates, registered, photometry, transferred, cameras)
+        rows = self._rows(templates, registered, photometry, transferred, cameras, poses)
         step = _STEP * templates.spacing
         moves = step[rows.patch, None] * self._ladder.to(step)
         radiance = self._look_up(rows, templates, moves, cameras, sources)
@@ -309,6 +312,7 @@ class Sweep(Stage):
         photometry: Photometry,
         transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
+        poses: Int[Tensor, " view"] | None,
     ) -> _Swept:
         """List the samples that enough views have, with these."""
         config, views = self.config, cameras.num_views
@@ -330,8 +334,12 @@ class Sweep(Stage):
             footprint = self._footprint(points, templates.spacing[patch], cameras)
             score = view_scores(facing, footprint, shading)
             usable = valid & (facing > 0) & (shading > 0)
+            if poses is not None:
+                score = poses_first(score, usable, poses)
             chosen, seen = best_views(score, usable, config.num_views)
             enough = seen.sum(dim=1) >= config.min_views
+            if poses is not None:
+                enough = (seen & (score.gather(1, chosen) > 0)).sum(dim=1) >= config.min_views
         return _Swept(
             index=index[enough],
             patch=patch[enough],

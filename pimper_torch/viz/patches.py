@@ -12,6 +12,7 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     DepthPatches,
+    Observations,
     PatchSet,
     PatchViews,
     PhotometricPatches,
@@ -20,6 +21,7 @@ from pimper_torch.records import (
 from pimper_torch.viz.maps import normal_colors
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _PANEL_IN = 2.2
@@ -27,26 +29,40 @@ _PANEL_IN = 2.2
 AnyPatch = PatchSet | PatchViews | PhotometricPatches | SweptPatches | DepthPatches
 
 
-def plot_patch(patch: AnyPatch) -> "Figure":
+def plot_patch(
+    patch: AnyPatch, seen: PatchViews | None = None, sample: tuple[int, int] | None = None
+) -> "Figure":
     """Draw what a record says about one patch, on its template's raster.
 
     Of :class:`PatchViews` every view that shows it; of the others albedo, normals (red right, green
-    up, blue to the viewer), confidence and heights, as far as the record has them.
+    up, blue to the viewer), confidence and heights, as far as the record has them. With views
+    beside photometry, the residual of every sample, too, and a sample's radiance in every view that
+    has it, observed and predicted: the light on it.
 
     Args:
         patch: A record of one patch, such as ``heights[17]``.
+        seen: Views on the same patch, such as ``seen[17]``.
+        sample: Row and column of the sample whose light is drawn; the one with the largest
+            residual unless given.
 
     Raises:
-        InputError: The record has more patches than one, or none.
+        InputError: The record has more patches than one, or none; the views are of another patch;
+            no view has the sample.
     """
     if len(patch) != 1:
         raise InputError(
             f"plot_patch got {len(patch)} patches; needed: one, such as `patches[17]`."
         )
-    panels = _cropped(patch, _panels(patch))
-    figure = _figure(len(panels))
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (title, raster) in zip(all_axes, panels, strict=True):
+    panels = _panels(patch)
+    residual = None if seen is None else _residual(patch, seen)
+    if residual is not None:
+        panels.append(("residual", residual.square().nanmean(dim=0).sqrt()))
+    panels = _cropped(patch, panels)
+    figure = _figure(len(panels) + (residual is not None))
+    all_axes = figure.subplots(1, len(panels) + (residual is not None), squeeze=False)[0]
+    if seen is not None and residual is not None:
+        _draw_light(all_axes[-1], seen.buckets[0], residual, sample)
+    for axes, (title, raster) in zip(all_axes, panels, strict=False):
         picture = raster.detach().float().cpu()
         if picture.ndim == 3:
             axes.imshow(picture.clamp(0, 1).numpy())
@@ -55,6 +71,47 @@ def plot_patch(patch: AnyPatch) -> "Figure":
         axes.set_title(title, fontsize="small")
         axes.set_axis_off()
     return figure
+
+
+def _residual(patch: AnyPatch, seen: PatchViews) -> Float[Tensor, "view height width"]:
+    """Return observed less predicted gray radiance; NaN where a view has no sample."""
+    facets = [one.buckets[0].facet.tolist() for one in (_templates(patch), seen.patches)]
+    if isinstance(patch, PatchSet | PatchViews) or facets[0] != facets[1]:
+        raise InputError(
+            f"plot_patch got a {type(patch).__name__} of facet {facets[0]} and views of facet "
+            f"{facets[1]}; needed: photometry of one patch, and views of the same."
+        )
+    photometric = patch if isinstance(patch, PhotometricPatches) else patch.photometric
+    (found,), (views,) = photometric.buckets, seen.buckets
+    known = views.valid[0] & found.observed[0]
+    return torch.where(known, views.gray[0] - found.predicted[0].mean(dim=1), torch.nan).detach()
+
+
+def _draw_light(
+    axes: "Axes",
+    views: Observations,
+    residual: Float[Tensor, "view height width"],
+    sample: tuple[int, int] | None,
+) -> None:
+    """Draw a sample's radiance in every view that has it, observed and predicted."""
+    if sample is None:
+        worst = int(residual.square().nansum(dim=0).argmax())
+        sample = worst // residual.shape[2], worst % residual.shape[2]
+    row, column = sample
+    off = residual[:, row, column].cpu()
+    (shown,) = torch.nonzero(off.isfinite(), as_tuple=True)
+    if not len(shown):
+        raise InputError(f"plot_patch: no view has sample {sample}; needed: one that is lit.")
+    observed = views.gray[0, shown.to(views.valid.device), row, column].detach().cpu()
+    axes.plot(shown.numpy(), observed.numpy(), "k.", label="observed")
+    axes.plot(shown.numpy(), (observed - off[shown]).numpy(), "C1_", label="predicted")
+    axes.set_title(f"sample {row}, {column}", fontsize="small")
+    axes.set_xlabel("view", fontsize="small")
+    axes.legend(fontsize="x-small")
+
+
+def _templates(patches: AnyPatch) -> PatchSet:
+    return patches if isinstance(patches, PatchSet) else patches.patches
 
 
 def plot_in_view(
@@ -100,7 +157,7 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
     Raises:
         InputError: The buckets have no such field, or more values than patches.
     """
-    templates = patches if isinstance(patches, PatchSet) else patches.patches
+    templates = _templates(patches)
     found = torch.full((len(templates.coarse.mesh.faces),), torch.nan)
     for own, bucket in zip(templates.buckets, patches.buckets, strict=True):
         value: object = bucket
@@ -151,8 +208,7 @@ def _in_colour(values: Float[Tensor, "height width channel"]) -> Float[Tensor, "
 
 def _cropped(patch: AnyPatch, panels: list[tuple[str, Tensor]]) -> list[tuple[str, Tensor]]:
     """Leave the padding out: templates of a bucket share one raster."""
-    templates = patch if isinstance(patch, PatchSet) else patch.patches
-    inside = templates.buckets[0].inside[0]
+    inside = _templates(patch).buckets[0].inside[0]
     rows, columns = (inside.any(dim=axis).nonzero()[:, 0] for axis in (1, 0))
     if not len(rows):
         return panels

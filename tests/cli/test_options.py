@@ -53,7 +53,7 @@ RUNS = {
         "{ball} -o {out} {tiny} --path turntable --no-fixed-point-light --no-fixed-room "
         "--no-fixed-table --constant-light",
         "{ball} -o {out} {tiny} --no-constant-light --turned-over --table patterned",
-        "{ball} -o {out} {tiny} --no-turned-over",
+        "{ball} -o {out} {tiny} --no-turned-over --lights-per-pose 2",
     ],
     "export": [
         "{result} --out {out} --format colmap nerfstudio alicevision maps lights --axes lub "

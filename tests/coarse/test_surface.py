@@ -7,6 +7,7 @@ from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.surface import (
     CoarseSurface,
     CoarseSurfaceConfig,
+    facets_of,
     smoothed_normals,
     two_faces_an_edge,
 )
@@ -189,3 +190,35 @@ def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
     ratio = tilt_after[[0, 2]] / tilt_before[[0, 2]]
     assert bool((ratio > 0.5).all() and (ratio < 0.8).all())
     assert_close(after.norm(dim=1), torch.ones(9))
+
+
+def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attach(round_about):
+    vertices, faces = icosphere(2)
+    mesh = Mesh(vertices_world=vertices, faces=faces.flip(1))  # wound inwards
+    found = facets_of(mesh, round_about)
+    assert len(found.mesh.faces) == len(faces)
+    assert found.mesh.vertices_world.dtype == round_about.points_world.dtype
+    outward = face_normals(found.mesh.vertices_world, found.mesh.faces)
+    assert ((outward * found.mesh.vertices_world[found.mesh.faces].mean(dim=1)).sum(1) > 0).all()
+    expected = built(round_about, mesh.replace(vertices_world=vertices.float()))
+    assert found.reference == expected.reference
+    assert_close(found.points.points_world, expected.points.points_world)
+    assert_close(found.points.covariance_world, expected.points.covariance_world)
+    bare = round_about.replace(
+        points_world=round_about.points_world[:0],
+        reprojection_errors_px=round_about.reprojection_errors_px[:0],
+        observation_point=round_about.observation_point[:0],
+        observation_view=round_about.observation_view[:0],
+        observation_pixels=round_about.observation_pixels[:0],
+    )
+    assert len(facets_of(mesh, bare, round_about.views.names[3]).points.facet) == 0
+    assert facets_of(mesh, bare, round_about.views.names[3]).reference == 3
+
+
+def test_facets_of_a_mesh_elsewhere_or_of_no_photograph_are_refused(round_about):
+    vertices, faces = icosphere(2)
+    mesh = Mesh(vertices_world=1000 * vertices, faces=faces)
+    with pytest.raises(InputError, match="in another frame than the cameras"):
+        facets_of(mesh, round_about)
+    with pytest.raises(InputError, match="are named 'front'"):
+        facets_of(mesh.replace(vertices_world=vertices), round_about, "front")

@@ -30,7 +30,6 @@ from pimper_torch.evidence.datasets import (
     read_llff,
     read_meshroom,
     read_metashape,
-    read_middlebury,
     read_rendered,
     read_transforms,
     write_colmap,
@@ -316,18 +315,15 @@ def _datasets(root: Path) -> list[Seed]:
     write_idr(views, cameras, root / "idr", points_world=points)
     write_colmap(views, cameras, root / "colmap", points_world=points)
     world_from_cam = invert_rigid(cameras.cam_from_world.double()).numpy()
-    for kind in ("llff/images", "middlebury", "meshroom", "metashape/images", "diligent"):
+    for kind in ("llff/images", "meshroom", "metashape/images", "diligent"):
         (root / kind).mkdir(parents=True)
         for name in views.names:
             Image.fromarray(_pixels()).save(root / kind / name)
-    rows, lines, frames, placed = [], [str(len(views.names))], [], []
+    rows, frames, placed = [], [], []
     for index, name in enumerate(views.names):
         pose, cam = world_from_cam[index], cameras.cam_from_world[index].numpy()
         columns = np.stack([pose[:3, 1], pose[:3, 0], -pose[:3, 2], pose[:3, 3], [18, 24, 30]], 1)
         rows.append([*columns.reshape(-1), 1.0, 9.0])
-        numbers = [*cameras.intrinsics[index].reshape(-1).tolist()]
-        numbers += [*cam[:3, :3].reshape(-1).tolist(), *cam[:3, 3].tolist()]
-        lines.append(" ".join([name, *(f"{value:.9g}" for value in numbers)]))
         rotation = [str(value) for value in cam[:3, :3].T.reshape(-1)]
         center = [str(value) for value in pose[:3, 3]]
         frames.append((str(index), name, rotation, center))
@@ -337,7 +333,6 @@ def _datasets(root: Path) -> list[Seed]:
             "</camera>"
         )
     np.save(root / "llff" / "poses_bounds.npy", np.array(rows))
-    (root / "middlebury" / "set_par.txt").write_text("\n".join(lines) + "\n")
     intrinsic = {"intrinsicId": "3", "width": "24", "height": "18", "type": "radial3"}
     intrinsic |= {"sensorWidth": "36", "focalLength": "45", "pixelRatio": "1"}
     more = {"principalPoint": ["0", "0"], "distortionParams": ["0.01", "0", "0"]}
@@ -372,7 +367,6 @@ def _datasets(root: Path) -> list[Seed]:
         "transforms": (read_transforms, ("transforms.json",)),
         "idr": (read_idr, ("cameras.npz",)),
         "llff": (read_llff, ("poses_bounds.npy",)),
-        "middlebury": (read_middlebury, ("set_par.txt",)),
         "meshroom": (read_meshroom, ("cameras.sfm",)),
         "metashape": (read_metashape, ("cameras.xml",)),
         "colmap": (

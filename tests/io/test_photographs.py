@@ -411,3 +411,30 @@ def test_an_object_that_fills_its_photographs_stays_bright(photos, tmp_path):
         save(tmp_path / "masks" / f"{number}.png", drawn)
     masks = load_views(photos, masks=tmp_path / "masks").masks
     assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
+
+
+def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
+    names = [f"pose_{pose}/light_{light}.png" for pose in (1, 2, 10) for light in (1, 2)]
+    for name in reversed(names):
+        save(tmp_path / "photos" / name, pixels)
+        save(tmp_path / "masks" / name, pixels[..., 0])
+    with pytest.warns(PimperWarning, match="6 photographs in its 3 folders are taken for 3 poses"):
+        views = load_views(tmp_path / "photos", masks=tmp_path / "masks")
+    assert views.names == tuple(names)
+    assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]
+    for pose in (1, 2, 10):
+        save(tmp_path / "shared" / f"pose_{pose}.png", pixels[..., 0])
+    with pytest.warns(PimperWarning, match="3 poses"):
+        shared = load_views(tmp_path / "photos", masks=tmp_path / "shared")
+    assert torch.equal(shared.masks, views.masks)
+
+
+def test_two_folders_inside_are_no_poses(tmp_path, pixels):
+    for name in ("a/1.png", "a/2.png", "b/1.png", "b/2.png"):
+        save(tmp_path / name, pixels)
+    with pytest.raises(InputError, match=r"no images; it holds .*three folders inside at least"):
+        load_views(tmp_path)
+    save(tmp_path / "c" / "1.png", pixels)
+    save(tmp_path / "c" / "1.tif", pixels)
+    with pytest.raises(InputError, match=r"c: 1.png and 1.tif differ only in their suffix"):
+        load_views(tmp_path)

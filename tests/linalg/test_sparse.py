@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -129,3 +132,13 @@ def test_numbers_that_are_not_finite_are_refused(place):
     (values if place == "matrix" else rhs)[1] = torch.nan
     with pytest.raises(SingularSystemError, match="finite"):
         solve(index, index, values, rhs)
+
+
+def test_nothing_leaks_at_exit_though_a_result_with_gradients_is_alive():
+    program = (
+        "import torch; from pimper_torch.linalg.sparse import SparseCholesky; "
+        "index = torch.arange(2); entries = torch.tensor([2.0, 4.0], requires_grad=True); "
+        "found = SparseCholesky(index, index, entries, size=2).solve(torch.ones(2))"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")

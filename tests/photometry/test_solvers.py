@@ -12,7 +12,6 @@ from pimper_torch.photometry.bilinear import (
 from pimper_torch.photometry.robust import Cauchy
 from pimper_torch.photometry.sample_estimates import refine_on_manifold
 from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.single_view.factorization.alternation import solve_alternation
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
 
 
@@ -21,7 +20,7 @@ def solve_projection(problem, max_iterations, tolerance):
     return solve_variable_projection(problem, max_iterations, tolerance**2)
 
 
-SOLVERS = pytest.mark.parametrize("solve", [solve_alternation, solve_balm, solve_projection])
+SOLVERS = pytest.mark.parametrize("solve", [solve_balm, solve_projection])
 
 
 def error(found, truth, weight, least=7):

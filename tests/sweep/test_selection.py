@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.sweep.selection import best_views, view_scores
+from pimper_torch.sweep.selection import best_views, poses_first, view_scores
 
 
 def test_the_best_usable_views_are_chosen_and_no_others():
@@ -25,3 +25,21 @@ def test_the_score_is_the_cosine_times_the_resolution_times_the_relative_light()
     expected = torch.tensor([[0.5 * 1.0, 0.5 * 1.0, 0.8 / 1.75, 0.0]])
     assert_close(view_scores(facing, footprint, shading), expected)
     assert (view_scores(facing, footprint, 0 * shading) == 0).all()  # no light at all
+
+
+def test_the_best_view_of_every_pose_goes_before_the_second_of_any():
+    generator = torch.Generator().manual_seed(64)
+    score = torch.rand(40, 9, generator=generator)
+    usable = torch.rand(40, 9, generator=generator) > 0.3
+    poses = torch.tensor([0, 1, 1, 2, 0, 1, 3, 3, 0])
+    for row in range(40):
+        shown = usable[row].nonzero()[:, 0].tolist()
+        distinct = {int(poses[view]) for view in shown}
+        chosen, meant = best_views(poses_first(score, usable, poses), usable, len(distinct))
+        best = {
+            pose: max((v for v in shown if poses[v] == pose), key=lambda v: float(score[row, v]))
+            for pose in distinct
+        }
+        assert set(chosen[row][meant[row]].tolist()) == set(best.values())
+    alone = torch.arange(9)
+    assert torch.equal(poses_first(score, usable, alone), score)

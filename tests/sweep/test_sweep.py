@@ -146,3 +146,37 @@ def test_heights_have_the_slope_of_the_photographs_differences(lift):
 def test_settings_out_of_range_are_refused(field, value):
     with pytest.raises(ConfigError, match=field):
         SweepConfig(**{field: value})
+
+
+def copied(lifted, copies):
+    """The same photographs several times, with the pose of each, or as if each had its own."""
+    scene = lifted.scene
+    views = scene.views.take(copies)
+    views = views.replace(names=tuple(map(str, range(len(copies)))), poses=torch.tensor(copies))
+    seen = lifted.seen.replace(
+        buckets=tuple(
+            one.replace(radiance=one.radiance[:, copies], valid=one.valid[:, copies])
+            for one in lifted.seen.buckets
+        )
+    )
+    photometric = lifted.photometric.replace(
+        buckets=tuple(
+            one.replace(lights_patch=one.lights_patch[:, copies])
+            for one in lifted.photometric.buckets
+        )
+    )
+    return views, scene.cameras.take(copies), seen, photometric
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # compiled, and torch
+def test_photographs_of_one_pose_are_compared_over_poses_first(lift, kind):
+    lifted = lift(0.4)
+    five = [record.to(kind) for record in copied(lifted, [0, 2, 4, 6, 8])]
+    many = [record.to(kind) for record in copied(lifted, [0, 2, 2, 2, 2, 4, 4, 6, 8, 8, 8, 8])]
+    config = SweepConfig(num_views=5)
+    alone, again = (told(Sweep(config)(*records))[0] for records in (five, many))
+    assert_close(alone, again)
+    unknown = many[0].replace(poses=None), *many[1:]
+    assert len(told(Sweep(config)(*unknown))[0]) != len(alone)
+    two = [record.to(kind) for record in copied(lifted, [0, 0, 0, 8, 8, 8])]
+    assert len(told(Sweep(config)(*two))[0]) == 0  # three poses are needed

@@ -1,13 +1,10 @@
 """Baselines, run on the same scene as the method."""
 
-from pimper_torch.evidence.baselines.colmap_dense import ColmapDense, ColmapDenseConfig
 from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
 from pimper_torch.evidence.baselines.pmvs import Pmvs, PmvsConfig
 from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
 
 __all__ = [
-    "ColmapDense",
-    "ColmapDenseConfig",
     "OpenMvs",
     "OpenMvsConfig",
     "Pmvs",

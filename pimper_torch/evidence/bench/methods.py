@@ -8,7 +8,6 @@ from torch import nn
 
 from pimper_torch.chains.presets import load_config, make_chain
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.baselines.colmap_dense import ColmapDense
 from pimper_torch.evidence.baselines.openmvs import OpenMvs
 from pimper_torch.evidence.baselines.pmvs import Pmvs
 from pimper_torch.evidence.baselines.smoothed import Smoothed
@@ -50,7 +49,6 @@ _BASELINES: dict[str, Callable[[], nn.Module]] = {
     "smoothed": Smoothed,
     "pmvs": Pmvs,
     "openmvs": OpenMvs,
-    "colmap-dense": ColmapDense,
 }
 
 
@@ -98,7 +96,7 @@ def _baseline(module: nn.Module) -> Method:
         return Outcome(
             estimate=estimate,
             seconds=time.perf_counter() - began,
-            external=isinstance(module, Pmvs | OpenMvs | ColmapDense),
+            external=isinstance(module, Pmvs | OpenMvs),
         )
 
     return run

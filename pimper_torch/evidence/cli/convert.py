@@ -25,7 +25,6 @@ from pimper_torch.evidence.datasets import (
     read_llff,
     read_meshroom,
     read_metashape,
-    read_middlebury,
     read_rendered,
     read_transforms,
     write_colmap,
@@ -45,7 +44,6 @@ from pimper_torch.reporting import stage
 Source = Literal[
     "colmap",
     "llff",
-    "middlebury",
     "idr",
     "transforms",
     "meshroom",
@@ -171,7 +169,6 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
     return {
         "colmap": read_colmap,
         "llff": read_llff,
-        "middlebury": read_middlebury,
         "idr": read_idr,
         "transforms": read_transforms,
         "meshroom": read_meshroom,

@@ -18,7 +18,14 @@ _DEFAULT = SceneConfig()
 _RARE = tuple(
     f"--{name}"
     for name in [
-        *("processes", "elevation-deg", "sway-deg", "fill", "no-fixed-point-light"),
+        *(
+            "processes",
+            "lights-per-pose",
+            "elevation-deg",
+            "sway-deg",
+            "fill",
+            "no-fixed-point-light",
+        ),
         *("no-fixed-room", "no-fixed-table", "no-constant-light", "no-turned-over"),
         *("pan-jitter-px", "crop-jitter-px", "point-light-distance", "irradiance"),
         *("flash", "bounces", "read-noise", "shot-noise", "supersample", "up", "rotation-deg"),

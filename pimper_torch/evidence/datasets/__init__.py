@@ -8,8 +8,6 @@ from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protoc
 from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
 from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, write_idr
 from pimper_torch.evidence.datasets.llff import read_llff
-from pimper_torch.evidence.datasets.middlebury import read_middlebury
-from pimper_torch.evidence.datasets.one_viewpoint import read_uw_ps, read_yale_b
 from pimper_torch.evidence.datasets.programs import read_meshroom, read_metashape, read_transforms
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.datasets.sampling import one_light_per_position
@@ -29,13 +27,10 @@ __all__ = [
     "read_llff",
     "read_meshroom",
     "read_metashape",
-    "read_middlebury",
     "read_normal_map",
     "read_rendered",
     "read_scale_mats",
     "read_transforms",
-    "read_uw_ps",
-    "read_yale_b",
     "write_colmap",
     "write_idr",
     "write_transforms",

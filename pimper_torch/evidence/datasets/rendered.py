@@ -43,7 +43,8 @@ def read_rendered(
             that take no memory, and there are no masks.
 
     Returns:
-        Cameras and lights in float64. Every view has a position and a light of its own.
+        Cameras and lights in float64. Every view has a light of its own, and a position of its own
+        unless ``lights_per_pose`` share one.
 
     Raises:
         InputError: Not such a folder, or something in it is missing or damaged.
@@ -73,7 +74,10 @@ def read_rendered(
     if maps:
         truth = truth.replace(**_read_maps(folder, named, settings))
     order = torch.tensor(chosen)
-    return Capture(views=pictures, cameras=cameras, truth=truth, position=order, light=order)
+    position = order // settings.lights_per_pose
+    if settings.lights_per_pose > 1:
+        pictures = pictures.replace(poses=position)
+    return Capture(views=pictures, cameras=cameras, truth=truth, position=position, light=order)
 
 
 def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
@@ -90,7 +94,10 @@ def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
     expect(
         isinstance(settings, dict)
         and isinstance(names, list)
-        and all(isinstance(name, str) and Path(name).name == name for name in names),
+        and all(
+            isinstance(name, str) and Path(name).name and ".." not in Path(name).parts
+            for name in names
+        ),
         path,
         _KIND,
         "a list `names` of file names, and `settings`",
@@ -171,7 +178,7 @@ def _read_picture(
 def _read_maps(folder: Path, names: Sequence[str], settings: SceneConfig) -> dict[str, Tensor]:
     read: dict[str, list[Tensor]] = {name: [] for name in MAP_NAMES}
     for name in track(names):
-        path = _file(folder / "truth" / "maps", Path(name).stem + ".npz")
+        path = _file(folder / "truth" / "maps", Path(name).with_suffix(".npz").as_posix())
         try:
             maps = unpack_maps(read_npz(path))
         except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:

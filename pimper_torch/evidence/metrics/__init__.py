@@ -7,7 +7,6 @@ from pimper_torch.evidence.metrics.evaluate import EvaluateConfig, Evaluation, e
 from pimper_torch.evidence.metrics.icp import IcpConfig, IcpResult, trimmed_icp
 from pimper_torch.evidence.metrics.in_view import ViewFigures, compare_along_rays
 from pimper_torch.evidence.metrics.lights import LightFigures, compare_lights
-from pimper_torch.evidence.metrics.maps import mean_absolute_depth_error, mean_angular_error_deg
 from pimper_torch.evidence.metrics.poses import CameraFigures, compare_cameras
 from pimper_torch.evidence.metrics.reflectance import AlbedoFigures, compare_albedo
 from pimper_torch.evidence.metrics.relative import angles_deg, relative_error
@@ -45,8 +44,6 @@ __all__ = [
     "compare_lights",
     "dtu_figures",
     "evaluate",
-    "mean_absolute_depth_error",
-    "mean_angular_error_deg",
     "pair_views",
     "relative_error",
     "report",

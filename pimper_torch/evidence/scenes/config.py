@@ -17,6 +17,8 @@ class SceneConfig:
 
     Attributes:
         num_views: Photographs.
+        lights_per_pose: Photographs that the camera takes of every pose, each under another
+            light; they are in a folder a pose then.
         width: Pixels.
         height: Pixels.
         seed: Of everything random: form, texture, point light, hand and noise.
@@ -71,6 +73,7 @@ class SceneConfig:
     """
 
     num_views: Annotated[int, Range(least=1, most=100_000)] = 30
+    lights_per_pose: Annotated[int, Range(least=1, most=1000)] = 1
     width: Annotated[int, Range(least=8, most=65_535)] = 1600  # as of a JPEG
     height: Annotated[int, Range(least=8, most=65_535)] = 1200
     seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0
@@ -117,6 +120,15 @@ class SceneConfig:
             "supersample",
             self.supersample,
             f"{most} at most with {self.width} x {self.height} pixels; or fewer of these",
+        )
+        several = self.lights_per_pose > 1
+        moving = self.turned_over or self.fixed_point_light or self.jitter_px > 0
+        require(
+            self.num_views % self.lights_per_pose == 0 and not (several and moving),
+            "lights_per_pose",
+            self.lights_per_pose,
+            f"a divisor of num_views ({self.num_views}), and neither turned_over, "
+            "fixed_point_light nor jitter with more than 1",
         )
         require(math.isfinite(self.rotation_deg), "rotation_deg", self.rotation_deg, "finite")
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg

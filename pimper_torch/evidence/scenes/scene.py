@@ -86,7 +86,11 @@ class Scene:
     @property
     def names(self) -> tuple[str, ...]:
         """File names of the photographs."""
-        return tuple(f"view_{view:03d}.png" for view in range(self.config.num_views))
+        each = self.config.lights_per_pose
+        if each == 1:
+            return tuple(f"view_{view:03d}.png" for view in range(self.config.num_views))
+        ends = (divmod(view, each) for view in range(self.config.num_views))
+        return tuple(f"pose_{pose:02d}/light_{light:02d}.png" for pose, light in ends)
 
     @property
     def object_mesh(self) -> Mesh:
@@ -289,16 +293,19 @@ def _surroundings(
 
 
 def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "view 3"]:
+    poses = config.num_views // config.lights_per_pose
     if config.path == "turntable":
-        return turntable_directions(config.num_views, elevation_deg=config.elevation_deg)
-    if config.path == "handheld":
-        return handheld_directions(config.num_views, generator, elevation_deg=config.elevation_deg)
-    return arc_directions(
-        config.num_views,
-        span_deg=config.span_deg,
-        elevation_deg=config.elevation_deg,
-        sway_deg=config.sway_deg,
-    )
+        directions = turntable_directions(poses, elevation_deg=config.elevation_deg)
+    elif config.path == "handheld":
+        directions = handheld_directions(poses, generator, elevation_deg=config.elevation_deg)
+    else:
+        directions = arc_directions(
+            poses,
+            span_deg=config.span_deg,
+            elevation_deg=config.elevation_deg,
+            sway_deg=config.sway_deg,
+        )
+    return directions.repeat_interleave(config.lights_per_pose, dim=0)
 
 
 def _finished(item: SceneObject, config: SceneConfig) -> SceneObject:

@@ -5,6 +5,7 @@ file                            what
 ==============================  ====================================================
 `photos/view_000.png` ...       the photographs
 `masks/view_000.png` ...        white on the object
+`photos/pose_00/light_00.png`   with ``lights_per_pose``; masks and maps accordingly
 `truth/scene.json`              every setting, the photographs' names, the version
 `truth/sparse/`                 COLMAP model: exact cameras, true points, their tracks
 `truth/lights.json`             point lights of every photograph, and first-order harmonics
@@ -89,7 +90,8 @@ def render_scene(
         config = SceneConfig() if config is None else config
         scene = build_scene(name_or_path, config)
         for part in ("photos", "masks", "truth/maps"):
-            (staging / part).mkdir(parents=True)
+            for own in {Path(name).parent for name in scene.names}:
+                (staging / part / own).mkdir(parents=True)
         _write_truth(scene, staging / "truth")
         _render_all(scene, staging, min(processes, config.num_views))
     return folder

@@ -19,13 +19,12 @@ from pimper_torch.single_view.integration.discontinuities import (
     DiscontinuityConfig,
     find_discontinuities,
 )
-from pimper_torch.single_view.integration.frankot_chellappa import integrate_fourier
 from pimper_torch.single_view.integration.rasters import Method as Solver
 from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 Raster = Tensor | np.ndarray
-Integration = Literal["discontinuities", "weighted", "cosine", "frankot-chellappa"]
+Integration = Literal["discontinuities", "weighted"]
 
 # Weight of steps over pixels without a normal, whose slopes are inpainted: a choice.
 _FILLED_WEIGHT = 1e-4
@@ -80,16 +79,12 @@ def integrate_normal_map(
         known_depth: Depth at some pixels, NaN at the others.
         known_weight: Of the known depths, in units of that of one normal; 1 if not given.
         method: ``"discontinuities"`` preserves depth discontinuities; see
-            :mod:`.discontinuities`. ``"weighted"`` is least squares with mask and weights.
-            ``"cosine"`` and ``"frankot-chellappa"`` integrate the bounding rectangle of the mask,
-            normals outside it inpainted: published, fast, and for rectangles without mask and
-            weights.
+            :mod:`.discontinuities`. ``"weighted"`` is least squares.
         solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
 
     Raises:
-        InputError: Shapes that differ, a mask without pixels, weights that are negative, a
-            method without mask or weights given these, normals of another convention: coded as
-            colours, or with z to the viewer.
+        InputError: Shapes that differ, a mask without pixels, weights that are negative,
+            normals of another convention: coded as colours, or with z to the viewer.
 
     Warns:
         PimperWarning: Normals that are integrable only with y negated.
@@ -150,25 +145,19 @@ def _integrated(
         )
         return _placed(part, box, *mask.shape)
     unit = _usable(normals, mask, weight)
-    whole = method in ("cosine", "frankot-chellappa")
-    inside = torch.ones_like(mask) if whole else mask
     if intrinsics is None:
-        steps = orthographic_steps(unit, inside, spacing)
+        steps = orthographic_steps(unit, mask, spacing)
     else:
-        steps = perspective_steps(unit, inside, intrinsics)
+        steps = perspective_steps(unit, mask, intrinsics)
     continuity = None
-    if whole:
-        _refuse_given(method, weight, known_depth)
-        found = _whole_rectangle(steps, method)
-    else:
-        anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
-        weights = _weights(steps, weight)
-        if method == "discontinuities":
-            settings = config or DiscontinuityConfig()
-            continuity = find_discontinuities(steps, *weights, anchor, unknown, settings, solver)
-            weights = weights[0] * continuity.right, weights[1] * continuity.down
-        system = RasterSystem(*weights, anchor, method=solver, what="the integration")
-        found = system.fit_steps(*steps.target, unknown)
+    anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
+    weights = _weights(steps, weight)
+    if method == "discontinuities":
+        settings = config or DiscontinuityConfig()
+        continuity = find_discontinuities(steps, *weights, anchor, unknown, settings, solver)
+        weights = weights[0] * continuity.right, weights[1] * continuity.down
+    system = RasterSystem(*weights, anchor, method=solver, what="the integration")
+    found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
 
@@ -250,15 +239,6 @@ def _known(
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
     return strength / (steps.unit_right * steps.unit_down), unknown
-
-
-def _whole_rectangle(steps: Steps, method: Integration) -> Float[Tensor, "height width"]:
-    if method == "frankot-chellappa":
-        right, down = steps.slopes.unbind(dim=-1)
-        return integrate_fourier(right, down, steps.unit_right, steps.unit_down)
-    right = torch.full_like(steps.right, steps.unit_right**-2)
-    down = torch.full_like(steps.down, steps.unit_down**-2)
-    return RasterSystem(right, down, method="cosine").fit_steps(*steps.target)
 
 
 def _tensor(values: Raster | None) -> Tensor | None:
@@ -352,13 +332,3 @@ def _refuse(
         raise InputError("known_weight was given without known_depth; give both.")
     if not all(0 < step < math.inf for step in spacing):
         raise InputError(f"spacing is {spacing}; both distances must be above 0.")
-
-
-def _refuse_given(
-    method: Integration,
-    weight: Float[Tensor, "height width"] | None,
-    known_depth: Float[Tensor, "height width"] | None,
-) -> None:
-    if weight is not None or known_depth is not None:
-        name = "weight" if weight is not None else "known_depth"
-        raise InputError(f"method {method!r} takes no {name}; use 'weighted' or 'discontinuities'.")

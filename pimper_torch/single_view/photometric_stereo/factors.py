@@ -1,11 +1,14 @@
 """Checks of the factors that methods resolve up to bas-relief."""
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.relief_metric import standard_relief
+
+# Relative rounding of squares of parallel vectors in float32.
+_FLAT = 1e-12
 
 
 def usable_pixels(shading: Float[Tensor, "3 pixel"]) -> Bool[Tensor, " pixel"]:
@@ -13,23 +16,22 @@ def usable_pixels(shading: Float[Tensor, "3 pixel"]) -> Bool[Tensor, " pixel"]:
     return shading.isfinite().all(dim=0) & (shading != 0).any(dim=0)
 
 
-def require_matching(
-    images: Float[Tensor, "view channel height width"],
-    mask: Bool[Tensor, "height width"],
-    shading: Float[Tensor, "3 pixel"],
-    lights: Float[Tensor, "light 3"],
-) -> None:
-    """Refuse factors whose sizes do not match the images.
+def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
+    r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
-    Raises:
-        InputError: Not one light a view, or not one vector a pixel inside the mask.
+    After it :math:`\sum x z = \sum y z = 0` and :math:`\sum x^2 + y^2 = \sum z^2`: the surface
+    faces the viewer on average, at a mean tilt of 45 degrees. Methods that start here do not
+    depend on the transformation they were given. Lambda is above zero.
+
+    NaN where all normals are parallel. Differentiable.
     """
-    pixels = int(mask.sum())
-    if shading.shape[1] != pixels or len(lights) != len(images):
-        raise InputError(
-            f"{len(images)} images with {pixels} pixels inside the mask, {len(lights)} lights and "
-            f"{shading.shape[1]} shading vectors; needed: one light a view, one vector a pixel."
-        )
+    x, y, z = shading.double()
+    depth = (z * z).sum()
+    tilt_x, tilt_y = (x * z).sum() / depth, (y * z).sum() / depth
+    slant = (x - tilt_x * z).square().sum() + (y - tilt_y * z).square().sum()
+    curved = slant > _FLAT * (depth + (x * x + y * y).sum())
+    lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
+    return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)
 
 
 def require_standard(shading: Float[Tensor, "3 pixel"]) -> BasRelief:

@@ -182,38 +182,6 @@ def integrable(
         return Integrable(matrix=matrix.to(pseudo), curl=curl, certainty=certainty)
 
 
-def rotation_to_surface(
-    shading: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
-    noise: Float[Tensor, "3 3"] | None = None,
-) -> Float[Tensor, "3 3"]:
-    """Find the orthogonal matrix that makes shading integrable.
-
-    The two bivectors are then its first two rows. The third component of most normals is
-    negative; the remaining ambiguity is convex or concave.
-
-    Args:
-        shading: Albedo times normal of the pixels inside the mask, in an unknown frame.
-        weight: Of the pixels; 0 leaves one out.
-        noise: Covariance of the shading; see :func:`curls`.
-
-    Raises:
-        InputError: As :func:`integrable`.
-
-    Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999, for rotations and bas-relief
-    transformations having nothing else in common; the computation is ours.
-    """
-    with torch.no_grad():
-        found, _, _ = _least(curls(shading, weight, mask, noise))
-        pair = torch.stack([_vector(found[:3]), _vector(found[3:])])
-        U, _, Vh = torch.linalg.svd(pair, full_matrices=False)
-        first, second = (U @ Vh).to(shading)
-        third = torch.linalg.cross(first, second)
-        facing = (weight * (third @ shading).sign()).sum()
-        return torch.stack([first, second, third if facing <= 0 else -third])
-
-
 def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor, "both both"]]:
     """Return the quadratic forms of the equations' residuals, and of their terms."""
     both = torch.cat([equations.across, equations.down], dim=1)

@@ -11,23 +11,16 @@ from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
-from pimper_torch.single_view.photometric_stereo.colour_profiles import resolve_by_colour_profiles
-from pimper_torch.single_view.photometric_stereo.diffuse_maxima import resolve_by_diffuse_maxima
-from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
-from pimper_torch.single_view.photometric_stereo.hayakawa import (
-    metric_from_albedo,
-    metric_from_strength,
+from pimper_torch.single_view.photometric_stereo.equal_lengths import (
     relief_from_albedo,
     relief_from_strength,
 )
-from pimper_torch.single_view.photometric_stereo.integrability import (
-    integrable,
-    rotation_to_surface,
-)
+from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
+from pimper_torch.single_view.photometric_stereo.integrability import integrable
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.single_view.photometric_stereo.regression import determined
-from pimper_torch.single_view.photometric_stereo.relief import bulge, convex, rounded_relief
+from pimper_torch.single_view.photometric_stereo.relief import convex, rounded_relief
 from pimper_torch.single_view.photometric_stereo.spherical_harmonics import four_harmonic_stereo
 from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
 
@@ -36,20 +29,6 @@ def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
     images, mask = _reliable(given, found)
     groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
     relief = resolve_by_albedo_entropy(found.shading[:, found.reliability > 0], groups)
-    return convex(relief, found.shading, found.reliability, given.mask)
-
-
-def _by_profiles(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _reliable(given, found)
-    known = found.shading[:, found.reliability > 0]
-    relief = resolve_by_colour_profiles(images, mask, known, found.lights)
-    return convex(relief, found.shading, found.reliability, given.mask)
-
-
-def _by_maxima(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _reliable(given, found)
-    known = found.shading[:, found.reliability > 0]
-    relief = resolve_by_diffuse_maxima(images, mask, known, found.lights)
     return convex(relief, found.shading, found.reliability, given.mask)
 
 
@@ -70,8 +49,8 @@ def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]
 
 
 # Methods that resolve the bas-relief ambiguity; "rounded" is a convention. Entropy comes first, as
-# the default: nearest to known lights on the rendered objects and, with diffuse maxima, on the
-# photographs (benchmarks/photometric_stereo.py).
+# the default: nearest to known lights on the rendered objects
+# (benchmarks/photometric_stereo.py).
 RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "albedo_entropy": _by_entropy,
     "rounded": lambda given, found: rounded_relief(found.shading, found.reliability, given.mask),
@@ -81,8 +60,6 @@ RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
     "equal_strength": lambda given, found: relief_from_strength(
         found.lights, found.shading, found.reliability, given.mask
     ),
-    "colour_profiles": _by_profiles,
-    "diffuse_maxima": _by_maxima,
 }
 _FACTOR = "a factor between albedo and light"
 
@@ -99,31 +76,6 @@ def _calibrated(given: Problem, resolve: str) -> Solution:
         weight=found.weight,
         applied=None,
         free="nothing",
-    )
-
-
-def _hayakawa(given: Problem, resolve: str) -> Solution:
-    found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
-    reliability = _reliability(found.weight, found.lights)
-    if resolve == "equal_albedo":
-        matrix = metric_from_albedo(found.shading, reliability)
-    else:
-        matrix = metric_from_strength(found.lights)
-    shading = matrix @ found.shading
-    rotated = rotation_to_surface(shading, reliability, given.mask, matrix @ matrix.mT)
-    sign = bulge((rotated @ shading)[:2], reliability, given.mask)
-    signs = torch.stack([sign, sign, torch.ones_like(sign)])
-    matrix = signs[:, None] * (rotated @ matrix)
-    return _lambertian(
-        given,
-        Surfaced(
-            shading=matrix @ found.shading,
-            lights=found.lights @ torch.linalg.inv(matrix),
-            reliability=reliability,
-            weight=found.weight,
-        ),
-        None,
-        f"convex or concave, {_FACTOR}",
     )
 
 
@@ -236,7 +188,6 @@ class Method:
 
 METHODS = {
     "calibrated": Method(solve=_calibrated, unknowns=3, calibrated=True),
-    "hayakawa": Method(solve=_hayakawa, unknowns=3, resolvers=("equal_strength", "equal_albedo")),
     "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
     "perspective": Method(solve=_perspective, unknowns=3, perspective=True),
     "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),

@@ -78,8 +78,6 @@ def photometric_stereo(
     method              light                                       ambiguity
     ==================  ==========================================  =================
     ``calibrated``      known point lights                          none
-    ``hayakawa``        point lights of one strength, or pixels     convex or concave
-                        of one albedo (``resolve``)
     ``integrability``   point lights                                bas-relief,
                                                                     by ``resolve``
     ``perspective``     point lights, pinhole (``intrinsics``)      none
@@ -87,14 +85,14 @@ def photometric_stereo(
     ==================  ==========================================  =================
 
     Convex is chosen. ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a
-    ball), ``equal_albedo``, ``equal_strength``, ``albedo_entropy`` (few albedos),
-    ``colour_profiles`` (paints of different hue) or ``diffuse_maxima``.
+    ball), ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few
+    albedos).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
         mask: True on the object; of the size of the images.
-        resolve: For ``integrability`` by default ``albedo_entropy``, for ``hayakawa`` by default
-            ``equal_strength``; others have nothing to resolve.
+        resolve: For ``integrability``, by default ``albedo_entropy``; others have nothing to
+            resolve.
         lights: For ``calibrated``, one a view: direction to the point light times its irradiance,
             camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.

@@ -1,13 +1,10 @@
 import pytest
 import torch
-from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics import (
     compare_albedo,
     compare_along_rays,
-    mean_absolute_depth_error,
-    mean_angular_error_deg,
 )
 from pimper_torch.evidence.metrics.visible import joined
 from pimper_torch.geometry.visibility import cast_view
@@ -170,46 +167,3 @@ def test_grey_albedo_is_compared_with_the_mean_of_colours():
     assert found.channels == 1
     assert found.one_scale_percent < 1e-10
     assert compare_albedo(0 * truth, truth) is None
-
-
-def test_the_mean_angular_error_is_over_the_mask_and_silence_costs():
-    truth = torch.zeros(2, 2, 3, dtype=torch.float64)
-    truth[..., 2] = -1
-    ours = truth.clone()
-    tilt = torch.deg2rad(torch.tensor(20.0, dtype=torch.float64))
-    ours[0, 0] = 3 * torch.stack([tilt.sin(), 0 * tilt, -tilt.cos()])  # its length is no matter
-    ours[0, 1] = 0
-    ours[1, 1] = torch.tensor([1.0, 0, 0])
-    mask = torch.tensor([[True, True], [True, False]])
-    assert mean_angular_error_deg(ours, truth, mask) == pytest.approx((20 + 90 + 0) / 3)
-    with pytest.raises(InputError, match="mask is empty"):
-        mean_angular_error_deg(ours, truth, mask & False)
-    with pytest.raises(InputError, match="1 of 3 pixels"):
-        mean_angular_error_deg(ours, ours, mask)
-
-
-def test_depth_known_up_to_scale_is_aligned_by_the_median_ratio():
-    truth = torch.tensor([[2.0, 4.0, 6.0], [8.0, 10.0, torch.inf]], dtype=torch.float64)
-    ours = truth / 2
-    ours[0, 0] = 2.0  # ratios 1, 2, 2, 2, 2: the median is 2, the mean is not
-    assert mean_absolute_depth_error(ours, truth, "median scale") == pytest.approx(2 / 5)
-    assert mean_absolute_depth_error(ours, truth, "none") == pytest.approx((0 + 2 + 3 + 4 + 5) / 5)
-    inner = torch.tensor([[False, True, True], [True, True, True]])
-    assert mean_absolute_depth_error(ours, truth, "median scale", inner) == 0
-
-
-def test_depth_known_up_to_a_constant_is_aligned_by_the_median_difference():
-    truth = torch.tensor([[1.0, 2.0, 3.0, 4.0, 5.0]], dtype=torch.float64)
-    ours = truth - 7
-    ours[0, 4] = 0.0
-    assert mean_absolute_depth_error(ours, truth, "median offset") == pytest.approx(2 / 5)
-    with pytest.raises(InputError, match="not positive"):
-        mean_absolute_depth_error(ours, truth, "median scale")
-    with pytest.raises(InputError, match="no pixel"):
-        mean_absolute_depth_error(ours * torch.nan, truth, "none")
-
-
-def test_the_median_of_an_even_number_lies_between_the_two():
-    truth = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
-    found = mean_absolute_depth_error(torch.zeros(1, 2).double(), truth, "median offset")
-    assert_close(found, 0.5)

@@ -225,6 +225,8 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
     ("setting", "words"),
     [
         ({"num_views": 0}, "num_views is 0"),
+        ({"num_views": 8, "lights_per_pose": 3}, "lights_per_pose is 3"),
+        ({"num_views": 8, "lights_per_pose": 2, "crop_jitter_px": 1.0}, "lights_per_pose is 2"),
         ({"elevation_deg": 3.0}, "elevation_deg is 3.0"),
         ({"irradiance": 0.0, "ambient": 0.0}, "some light"),
         ({"point_light_distance": 0.5}, "point_light_distance is 0.5"),

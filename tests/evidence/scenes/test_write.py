@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, OutputError
+from pimper_torch.errors import ConfigError, OutputError, PimperWarning
+from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.frame import render_frame
 from pimper_torch.evidence.scenes.maps import unpack_maps
@@ -152,3 +153,23 @@ def test_no_processes_are_refused(ball, tmp_path):
     with pytest.raises(ConfigError, match="processes is 0"):
         render_scene(ball, tmp_path / "out", SMALL, processes=0)
     assert not (tmp_path / "out").exists()
+
+
+def test_several_lights_a_pose_are_one_camera_and_a_folder_each(ball, tmp_path):
+    config = SceneConfig(num_views=6, lights_per_pose=2, width=48, height=36, supersample=1)
+    folder = render_scene(ball, tmp_path / "scene", config, processes=1)
+    with pytest.warns(PimperWarning, match="3 poses of the camera"):
+        views = load_views(folder / "photos", masks=folder / "masks")
+    assert views.names[2:4] == ("pose_01/light_00.png", "pose_01/light_01.png")
+    assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]
+    model = read_model(folder / "truth" / "sparse")
+    assert model.names == views.names
+    assert torch.equal(model.cam_from_world[::2], model.cam_from_world[1::2])
+    assert not torch.equal(model.cam_from_world[1], model.cam_from_world[2])
+    assert torch.equal(views.masks[::2], views.masks[1::2])
+    lights = torch.tensor(json.loads((folder / "truth/lights.json").read_text())["positions_world"])
+    assert len(lights.unique(dim=0)) == 6
+    capture = read_rendered(folder)
+    assert torch.equal(capture.views.images, views.images)
+    assert capture.position.tolist() == capture.views.poses.tolist() == views.poses.tolist()
+    assert capture.truth.depth.shape == (6, 36, 48)

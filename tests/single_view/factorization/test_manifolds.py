@@ -10,7 +10,6 @@ from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
-from pimper_torch.single_view.factorization.alternation import solve_alternation
 from pimper_torch.single_view.factorization.manifolds import Free
 
 MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone()])
@@ -74,7 +73,6 @@ def test_vectors_without_a_normal_are_refused(generator):
 @pytest.mark.parametrize(
     ("solve", "tolerance"),
     [
-        (solve_alternation, 3e-3),
         (solve_balm, 1e-6),
         (solve_variable_projection, 1e-12),
     ],

@@ -7,7 +7,6 @@ from pimper_torch.errors import InputError
 from pimper_torch.single_view.photometric_stereo.integrability import (
     curls,
     integrable,
-    rotation_to_surface,
     wedge,
 )
 
@@ -82,16 +81,6 @@ def test_depth_edges_are_outliers(bumpy, angles_deg):
     shading = integrable(pseudo, even(bumpy), bumpy.mask).matrix @ pseudo
     best = align_reliefs(shading, pseudo, even(bumpy)).on_shading(shading)
     assert angles_deg(best, pseudo).mean() < 0.5
-
-
-def test_a_rotation_is_undone_but_for_convex_and_concave(bumpy, generator, angles_deg):
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
-    back = rotation_to_surface(rotation @ bumpy.columns, even(bumpy), bumpy.mask)
-    assert_close(back.mT @ back, torch.eye(3, dtype=torch.float64))
-    found = back @ rotation @ bumpy.columns
-    concave = found * torch.tensor([[-1.0], [-1.0], [1.0]], dtype=torch.float64)
-    off = min(angles_deg(one, bumpy.columns).mean() for one in (found, concave))
-    assert off < 0.3
 
 
 def test_planes_and_cylinders_are_refused():

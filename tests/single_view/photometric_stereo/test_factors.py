@@ -3,11 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.relief_metric import (
-    metric_row,
-    relief_of_metric,
-    standard_relief,
-)
+from pimper_torch.single_view.photometric_stereo.factors import standard_relief
 
 
 @pytest.fixture
@@ -18,21 +14,6 @@ def generator():
 def some(generator, sign=1.0):
     mu, nu, size = torch.randn(3, generator=generator, dtype=torch.float64)
     return BasRelief(mu=mu, nu=nu, lam=sign * size.exp())
-
-
-def test_the_metric_gives_squared_albedo_and_leads_back_to_the_relief(generator):
-    relief = some(generator)
-    b = torch.randn(3, 30, generator=generator, dtype=torch.float64)
-    M = relief.matrix.mT @ relief.matrix
-    metric = torch.stack([M[0, 0], M[0, 2], M[1, 2], M[2, 2]])
-    assert_close(metric_row(b) @ metric, relief.on_shading(b).square().sum(dim=0))
-    for factor in (1.0, 7.0, -0.2):
-        assert_close(relief_of_metric(factor * metric).matrix, relief.matrix)
-
-
-def test_what_is_no_metric_gives_no_number():
-    for wrong in ([1.0, 2.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0, 1.0, 1.0, 1.0]):
-        assert relief_of_metric(torch.tensor(wrong)).lam.isnan()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

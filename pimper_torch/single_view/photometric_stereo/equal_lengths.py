@@ -1,8 +1,7 @@
-r"""Metric upgrade of rank-three factorizations by pixels of one albedo or lights of one strength.
+r"""Bas-relief resolved by pixels of one albedo or point lights of one strength.
 
-Six pixels of equal albedo, or six point lights of equal strength, determine the quadratic form of
-their lengths; its ambiguity is an orthogonal matrix. Where the ambiguity is a bas-relief
-transformation, they resolve it up to convex or concave.
+Vectors of one length determine the quadratic form of lengths, of which bas-relief leaves four
+entries: the transformation follows up to convex or concave.
 
 Source: Hayakawa, Photometric stereo under a light source with arbitrary motion, JOSA A 11(11),
 1994, for the form; that bas-relief and form have no more in common: Belhumeur, Kriegman & Yuille,
@@ -16,15 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.quadratics import diagonal, outer, unpacked
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.relief import convex
 
-_ITERATIONS = 20
-# Minimum singular value of the equations, as a fraction of the largest: below, the vectors lie on
-# a cone, and the form is not unique. A choice.
-_MIN_FRACTION = 1e-6
 # Initial depths of the search for a bas-relief, as factors of the given one: a choice.
 _DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _STEPS = 60
@@ -32,48 +26,6 @@ _STEPS = 60
 _Curve = Callable[
     [Float[Tensor, "start 4"]], tuple[Float[Tensor, "start item"], Float[Tensor, "start item 4"]]
 ]
-
-
-def metric_from_albedo(
-    shading: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"]
-) -> Float[Tensor, "3 3"]:
-    r"""Find the matrix after which shading has length 1 wherever there is weight.
-
-    :math:`\lVert A s_k \rVert = 1` is linear in :math:`A^\top A`; Cauchy's weights reject pixels of
-    another albedo, as long as they are few. The remaining ambiguity is an orthogonal matrix.
-
-    Args:
-        shading: Up to an invertible matrix.
-        weight: Not negative; 0 leaves a pixel out.
-
-    Returns:
-        ``A``, to be applied to shading. Its inverse goes to the lights.
-
-    Raises:
-        InputError: Fewer than six pixels, or pixels for which there is no form, or several.
-    """
-    return _root(_form(shading, weight, "pixels of equal albedo"), "pixels of equal albedo")
-
-
-def metric_from_strength(lights: Float[Tensor, "view 3"]) -> Float[Tensor, "3 3"]:
-    r"""Find the matrix after which all point lights have the same strength.
-
-    :math:`\lVert A^{-\top} l_v \rVert = 1` for all point lights is linear in
-    :math:`A^{-1} A^{-\top}`. The remaining ambiguity is an orthogonal matrix.
-
-    Args:
-        lights: Up to an invertible matrix; zero rows are ignored.
-
-    Returns:
-        ``A``, to be applied to shading. Its inverse goes to the lights.
-
-    Raises:
-        InputError: Fewer than six point lights, point lights on one cone, or point lights that
-            cannot have one strength.
-    """
-    weight = (lights != 0).any(dim=1).to(lights)
-    form = _form(lights.mT, weight, "point lights of equal strength")
-    return torch.linalg.inv(_root(form, "point lights of equal strength")).mT
 
 
 def relief_from_albedo(
@@ -146,48 +98,6 @@ def relief_from_strength(
     )
     found = BasRelief(mu=tilt_x / across, nu=tilt_y / across, lam=along / across)
     return convex(found, shading, weight, mask)
-
-
-def _form(
-    vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"], what: str
-) -> Float[Tensor, "3 3"]:
-    """Find the quadratic form under which vectors have length 1, by reweighted least squares."""
-    with torch.no_grad():
-        given = weight.double()
-        count = int((given > 0).sum())
-        if count < 6:
-            raise InputError(f"{what}: {count} are given; needed: six or more. Mark more.")
-        size = _typical(vectors, weight)
-        double = torch.full((6, 1), 2.0).to(given)
-        double[diagonal(3)] = 1
-        monomials = double * outer(vectors.double() / size)
-        heavy = given
-        for _ in range(_ITERATIONS):
-            root = heavy.sqrt()
-            singular = torch.linalg.svdvals(root * monomials)
-            if not singular[-1] > _MIN_FRACTION * singular[0]:
-                raise InputError(
-                    f"{what}: theirs are on one cone, so that more than one quadratic form makes "
-                    "them equal; needed: others besides. Take more, in other directions."
-                )
-            entries = torch.linalg.lstsq(
-                (root * monomials).mT, root[:, None], driver="gelsd"
-            ).solution[:, 0]
-            residual = entries @ monomials - 1
-            scale = CAUCHY_TUNING * median_deviation(residual, given > 0)
-            heavy = given * cauchy_weights(residual, scale)
-        return unpacked(entries[:, None], 3)[0].to(vectors) / size**2
-
-
-def _root(form: Float[Tensor, "3 3"], what: str) -> Float[Tensor, "3 3"]:
-    """Split ``B = A^T A``."""
-    factor, failed = torch.linalg.cholesky_ex(form)
-    if int(failed) != 0:
-        raise InputError(
-            f"{what}: no quadratic form makes them equal (the best one is not positive definite); "
-            "needed: what is equal. Leave the others out, or resolve the ambiguity otherwise."
-        )
-    return factor.mT
 
 
 def _typical(vectors: Float[Tensor, "3 item"], weight: Float[Tensor, " item"]) -> float:

@@ -1,0 +1,165 @@
+"""Several photographs of one pose, each under another light: one of them for all that is geometry.
+
+Photographs of one pose have no parallax to one another. Structure from motion gets one picture a
+pose, and what it finds holds for all photographs of the pose; silhouettes and depth maps are those
+of one photograph a pose. Lights are fitted to all.
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError, some
+from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
+from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.sound_views import with_views
+
+# Distance in pixels, at the object, up to which two cameras are one pose. A choice: bundle
+# adjustment leaves such photographs 0.1 px apart, and between neighbours of a set lie tens.
+_SAME_PX = 0.5
+
+
+def pictures_of_poses(views: Views) -> Views:
+    """Average the radiance of the photographs of each pose; without poses, return the views.
+
+    Returns:
+        Pictures in the order of the poses, under the names of their first photographs. The object
+        is where any of a pose's masks shows it.
+
+    Raises:
+        InputError: Photographs of one pose have unlike sizes.
+    """
+    if views.poses is None:
+        return views
+    groups = [(views.poses == pose).nonzero()[:, 0] for pose in sorted(set(views.poses.tolist()))]
+    uneven = [
+        views.names[int(own[0])]
+        for own in groups
+        if bool((views.sizes_px[own] != views.sizes_px[own[:1]]).any())
+    ]
+    if uneven:
+        raise InputError(
+            f"Photographs of the poses of {some(uneven)} have unlike sizes; needed: one size a "
+            "pose, as of a camera that stands still. Put each of the others in a folder of its own."
+        )
+    first = views.take([int(own[0]) for own in groups])
+    masks = views.masks
+    return first.replace(
+        images=torch.stack([views.images[own].mean(dim=0) for own in groups]),
+        masks=None if masks is None else torch.stack([masks[own].any(dim=0) for own in groups]),
+        focals_px=torch.stack([views.focals_px[own].nanmedian() for own in groups]),
+        poses=None,
+    )
+
+
+def of_photographs(model: SparseModel, views: Views) -> SparseModel:
+    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses.
+
+    Returns:
+        In the order of the photographs; each observes what the picture of its pose does.
+    """
+    if views.poses is None:
+        return model
+    place = {name: index for index, name in enumerate(model.names)}
+    first = {pose: view for view, pose in reversed(list(enumerate(views.poses.tolist())))}
+    source = [place.get(views.names[first[pose]], -1) for pose in views.poses.tolist()]
+    shown = [view for view, found in enumerate(source) if found >= 0]
+    index = [source[view] for view in shown]
+    rows = [(model.observation_view == found).nonzero()[:, 0] for found in index]
+    row = torch.cat(rows)
+    view = torch.arange(len(shown)).repeat_interleave(torch.tensor([len(one) for one in rows]))
+    order = torch.argsort(model.observation_point[row] * len(shown) + view)
+    maps, series = model.background_from_view, model.series
+    return model.replace(
+        names=tuple(views.names[one] for one in shown),
+        lenses=tuple(model.lenses[one] for one in index),
+        cam_from_world=model.cam_from_world[index],
+        observation_point=model.observation_point[row][order],
+        observation_view=view[order],
+        observation_pixels=model.observation_pixels[row][order],
+        background_from_view=maps[index] if len(maps) else maps,
+        series=series[index] if len(series) else series,
+    )
+
+
+def with_poses(scene: SparseScene) -> SparseScene:
+    """Number the poses where cameras that came with the photographs are equal."""
+    if scene.views.poses is not None or scene.cameras.num_views < 2:
+        return scene
+    poses = equal_poses(scene.cameras)
+    if len(set(poses.tolist())) == len(poses):
+        return scene
+    return scene.replace(views=scene.views.replace(poses=poses.to(scene.views.sizes_px)))
+
+
+def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
+    """Number the poses of cameras; those half a pixel apart at the object are the same."""
+    pose = cameras.cam_from_world.detach().double()
+    centers = cameras.centers_world.detach().double()
+    focal = cameras.intrinsics[:, 0, 0].detach().double()
+    # Cameras stand round an object about as far from each other as from it.
+    extent = (centers - centers.mean(dim=0)).norm(dim=1).mean()
+    turned = (pose[:, None, :3, :3] - pose[None, :, :3, :3]).flatten(2).norm(dim=2) / 2**0.5
+    moved = (centers[:, None] - centers).norm(dim=2)
+    same = focal[:, None] * (turned + moved / extent) < _SAME_PX
+    return same.long().argmax(dim=1)  # the first of each pose
+
+
+class OneAPose(NamedTuple):
+    """A scene with one photograph of every pose.
+
+    Attributes:
+        scene: Those photographs alone, with what all of their poses observe.
+        chosen: Which views of the whole scene they are.
+        of: Which of them has the pose of each view of the whole scene.
+    """
+
+    scene: SparseScene
+    chosen: Int[Tensor, " pose"]
+    of: Int[Tensor, " view"]
+
+
+def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPose:
+    """Keep the most textured photograph of every pose; without poses, the scene as it is.
+
+    Args:
+        needed: Names, with their suffix or without, of photographs that go before others.
+    """
+    poses = scene.views.poses
+    if poses is None:
+        every = torch.arange(scene.cameras.num_views)
+        return OneAPose(scene, every, every)
+    rank = _texture(scene.views)
+    for view, name in enumerate(scene.views.names):
+        if {name, name.rsplit(".", 1)[0]} & set(needed):
+            rank[view] += 1
+    numbers = poses.tolist()
+    best = {pose: int(torch.where(poses == pose, rank, -1).argmax()) for pose in set(numbers)}
+    lead = torch.tensor([best[pose] for pose in numbers], device=poses.device)
+    point, seer = scene.observation_point, lead[scene.observation_view]
+    table = pairs_table(point, seer, (len(scene.points_world), len(numbers)))
+    pixels = scene.observation_pixels.new_zeros(*table.shape, 2)
+    pixels[point, seer] = scene.observation_pixels
+    point, seer = table.nonzero(as_tuple=True)
+    kept = torch.zeros_like(poses, dtype=torch.bool)
+    kept[lead] = True
+    one = scene.replace(
+        observation_point=point, observation_view=seer, observation_pixels=pixels[point, seer]
+    )
+    few = with_views(one, kept)
+    few = few.replace(views=few.views.replace(poses=None), unregistered=scene.unregistered)
+    return OneAPose(few, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
+
+
+def _texture(views: Views) -> Float[Tensor, " view"]:
+    """Compute the mean step of the square root of radiance between neighbouring pixels."""
+    level = views.images.detach().mean(dim=1).clamp(0, 1).sqrt()
+    return torch.stack(
+        [
+            one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()
+            for one, (wide, high) in zip(level, views.sizes_px.tolist(), strict=True)
+        ]
+    )

@@ -1,0 +1,98 @@
+"""Records of patches that are made by hand."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+import pimper_torch as pt
+from pimper_torch.records import PatchStatus
+
+
+def taken_apart(found):
+    """The normals, albedo, lights and information of photometry, a bucket each."""
+    names = {"normals": "normals_patch", "lights": "lights_patch"}
+    return {
+        name: [getattr(bucket, names.get(name, name)) for bucket in found.buckets]
+        for name in ("normals", "lights", "albedo", "information")
+    }
+
+
+def test_photometry_put_together_from_its_parts_is_the_whole(lift):
+    true = lift(0.0).photometric
+    found = pt.PhotometricPatches.of(true.patches, **taken_apart(true))
+    for made, own in zip(found.buckets, true.buckets, strict=True):
+        assert_close(made.normals_patch[made.valid], own.normals_patch[own.valid])
+        for name in ("albedo", "lights_patch", "valid", "status"):
+            assert_close(getattr(made, name), getattr(own, name))
+        assert_close(made.information, own.information * own.valid)
+        assert bool(made.convergence.converged.all())
+
+
+def test_lights_of_the_world_are_turned_to_every_patch_and_residuals_are_those_of_the_views(lift):
+    plane = lift(0.0)
+    true = plane.photometric
+    parts = taken_apart(true)
+    bare = pt.PhotometricPatches.of(
+        true.patches, normals=parts["normals"], lights=plane.scene.lights_world
+    )
+    for made, own in zip(bare.buckets, true.buckets, strict=True):
+        assert_close(made.lights_patch, own.lights_patch)
+        assert made.albedo.unique().tolist() == [1]
+        assert made.convergence.residual.unique().tolist() == [0]
+    # What the views show under these lights is albedo by the median of their quotients.
+    albedo = []
+    for views, made in zip(plane.seen.buckets, bare.buckets, strict=True):
+        quotient = torch.where(views.valid[:, :, None], views.radiance / made.predicted, torch.nan)
+        albedo.append(quotient.nanmedian(dim=1).values.nan_to_num(0).movedim(1, -1))
+    found = pt.PhotometricPatches.of(
+        plane.seen, normals=parts["normals"], lights=plane.scene.lights_world, albedo=albedo
+    )
+    residual = torch.cat([bucket.convergence.residual for bucket in found.buckets])
+    assert 0 < residual.max() < 0.03  # speckle is interpolated between pixels
+    other = [0.5 * values for values in albedo]
+    half = pt.PhotometricPatches.of(
+        plane.seen, normals=parts["normals"], lights=plane.scene.lights_world, albedo=other
+    )
+    level = torch.cat([v.gray[v.valid] for v in plane.seen.buckets]).square().mean().sqrt()
+    assert_close(half.buckets[0].convergence.residual.mean(), level.double() / 2, rtol=0.1, atol=0)
+
+
+def test_samples_without_a_normal_are_not_valid_and_a_patch_of_them_is_unseen(lift):
+    true = lift(0.0).photometric
+    parts = taken_apart(true)
+    normals = [3 * values.clone() for values in parts["normals"]]  # of any length
+    normals[0][0] = 0
+    normals[0][1, 0] = torch.nan
+    found = pt.PhotometricPatches.of(true.patches, **{**parts, "normals": normals})
+    first = found.buckets[0]
+    assert first.status.tolist()[:2] == [PatchStatus.UNSEEN, PatchStatus.DETERMINED]
+    assert not bool(first.valid[0].any() | first.valid[1, 0].any())
+    assert_close(first.normals_patch, normalize(first.normals_patch, dim=-1))
+    assert bool((first.information[~first.valid] == 0).all())
+    away = [-values for values in parts["normals"]]
+    turned = pt.PhotometricPatches.of(true.patches, **{**parts, "normals": away})
+    assert not bool(turned.buckets[0].valid.any())
+
+
+def test_what_does_not_belong_to_the_patches_is_refused(lift):
+    true = lift(0.0).photometric
+    parts = taken_apart(true)
+    with pytest.raises(pt.InputError, match="normals are 0; needed: one tensor for each of"):
+        pt.PhotometricPatches.of(true.patches, **{**parts, "normals": []})
+    small = [values[:, :2] for values in parts["normals"]]
+    with pytest.raises(pt.InputError, match="normals of a bucket have shape"):
+        pt.PhotometricPatches.of(true.patches, **{**parts, "normals": small})
+    nowhere = [torch.full_like(values, torch.nan) for values in parts["albedo"]]
+    with pytest.raises(pt.InputError, match="albedo"):
+        pt.PhotometricPatches.of(true.patches, **{**parts, "albedo": nowhere})
+
+
+def test_printed_a_result_is_a_few_lines(reconstruction):
+    shown = str(reconstruction)
+    assert len(shown) < 600
+    assert len(shown.splitlines()) == 10
+    assert "  mesh: Mesh(vertex 225, face 392, channel 3)" in shown
+    assert "  patches: DepthPatches(patch 2)" in shown
+    assert "  report: 2 StageReport" in shown
+    assert len(str(reconstruction.scene)) < 800

@@ -1,0 +1,44 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.errors import InputError
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
+from pimper_torch.single_view.photometric_stereo.equal_lengths import (
+    relief_from_albedo,
+    relief_from_strength,
+)
+
+
+def tilted(bumpy):
+    mu, nu, lam = torch.tensor([0.4, -0.3, 0.35], dtype=torch.float64)
+    return BasRelief(mu=mu, nu=nu, lam=lam)
+
+
+@pytest.mark.parametrize("shrunk", [0.05, 1.0, 20.0])
+def test_a_relief_is_undone_by_pixels_of_one_albedo(bumpy, generator, shrunk):
+    odd = torch.rand(bumpy.columns.shape[1], generator=generator) < 0.3
+    shading = shrunk * tilted(bumpy).on_shading(torch.where(odd, 0.4, 1.0) * bumpy.columns)
+    weight = torch.ones(len(odd), dtype=torch.float64)
+    found = relief_from_albedo(shading, weight, bumpy.mask)
+    assert_close(found.after(tilted(bumpy)).matrix, torch.eye(3).double(), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("shrunk", [0.05, 1.0, 20.0])
+def test_a_relief_is_undone_by_point_lights_of_one_strength(bumpy, point_lights, shrunk):
+    lights = point_lights(12)
+    lights[3] *= 1.4  # an outlier
+    shading = tilted(bumpy).on_shading(bumpy.columns)
+    weight = torch.ones(shading.shape[1], dtype=torch.float64)
+    moved = shrunk * tilted(bumpy).on_lights(lights)
+    found = relief_from_strength(moved, shading, weight, bumpy.mask)
+    assert_close(found.after(tilted(bumpy)).matrix, torch.eye(3).double(), atol=2e-3, rtol=0)
+
+
+def test_too_few_are_refused(bumpy, point_lights):
+    weight = torch.zeros(bumpy.columns.shape[1], dtype=torch.float64)
+    weight[:3] = 1
+    with pytest.raises(InputError, match="3 are given; needed: four"):
+        relief_from_albedo(bumpy.columns, weight, bumpy.mask)
+    with pytest.raises(InputError, match="3 are given; needed: four"):
+        relief_from_strength(point_lights(3), bumpy.columns, weight, bumpy.mask)
