@@ -21,7 +21,17 @@ _RARE = tuple(
         *("processes", "elevation-deg", "sway-deg", "fill", "no-fixed-point-light"),
         *("no-fixed-room", "no-fixed-table", "no-constant-light", "no-turned-over"),
         *("pan-jitter-px", "crop-jitter-px", "point-light-distance", "irradiance"),
-        *("flash", "bounces", "read-noise", "shot-noise", "supersample", "up", "rotation-deg"),
+        *(
+            "flash",
+            "window",
+            "lamp-colour",
+            "bounces",
+            "read-noise",
+            "shot-noise",
+            "supersample",
+            "up",
+            "rotation-deg",
+        ),
     ]
 )
 
