@@ -30,47 +30,68 @@ _LARGE = 1e100
 
 @compiled(fast=True)
 def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Return radiance of albedo 1, by the four harmonics or the five values of a point light."""
+    """Return radiance of albedo 1, by the harmonics and the point light, if there is one."""
+    terms = _soft_terms(geometry, lights[0])
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
-        a, b, c, d = geometry[0], geometry[1], geometry[2], geometry[3]
-        if len(light) == 4:
+        row[:] = 0
+        for k in range(terms):
+            harmonic = geometry[k]
             for i in range(len(row)):
-                row[i] = light[0] * a[i] + light[1] * b[i] + light[2] * c[i] + light[3] * d[i]
+                row[i] += light[k] * harmonic[i]
+        if terms == len(light):
             continue
-        e, f = geometry[4], geometry[5]
-        strength, x, y, z = _direction(light)
+        a, b, c = geometry[terms], geometry[terms + 1], geometry[terms + 2]
+        d, e, f = geometry[terms + 3], geometry[terms + 4], geometry[terms + 5]
+        strength, x, y, z = _direction(light[terms:])
+        near = light[terms + 3]
         for i in range(len(row)):
-            p, q, r = x - light[4] * d[i], y - light[4] * e[i], z - light[4] * f[i]
+            p, q, r = x - near * d[i], y - near * e[i], z - near * f[i]
             distance = max(math.sqrt(p * p + q * q + r * r), 1e-6)
             facing = max(a[i] * p + b[i] * q + c[i] * r, 0.0)
-            row[i] = light[0] + strength * facing / (distance * distance * distance)
+            row[i] += strength * facing / (distance * distance * distance)
+
+
+@compiled()
+def _soft_terms(geometry: Doubles, light: Doubles) -> int:
+    """Count the coefficients of soft light; a point light has 4 values and 6 coordinates."""
+    return len(light) if len(geometry) == len(light) else len(light) - 4
 
 
 @compiled()
 def _direction(light: Doubles) -> tuple[float, float, float, float]:
-    strength = math.sqrt(light[1] ** 2 + light[2] ** 2 + light[3] ** 2)
+    strength = math.sqrt(light[0] ** 2 + light[1] ** 2 + light[2] ** 2)
     scale = 1 / strength if strength > 0 else 1.0
-    return strength, light[1] * scale, light[2] * scale, light[3] * scale
+    return strength, light[0] * scale, light[1] * scale, light[2] * scale
 
 
 @compiled(fast=True)
 def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
     """Return the derivatives of a view's shading by its light's parameters, for one tile."""
-    if len(light) == 4:
-        for j in range(4):
-            row = geometry[j, first : first + TILE]
-            for i in range(TILE):
-                slopes[j * TILE + i] = row[i]
-        return
+    terms = _soft_terms(geometry, light)
     samples = slice(first, first + TILE)
-    a, b, c = geometry[0, samples], geometry[1, samples], geometry[2, samples]
-    d, e, f = geometry[3, samples], geometry[4, samples], geometry[5, samples]
-    strength, x, y, z = _direction(light)
+    for j in range(terms):
+        row = geometry[j, samples]
+        for i in range(TILE):
+            slopes[j * TILE + i] = row[i]
+    if terms == len(light):
+        return
+    a, b, c = (
+        geometry[terms, samples],
+        geometry[terms + 1, samples],
+        geometry[terms + 2, samples],
+    )
+    d, e, f = (
+        geometry[terms + 3, samples],
+        geometry[terms + 4, samples],
+        geometry[terms + 5, samples],
+    )
+    strength, x, y, z = _direction(light[terms:])
+    near, at = light[terms + 3], terms * TILE
     for i in range(TILE):
         k, m, n = a[i], b[i], c[i]
         s, t, u = d[i], e[i], f[i]
-        p, q, r = x - light[4] * s, y - light[4] * t, z - light[4] * u
+        p, q, r = x - near * s, y - near * t, z - near * u
         distance = max(math.sqrt(p * p + q * q + r * r), 1e-6)
         facing = k * p + m * q + n * r
         lit = 1.0 if facing > 0 else 0.0
@@ -79,20 +100,19 @@ def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> N
         radial = 3 * facing * inverse * inverse
         g, h, j = falloff * (k - radial * p), falloff * (m - radial * q), falloff * (n - radial * r)
         along = facing * falloff - (g * x + h * y + j * z)
-        slopes[i] = 1.0
-        slopes[TILE + i] = g + along * x
-        slopes[2 * TILE + i] = h + along * y
-        slopes[3 * TILE + i] = j + along * z
-        slopes[4 * TILE + i] = -strength * (g * s + h * t + j * u)
+        slopes[at + i] = g + along * x
+        slopes[at + TILE + i] = h + along * y
+        slopes[at + 2 * TILE + i] = j + along * z
+        slopes[at + 3 * TILE + i] = -strength * (g * s + h * t + j * u)
 
 
 @compiled()
-def _clamp(lights: Doubles, max_closeness: float) -> None:
+def _clamp(geometry: Doubles, lights: Doubles, max_closeness: float) -> None:
     """Project the parameters on their bounds: see ``light_models``."""
     for light in lights:
         light[0] = max(light[0], 0.0)
-        if len(light) == 5:
-            light[4] = min(max(light[4], 0.0), max_closeness)
+        if _soft_terms(geometry, light) < len(light):
+            light[-1] = min(max(light[-1], 0.0), max_closeness)
 
 
 @compiled(fast=True)
@@ -302,7 +322,7 @@ def _step(
     for v in range(num_views):
         for p in range(size):
             new_lights[v, p] = lights[v, p] + gradient[v * size + p]
-    _clamp(new_lights, max_closeness)
+    _clamp(geometry, new_lights, max_closeness)
     rhs = np.zeros(padded)
     for index in range(count):
         v, p = index // size, index % size
@@ -327,7 +347,7 @@ def _step(
             albedo_gradient[i] -= step * row[i]
     for i in range(num_samples):
         new_albedo[i] = albedo[i] + own[i] * albedo_gradient[i]
-    _clamp(new_lights, max_closeness)
+    _clamp(geometry, new_lights, max_closeness)
     return True
 
 
@@ -349,8 +369,8 @@ def fit(
     """Minimize over lights and albedo together, in place.
 
     Args:
-        geometry: Rows of the samples: the four harmonics; or, for a point light, the coordinates
-            of the normals and of the points.
+        geometry: Rows of the samples: the harmonics; with a point light, coordinates of the
+            normals and of the points, too.
         radiance: View by sample; zero where not seen.
         seen: 1 or 0.
         level: Mean brightness of each view.
@@ -366,7 +386,7 @@ def fit(
     cross = np.empty((lights.size, len(albedo)))
     new_lights, new_albedo = np.empty_like(lights), np.empty_like(albedo)
     scale, guess = np.zeros(len(lights)), np.zeros(len(lights))
-    _clamp(lights, max_closeness)
+    _clamp(geometry, lights, max_closeness)
     _shade(geometry, lights, shading)
     _residuals(radiance, seen, albedo, shading, residual)
     damping = _DAMPING

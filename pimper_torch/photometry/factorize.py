@@ -22,7 +22,7 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.light_field import LightField, faces_light
+from pimper_torch.photometry.light_field import LightField, faces_light, is_strong
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.priors import (
@@ -114,13 +114,17 @@ SPREAD_SAMPLES = 512
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``light="soft"``, ``solver="balm"``, ``loss="squares"``, and no priors:
-    ``light_prior=0`` and ``geometry_weight=0``.
+    The published method is ``light="soft"``, ``colours=False``, ``solver="balm"``,
+    ``loss="squares"``, and no priors: ``light_prior=0`` and ``geometry_weight=0``.
 
     Attributes:
         light: Model fitted to the coarse mesh: ``"soft"``, first-order harmonics per view,
             constant over the scene; ``"point_light"``, ambient light and a near point light with
-            attached shadows; ``"auto"``, the one with the smaller residuals.
+            attached shadows; ``"room"``, a near point light in a room that is lit, whose light is
+            second-order harmonics shared by the views up to exposure; ``"auto"``, the simplest
+            that predicts radiance left out of the fit.
+        colours: Whether views may have light of unlike colour, where that predicts radiance left
+            out of the fit.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
         light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in
@@ -141,7 +145,8 @@ class FactorizeConfig:
             projection, of its shading vectors with BALM.
     """
 
-    light: Literal["auto", "soft", "point_light"] = "auto"
+    light: Literal["auto", "soft", "point_light", "room"] = "auto"
+    colours: bool = True
     solver: Literal["variable-projection", "balm"] = "variable-projection"
     light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
     geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
@@ -157,8 +162,8 @@ class FactorizeConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self, "factorize")
-        models = ("auto", "soft", "point_light")
-        require(self.light in models, "factorize.light", self.light, "auto, soft or point_light")
+        models = ("auto", "soft", "point_light", "room")
+        require(self.light in models, "factorize.light", self.light, " or ".join(models))
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
 
@@ -201,9 +206,11 @@ class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:
-    soft light, or a near point light. Then every patch is factorized, the field being the prior
-    mean of its lights; samples that face away from the point light are left out. Each sample
-    gets a last Gauss-Newton step, and albedo is fitted to every channel.
+    soft light, or a near point light, in a lit room where there is one; and its colour, which is
+    divided out. Then every patch is factorized, the field being the prior mean of its lights;
+    samples in shadow of the point light are left out, or, where they are most of a patch in a lit
+    room, those outside it. Each sample gets a last Gauss-Newton step, and albedo is fitted to
+    every channel.
 
     In parts, for patches that are not all in memory at once: :meth:`light` from thinned
     templates, :meth:`solve` for some patches at a time, and :meth:`conclude` for all of them.
@@ -275,9 +282,10 @@ class Factorize(Stage):
 
     def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
         """Fit the light field; soft light, which is simpler, where what was asked for fails."""
-        min_views, model = self.config.min_views, self.config.light
+        config, model = self.config, self.config.light
+        fit = partial(light_of_mesh, seen, coarse, config.min_views, colours=config.colours)
         try:
-            return light_of_mesh(seen, coarse, min_views, model)
+            return fit(model)
         except Exception as error:
             if model == "soft" or not by_data(error) or out_of_memory(error):
                 raise
@@ -289,7 +297,7 @@ class Factorize(Stage):
                 done="Soft light was fitted instead",
             )
             skipped(failure, error=error)
-        return light_of_mesh(seen, coarse, min_views, "soft")
+        return fit("soft")
 
     def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
         """Factorize some patches, independently of others.
@@ -297,8 +305,11 @@ class Factorize(Stage):
         Returns:
             Albedo and lights up to the factor of the scene, which :meth:`conclude` sets.
         """
-        buckets = []
+        buckets, colour = [], light.field.colour
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
+            if colour is not None and not bool((colour == 1).all()):
+                balanced = registered.radiance / colour[..., None, None].to(registered.radiance)
+                registered = registered.replace(radiance=balanced)
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
             found = over_patches(
@@ -313,7 +324,7 @@ class Factorize(Stage):
 
     def _solved(self, bucket: _Bucket, light: Illumination, some: slice) -> Photometry:
         bucket = bucket.take(some)
-        prepared = self._prepare(bucket, _illuminated(bucket, light), light)
+        prepared = self._prepare(bucket, *_illuminated(bucket, light), light)
         return self._photometry(bucket, prepared, self._solve(prepared.problem))
 
     def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
@@ -331,6 +342,7 @@ class Factorize(Stage):
         self,
         bucket: _Bucket,
         illuminated: Bool[Tensor, "patch view height width"],
+        shadowed: Bool[Tensor, "patch view height width"],
         light: Illumination,
     ) -> _Prepared:
         """Pose the problem; under light that never moves, samples in shadow take part.
@@ -340,11 +352,19 @@ class Factorize(Stage):
         config, field, variance = self.config, light.field, light.guess_variance
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
-        anchor = rotate_lights(patch_from_world, field.lights_at(centre))
+        anchor = rotate_lights(
+            patch_from_world, field.lights_at(centre, -patch_from_world[:, 2, :3])
+        )
         point_light = rotate(patch_from_world, field.point_light_at(centre))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
         observed = bucket.registered.valid & bucket.templates.inside[:, None]
         lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
+        # What is mostly in shadow of the lamp has the room's light in that view.
+        soft = rotate_lights(patch_from_world, field.soft_at(-patch_from_world[:, 2, :3]))
+        shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
+        by_soft = shaded & rows.seen & is_strong(soft, point_light)[..., None]
+        in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
+        lit, anchor = torch.where(in_room, by_soft, lit), torch.where(in_room, soft, anchor)
         dark = int((rows.seen & ~lit).sum())
         leave_out("photometry.shadows", dark, total=int(rows.seen.sum()))
         status = patch_status(
@@ -658,11 +678,13 @@ def _lost(bucket: _Bucket, some: slice) -> Photometry:
     )
 
 
-def _illuminated(bucket: _Bucket, light: Illumination) -> Bool[Tensor, "patch view height width"]:
-    """Find observed samples that are not in cast shadows, or near their edges."""
+def _illuminated(
+    bucket: _Bucket, light: Illumination
+) -> tuple[Bool[Tensor, "patch view height width"], Bool[Tensor, "patch view height width"]]:
+    """Find observed samples that are not in cast shadows, and those that are; no edges of them."""
     registered, templates = bucket.registered, bucket.templates
     if light.caster is None:
-        return registered.valid
+        return registered.valid, torch.zeros_like(registered.valid)
     world_from_patch = invert_rigid(templates.patch_from_world)
     raster = templates.points_patch.shape
     points_world = transform(world_from_patch, templates.points_patch.flatten(1, 2))
@@ -677,8 +699,8 @@ def _illuminated(bucket: _Bucket, light: Illumination) -> Bool[Tensor, "patch vi
         mask=templates.inside,
         seen=registered.valid,
     )
-    reached = (shadows.lit & shadows.sure).movedim(-1, 1)
-    return registered.valid & reached
+    lit, sure = shadows.lit.movedim(-1, 1), registered.valid & shadows.sure.movedim(-1, 1)
+    return lit & sure, ~lit & sure
 
 
 def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:

@@ -1,8 +1,9 @@
-r"""First-order spherical harmonics: shading of a Lambertian surface under distributed light.
+r"""Spherical harmonics: shading of a Lambertian surface under distributed light.
 
 Under distant light of any distribution the radiance of a convex Lambertian surface is, to
 first order, :math:`x = \rho\, l^\top (1, n)`: albedo, four coefficients of the light, the normal.
-The constants of the real harmonics are folded into ``l``.
+The constants of the real harmonics are folded into ``l``. Second order adds five coefficients, and
+is 99 % of the energy in place of 88 %.
 
 Source: Basri & Jacobs, PAMI 25(2), 2003; Ramamoorthi & Hanrahan, JOSA A 18(10), 2001.
 """
@@ -19,6 +20,28 @@ def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     tensor([ 1.,  0.,  0., -1.])
     """
     return torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
+
+
+def second_harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 5"]:
+    """Return the harmonics of second order, ``(xy, yz, xz, x^2 - y^2, 3 z^2 - 1)``."""
+    x, y, z = normals.unbind(dim=-1)
+    return torch.stack([x * y, y * z, x * z, x**2 - y**2, 3 * z**2 - 1], dim=-1)
+
+
+def linearized(
+    lights: Float[Tensor, "view 9"], normals: Float[Tensor, "point 3"]
+) -> Float[Tensor, "point view 4"]:
+    r"""Return first-order lights that shade as second-order ones do near given normals.
+
+    The harmonics of second order are quadratic forms: :math:`n^\top Q n` is
+    :math:`2 (Q n_0)^\top n - n_0^\top Q n_0` up to the square of :math:`n - n_0`.
+    """
+    xy, yz, xz, difference, along = lights[:, 4:].unbind(dim=1)
+    rows = [difference - along, xy / 2, xz / 2, xy / 2, -difference - along, yz / 2]
+    forms = torch.stack([*rows, xz / 2, yz / 2, 2 * along], dim=1).reshape(-1, 3, 3)
+    slope = 2 * torch.einsum("vij,pj->pvi", forms, normals)
+    value = (slope * normals[:, None]).sum(dim=-1, keepdim=True) / 2
+    return torch.cat([lights[:, :1] - value, lights[:, 1:4] + slope], dim=-1)
 
 
 def rotate_lights(

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
+# Minimum standard deviation of residuals, in brightnesses of their view: a choice.
+MIN_SPREAD = 1e-4
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageSamples:
@@ -35,7 +38,7 @@ class ImageSamples:
 
     def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
         """Return the scale of Cauchy's loss for each view."""
-        least = 1e-4 * self.level
+        least = MIN_SPREAD * self.level
         return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
     def weights(

@@ -1,4 +1,4 @@
-"""Light that varies over the scene: a point light and first-order harmonics in every view."""
+"""Light that varies over the scene: a point light and spherical harmonics in every view."""
 
 from dataclasses import dataclass
 
@@ -6,11 +6,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.photometry.harmonics import linearized
 from pimper_torch.records import Record
 
 # Minimum cosine between normal and direction of the point light for a sample to count as lit: a
 # choice, 3 degrees from grazing, as coarse normals are off by a few degrees.
 _MIN_COSINE = 0.05
+
+# Minimum fraction of the shading that is soft light's for a patch in shadow to be used: a choice.
+_MIN_SOFT = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -19,24 +23,26 @@ class LightField(Record):
 
     A surface at ``x`` with normal ``n`` and albedo 1 shows
 
-    .. math:: s \cdot (1, n) + \max(0, E(x) \cdot n), \qquad
+    .. math:: s \cdot h(n) + \max(0, E(x) \cdot n), \qquad
               E(x) = |e| \frac{e/|e| - c (x - o)}{|e/|e| - c (x - o)|^3}:
 
-    soft light ``s`` (first-order spherical harmonics), and a point light in direction ``e`` at
+    soft light ``s`` (harmonics ``h`` to second order), and a point light in direction ``e`` at
     distance ``1 / c`` from the origin ``o``, whose irradiance there is ``|e|`` and falls off with
     the square of the distance.
 
     Attributes:
         origin: World.
-        soft: First-order harmonics, world.
+        soft: Harmonics ``(1, n)`` and those of second order, world.
         point_light: ``e``; zero for none.
         closeness: ``c``, the inverse distance; zero for a distant light.
+        colour: Of all light; radiance over it is gray. White if ``None``.
     """
 
     origin: Float[Tensor, " 3"]
-    soft: Float[Tensor, "view 4"]
+    soft: Float[Tensor, "view 9"]
     point_light: Float[Tensor, "view 3"]
     closeness: Float[Tensor, " view"]
+    colour: Float[Tensor, "view channel"] | None = None
 
     def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
         """Return ``E``, the direction to the point light times its irradiance."""
@@ -46,11 +52,24 @@ class LightField(Record):
         distance = away.norm(dim=-1, keepdim=True)
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
-    def lights_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
-        """Return first-order light at points whose normals face the point light; world frame."""
-        point_light = self.point_light_at(points)
-        soft = self.soft.expand(len(points), -1, -1)
+    def soft_at(self, normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
+        """Return first-order light that is soft light near given normals; world frame."""
+        return linearized(self.soft, normals)
+
+    def lights_at(
+        self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, "point view 4"]:
+        """Return first-order light near normals that face the point light; world frame."""
+        point_light, soft = self.point_light_at(points), self.soft_at(normals)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
+
+
+def is_strong(
+    soft: Float[Tensor, "patch view 4"], point_light: Float[Tensor, "patch view 3"]
+) -> Bool[Tensor, "patch view"]:
+    """Find where directed soft light shades patches by much beside a point light."""
+    directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
+    return directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > _MIN_SOFT * strength)
 
 
 def faces_light(

@@ -7,13 +7,13 @@ with Cauchy's loss; gradients by the implicit function theorem at the optimum.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.image_samples import ImageSamples
+from pimper_torch.photometry.image_samples import MIN_SPREAD, ImageSamples
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
@@ -28,40 +28,51 @@ _PRECONDITIONER_DAMPING = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFit:
-    """Fitted lights and albedo, and the median residual as a fraction of the view's brightness."""
+    """Fitted lights and albedo."""
 
     model: LightModel
     lights: Float[Tensor, "view parameter"]
     albedo: Float[Tensor, " sample"]
-    misfit: float
+
+    def misfit(
+        self, samples: ImageSamples, some: Bool[Tensor, "sample view"]
+    ) -> Float[Tensor, " view"]:
+        """Return the median residual of some samples, in brightnesses of their views.
+
+        NaN in views that have none of them.
+        """
+        residual = samples.radiance - self.albedo[:, None] * self.model.shade(self.lights)
+        relative = residual.abs() / samples.level.clamp_min(1e-300)
+        missing = torch.where(some, relative.clamp_min(MIN_SPREAD), torch.nan)
+        return missing.nanmedian(dim=0).values
 
 
-def fit_lights(model: LightModel, samples: ImageSamples, iterations: int) -> LightFit:
+def fit_lights(
+    model: LightModel,
+    samples: ImageSamples,
+    iterations: int,
+    start: tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]] | None = None,
+) -> LightFit:
     """Fit a model's lights and the samples' albedo; a constant to autograd.
 
     Where gradients are required, it iterates to convergence: see :func:`with_gradients`.
 
     Args:
-        model: Soft light or a point light, at the samples.
+        model: At the samples.
         iterations: At most, where no gradients are required.
+        start: Lights and albedo; by default, see :meth:`LightModel.initialize`.
     """
     limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
     with torch.no_grad():
-        return _fit(model, samples, limit, min_gain)
+        lights, albedo = start or model.initialize(samples)
+        minimize = _minimize_by_kernel if compiled_for(samples.radiance) else _minimize
+        lights, albedo = minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
+    return LightFit(model=model, lights=lights, albedo=albedo)
 
 
 def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
     parts = (samples.radiance, *model.geometry())
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
-
-
-def _fit(model: LightModel, samples: ImageSamples, limit: int, min_gain: float) -> LightFit:
-    lights, albedo = model.initialize(samples)
-    minimize = _minimize_by_kernel if compiled_for(samples.radiance) else _minimize
-    lights, albedo = minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
-    residual = samples.residual(albedo, model.shade(lights))
-    relative = (residual.abs() / samples.level.clamp_min(1e-300))[samples.seen]
-    return LightFit(model=model, lights=lights, albedo=albedo, misfit=float(relative.median()))
 
 
 def _minimize_by_kernel(
@@ -180,7 +191,6 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
         model=model,
         lights=answer[:count].reshape(found.lights.shape),
         albedo=answer[count:],
-        misfit=found.misfit,
     )
 
 

@@ -3,10 +3,11 @@ r"""The light of every view, calibrated by the coarse mesh's normals.
 Normals of the coarse mesh are right to a few degrees; that is enough to calibrate lights, and
 calibrated lights leave the factorization no ambiguity.
 
-Two models are fitted, and the one with the smaller residuals is selected: soft light, first-order
-harmonics that are constant over the scene; and a near point light with inverse-square falloff,
-attached shadows and an ambient term. Falloff and shadows of a point light are not linear in
-:math:`(1, n)`: fitted by soft light, they would appear as shape.
+Three models are tried: soft light, first-order harmonics that are constant over the scene; a near
+point light with inverse-square falloff, attached shadows and an ambient term; and a near point
+light in a lit room, whose light is at rest in the world. Falloff and shadows of a point light are
+not linear in :math:`(1, n)`: fitted by soft light, they would appear as shape; and so would the
+room's light. Radiance that is left out of the fits decides.
 """
 
 import math
@@ -15,18 +16,27 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from pimper_torch.geometry.frames import invert_rigid, transform
-from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.harmonics import harmonics, second_harmonics
 from pimper_torch.photometry.image_samples import ImageSamples
+from pimper_torch.photometry.left_out import left_out, predicts_better
+from pimper_torch.photometry.light_colour import light_colours
 from pimper_torch.photometry.light_field import LightField
-from pimper_torch.photometry.light_fit import fit_lights, with_gradients
-from pimper_torch.photometry.light_models import PointLight, SoftLight
+from pimper_torch.photometry.light_fit import LightFit, fit_lights, with_gradients
+from pimper_torch.photometry.light_models import LightModel
 from pimper_torch.records import PatchSet, PatchViews, Templates
 
-# A point light, which has one parameter more, is selected if its residuals are below this
-# fraction of those of soft light: a choice.
-_POINT_LIGHT_GAIN = 0.95
+# Models by their number of parameters.
+LightName = Literal["auto", "soft", "point_light", "room"]
+_MODELS = "soft", "point_light", "room"
+
+# Fits of the room's harmonics and of all else take turns, so many times: a choice.
+_ROOM_ITERATIONS = 8
+
+# Models are tried on about this many samples: a choice.
+_TRIED = 2500
 
 # Maximum number of samples that the light is fitted to: a choice, 2,000 per parameter.
 LIGHT_SAMPLES = 10_000
@@ -54,7 +64,8 @@ def light_of_mesh(
     seen: PatchViews,
     coarse: list[Float[Tensor, "_ _ _ 3"]],
     min_views: int,
-    model: Literal["auto", "soft", "point_light"],
+    model: LightName,
+    colours: bool = True,
 ) -> LightField:
     """Fit the light field to samples spread evenly over the facets, without their overlap.
 
@@ -63,6 +74,7 @@ def light_of_mesh(
         coarse: Normals of each bucket's templates, patch frame.
         min_views: Views a sample must be valid in.
         model: See :func:`fit_light_field`.
+        colours: Whether views may have light of unlike colour.
 
     Differentiable in radiance, normals and templates; which samples are taken is constant.
     """
@@ -76,21 +88,19 @@ def light_of_mesh(
         seen.patches.buckets, seen.buckets, coarse, chosen, strict=True
     ):
         patch, row, column = (part[::stride] for part in mask.nonzero(as_tuple=True))
-        gray = registered.radiance[patch, :, :, row, column].mean(dim=2)
-        finite = gray.isfinite()
-        radiance.append(torch.where(finite, gray, 0))
+        sampled = registered.radiance[patch, :, :, row, column]
+        finite = sampled.isfinite().all(dim=2)
+        radiance.append(torch.where(finite[..., None], sampled, 0))
         visible.append(registered.valid[patch, :, row, column] & finite)
         to_world = templates.patch_from_world[patch, :3, :3].to(bucket_normals)
         normals.append((bucket_normals[patch, row, column, None] @ to_world)[:, 0])
         positions = templates.points_patch[patch, row, column, None]
         points.append(transform(invert_rigid(templates.patch_from_world[patch]), positions)[:, 0])
-    return fit_light_field(
-        torch.cat(radiance),
-        torch.cat(visible),
-        torch.cat(normals),
-        torch.cat(points),
-        model=model,
-    )
+    every, shown = torch.cat(radiance), torch.cat(visible)
+    colour = light_colours(every, shown) if colours else every.new_ones(every.shape[1:])
+    gray = (every / colour).mean(dim=2)
+    field = fit_light_field(gray, shown, torch.cat(normals), torch.cat(points), model=model)
+    return field.replace(colour=colour)
 
 
 def fit_light_field(
@@ -98,10 +108,10 @@ def fit_light_field(
     seen: Bool[Tensor, "sample view"],
     normals: Float[Tensor, "sample 3"],
     points: Float[Tensor, "sample 3"] | None = None,
-    model: Literal["auto", "soft", "point_light"] = "auto",
+    model: LightName = "auto",
     iterations: int = 60,
 ) -> LightField:
-    r"""Fit soft light, point lights, or both, and select the model with the smaller residuals.
+    r"""Fit soft light, point lights, or point lights in a lit room.
 
     Minimizes :math:`\sum_{ig} \phi(x_{gi} - \rho_i\, s_g(i))`, :math:`\phi` being Cauchy's
     loss with a scale of 2.385 robust deviations of the view's residuals (wider at first).
@@ -111,7 +121,8 @@ def fit_light_field(
         seen: False where missing.
         normals: Unit, world.
         points: World; without them, point lights are distant.
-        model: Which to fit; ``auto`` is both.
+        model: Which to fit; ``auto`` tries all with a fifth of the radiance left out, and selects
+            the simplest that none with more parameters predicts better than, significantly.
         iterations: At most, for each model.
 
     Returns:
@@ -121,7 +132,8 @@ def fit_light_field(
     Fails where the normals span too little (a plane determines one coefficient of each soft
     light): the result is then the smallest change from lights along the mean normal, so that all
     lights are nearly parallel. Computed in float64. Differentiable by the implicit function; the
-    choice of the model, and the parameters at a bound, are constant.
+    choice of the model, the room's harmonics over its ambient light, and the parameters at a
+    bound, are constant.
 
     Source: of the point light, Queau et al., LED-based photometric stereo, JMIV 60, 2018; its
     calibration by the coarse shape is ours.
@@ -130,7 +142,7 @@ def fit_light_field(
     if not seen.any():
         return LightField(
             origin=radiance.new_zeros(3),
-            soft=radiance.new_zeros(views, 4),
+            soft=radiance.new_zeros(views, 9),
             point_light=radiance.new_zeros(views, 3),
             closeness=radiance.new_zeros(views),
         )
@@ -141,25 +153,15 @@ def fit_light_field(
     positions = torch.zeros_like(own_normals) if points is None else points[some].double()
     origin = positions.mean(dim=0)
     size = _mean_distance(positions - origin)
-    soft = point_light = None
-    if model != "point_light":
-        soft = fit_lights(SoftLight(basis=harmonics(own_normals)), samples, iterations)
-    if model != "soft":
-        point_light = fit_lights(
-            PointLight(normals=own_normals, points=(positions - origin) / size), samples, iterations
-        )
-    lights = torch.zeros(views, 4).to(samples.radiance)
-    point_lights, closeness = torch.zeros_like(lights[:, 1:]), torch.zeros_like(lights[:, 0])
-    if point_light is None or (
-        soft is not None and point_light.misfit >= _POINT_LIGHT_GAIN * soft.misfit
-    ):
-        assert soft is not None
-        lights = with_gradients(soft, samples).lights
-    else:
-        solution = with_gradients(point_light, samples).lights
-        lights = torch.cat([solution[:, :1], lights[:, 1:]], dim=1)
-        point_lights = solution[:, 1:4]
-        closeness = torch.zeros_like(closeness) if points is None else solution[:, 4] / size
+    geometry = own_normals, (positions - origin) / size
+    name = _selected(samples, *geometry, iterations) if model == "auto" else model
+    found, mixing = _fit(name, samples, *geometry, iterations)
+    solution, terms = with_gradients(found, samples).lights, len(mixing)
+    lights = solution[:, :terms] @ mixing
+    point_lights, closeness = torch.zeros_like(lights[:, :3]), torch.zeros_like(lights[:, 0])
+    if name != "soft":
+        point_lights = solution[:, terms:-1]
+        closeness = closeness if points is None else solution[:, -1] / size
     factor = _median_length(lights.square().sum(dim=1) + point_lights.square().sum(dim=1))
     return LightField(
         origin=origin.to(radiance),
@@ -167,6 +169,79 @@ def fit_light_field(
         point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
+
+
+def _fit(
+    name: str,
+    samples: ImageSamples,
+    normals: Float[Tensor, "sample 3"],
+    points: Float[Tensor, "sample 3"],
+    iterations: int,
+) -> tuple[LightFit, Float[Tensor, "term 9"]]:
+    """Fit a model.
+
+    Returns:
+        The fit, and the harmonics that each coefficient of its soft light multiplies.
+    """
+    basis = torch.cat([harmonics(normals), second_harmonics(normals)], dim=1)
+    each = torch.eye(9).to(basis)
+    if name == "soft":
+        return fit_lights(LightModel(basis=basis[:, :4]), samples, iterations), each[:4]
+    model = LightModel(basis=basis[:, :1], normals=normals, points=points)
+    found = fit_lights(model, samples, iterations)
+    if name == "point_light":
+        return found, each[:1]
+    room = each[:1]
+    for _ in range(_ROOM_ITERATIONS):
+        room = _fit_room(found, samples, basis, room)
+        model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
+        found = fit_lights(model, samples, iterations, (found.lights, found.albedo))
+    return found, room
+
+
+@torch.no_grad()
+def _fit_room(
+    found: LightFit,
+    samples: ImageSamples,
+    basis: Float[Tensor, "sample 9"],
+    room: Float[Tensor, "1 9"],
+) -> Float[Tensor, "1 9"]:
+    """Take a Gauss-Newton step of the room's harmonics and the albedos, all else fixed."""
+    albedo, ambient = found.albedo, found.lights[:, 0]
+    shading = found.model.shade(found.lights)
+    residual = samples.residual(albedo, shading)
+    weight = samples.weights(residual, samples.scale(residual))
+    slope = basis[:, 1:] * albedo[:, None]
+    own = (weight * shading**2).sum(dim=1).clamp_min(1e-300)
+    cross = slope * ((weight * shading) @ ambient)[:, None]
+    matrix = slope.mT @ (slope * (weight @ ambient**2)[:, None]) - cross.mT @ (cross / own[:, None])
+    side = slope.mT @ ((weight * residual) @ ambient)
+    side = side - cross.mT @ ((weight * residual * shading).sum(dim=1) / own)
+    floor = 1e-6 * matrix.diagonal().mean().clamp_min(1e-300)
+    step = torch.linalg.solve(matrix + floor * torch.eye(8).to(matrix), side)
+    return room + pad(step, (1, 0))
+
+
+@torch.no_grad()
+def _selected(
+    samples: ImageSamples,
+    normals: Float[Tensor, "sample 3"],
+    points: Float[Tensor, "sample 3"],
+    iterations: int,
+) -> str:
+    """Select the model by its residuals where radiance is left out of the fit."""
+    few = slice(None, None, -(-len(normals) // _TRIED))
+    normals, points = normals[few], points[few]
+    every = ImageSamples(radiance=samples.radiance[few], seen=samples.seen[few])
+    test = left_out(every.seen)
+    seen = every.seen & ~test
+    rest = ImageSamples(radiance=torch.where(seen, every.radiance, 0), seen=seen)
+    best, least = "", torch.empty(0)
+    for name in _MODELS:
+        misfit = _fit(name, rest, normals, points, iterations)[0].misfit(every, test)
+        if not best or predicts_better(misfit, least):
+            best, least = name, misfit
+    return best
 
 
 def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:

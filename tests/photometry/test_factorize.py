@@ -1,7 +1,9 @@
 import math
+from dataclasses import asdict
 
 import pytest
 import torch
+from torch.nn.functional import pad
 from torch.testing import assert_close
 
 from pimper_torch.chains.presets import load_config
@@ -10,6 +12,7 @@ from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.light_field import LightField
 from pimper_torch.records import PatchStatus, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
@@ -144,7 +147,8 @@ def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
     true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
     def illuminated(bucket, _):
-        return bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
+        lit = bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
+        return lit, torch.zeros_like(lit)
 
     monkeypatch.setattr(factorize, "_illuminated", illuminated)
     with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
@@ -160,6 +164,56 @@ def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
     predicted = shading * found.albedo[1].mean(dim=-1)
     assert (found.observed[1] == seen.any(dim=0)).all()
     assert_close(predicted[seen], observations.gray[1][seen], rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("strength", [1.0, 100.0])
+def test_in_the_lamps_shadow_the_rooms_light_tells_normals_where_it_is_strong(
+    scene, monkeypatch, strength
+):
+    true = scene()
+    lamp = strength * torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(12, 3)
+    field = LightField(
+        origin=torch.zeros(3).double(),
+        soft=pad(true.lights, (0, 5)),
+        point_light=lamp,  # shadowed all over
+        closeness=torch.zeros(12).double(),
+    )
+    monkeypatch.setattr(Factorize, "_field", lambda *_: field)
+    monkeypatch.setattr(
+        factorize,
+        "_illuminated",
+        lambda bucket, _: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
+    )
+    if strength > 1:
+        with pytest.warns(PimperWarning, match="8 of 8 patches keep"):
+            assert not any(bucket.valid.any() for bucket in Factorize(EXACT)(true.seen).buckets)
+        return
+    assert median_error(Factorize(EXACT)(true.seen), true) < 0.1
+
+
+def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
+    true = scene()
+    colour = (0.3 * torch.randn(12, 3, generator=generator, dtype=torch.float64)).exp()
+    colour = colour / colour.log().mean(dim=0).exp()
+    tinted = true.seen.replace(
+        buckets=tuple(
+            one.replace(radiance=one.radiance * colour[..., None, None])
+            for one in true.seen.buckets
+        )
+    )
+    white, found = Factorize(EXACT)(true.seen), Factorize(EXACT)(tinted)
+    gray = Factorize(FactorizeConfig(**asdict(EXACT) | {"colours": False}))(tinted)
+    for one, two, three in zip(white.buckets, found.buckets, gray.buckets, strict=True):
+        share = one.albedo / one.albedo.mean(dim=-1, keepdim=True)
+
+        def off(other, share=share, valid=one.valid):
+            own = other.albedo / other.albedo.mean(dim=-1, keepdim=True)
+            return (own - share).abs()[valid].mean()
+
+        assert off(two) < 0.02
+        assert off(three) > 2 * off(two)
+        # Brightness of the views differs, and with it what robust weights do; bumps have 17.
+        assert angles_deg(two.normals_patch, one.normals_patch, one.valid).median() < 0.5
 
 
 def spoil(seen: PatchViews, how: str) -> PatchViews:

@@ -3,6 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.photometry.harmonics import harmonics, linearized, second_harmonics
 from pimper_torch.photometry.light_field import LightField, faces_light
 from pimper_torch.photometry.lights import fit_light_field
 
@@ -19,7 +20,7 @@ def room(generator):
     directions = normalize(draw(6, 3) * 0.6 + torch.tensor([0.0, 0.0, 1.0]), dim=1)
     field = LightField(
         origin=points.mean(dim=0),
-        soft=torch.tensor([[0.1, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(6, 1),
+        soft=torch.tensor([[0.1] + 8 * [0.0]], dtype=torch.float64).repeat(6, 1),
         point_light=torch.linspace(0.5, 1.5, 6).double()[:, None] * directions,
         closeness=1 / torch.linspace(3, 6, 6).double(),
     )
@@ -36,7 +37,7 @@ def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
     place = torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64)
     field = LightField(
         origin=torch.zeros(3).double(),
-        soft=torch.zeros(1, 4).double(),
+        soft=torch.zeros(1, 9).double(),
         point_light=2.0 * place[None] / 5,
         closeness=torch.tensor([1 / 5]).double(),
     )
@@ -45,19 +46,20 @@ def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
     away = place - points
     assert_close(normalize(found, dim=1), normalize(away, dim=1))
     assert_close(found.norm(dim=1), 2.0 * 25 / away.square().sum(dim=1))
-    assert_close(field.lights_at(points)[:, 0, 1:], found)
+    assert_close(field.lights_at(points, normalize(points + 1, dim=1))[:, 0, 1:], found)
 
 
 def test_a_point_light_far_away_is_the_same_everywhere():
     field = LightField(
         origin=torch.zeros(3).double(),
-        soft=torch.tensor([[0.3, 0.1, 0.2, 0.4]]).double(),
+        soft=torch.tensor([[0.3, 0.1, 0.2, 0.4] + 5 * [0.0]]).double(),
         point_light=torch.tensor([[0.6, 0.0, 0.8]]).double(),
         closeness=torch.zeros(1).double(),
     )
     points = torch.tensor([[0.0, 0, 0], [50.0, -8, 4]], dtype=torch.float64)
     expected = torch.tensor([0.3, 0.7, 0.2, 1.2], dtype=torch.float64)
-    assert_close(field.lights_at(points)[:, 0], expected.expand(2, 4))
+    found = field.lights_at(points, normalize(points + 1, dim=1))
+    assert_close(found[:, 0], expected.expand(2, 4))
 
 
 def test_point_lights_are_found_where_they_are(room, generator):
@@ -93,9 +95,48 @@ def test_light_from_all_sides_is_taken_for_no_point_light(room, generator):
     J = albedo[:, None] * (basis @ soft.mT)
     found = fit_light_field(J, J > 0, normals, points)
     assert (found.point_light == 0).all()
-    assert_close(found.soft / found.soft[:1, :1], soft / soft[:1, :1], rtol=1e-4, atol=1e-4)
+    assert_close(found.soft[:, :4] / found.soft[:1, :1], soft / soft[:1, :1], rtol=1e-4, atol=1e-4)
+    assert (found.soft[:, 4:] == 0).all()
     asked = fit_light_field(J, J > 0, normals, points, model="point_light")
     assert (asked.point_light.norm(dim=1) > 0).all()
+
+
+def test_a_room_at_rest_is_told_from_the_lamp_that_moves_in_it(room, generator):
+    points, normals, field = room
+    exposure = torch.linspace(0.8, 1.3, 6).double()[:, None]
+    shape = torch.tensor([1.0, -0.6, 0.3, 0.2, 0.1, -0.1, 0.2, 0.1, -0.05]).double()
+    field = field.replace(soft=0.3 * exposure * shape)
+    albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
+    basis = torch.cat([harmonics(normals), second_harmonics(normals)], dim=1)
+    direct = (field.point_light_at(points) * normals[:, None]).sum(dim=-1).clamp_min(0)
+    J = albedo[:, None] * (basis @ field.soft.mT + direct)
+    seen = torch.rand(J.shape, generator=generator) > 0.3
+    found = fit_light_field(torch.where(seen, J, torch.nan), seen, normals, points)
+
+    def off(field):
+        cosine = (normalize(field.point_light, dim=1) * lamps).sum(dim=1)
+        return torch.rad2deg(cosine.clamp(-1, 1).acos()).max()
+
+    lamps = normalize(field.point_light, dim=1)
+    assert off(found) < 0.1
+    assert off(fit_light_field(J, seen, normals, points, model="point_light")) > 2
+    one = found.soft / found.soft[:, :1]
+    assert_close(one, one[:1].expand(6, 9))  # a room for all views, in their exposures
+    assert_close(one[0, 1:3], shape[1:3], rtol=0, atol=0.15)  # what albedo cannot mimic
+
+
+def test_soft_light_near_a_normal_has_its_value_and_slope_there(generator):
+    normals = normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=1)
+    lights = torch.randn(7, 9, generator=generator, dtype=torch.float64)
+    found = linearized(lights, normals)
+
+    def error(turned):
+        basis = torch.cat([harmonics(turned), second_harmonics(turned)], dim=1)
+        return (found * harmonics(turned)[:, None]).sum(dim=-1) - basis @ lights.mT
+
+    assert error(normals).abs().max() < 1e-12
+    aside = normalize(normals + 1e-4 * torch.ones(3).double(), dim=1)
+    assert error(aside).abs().max() < 1e-6  # 1e-8 times twice the coefficients
 
 
 def test_what_faces_away_from_the_point_light_is_told():
@@ -109,7 +150,7 @@ def test_what_faces_away_from_the_point_light_is_told():
 def test_a_field_without_data_is_dark():
     none = torch.zeros(0, 5)
     found = fit_light_field(none, none.bool(), torch.zeros(0, 3), torch.zeros(0, 3))
-    assert (found.lights_at(torch.zeros(2, 3)) == 0).all()
+    assert (found.lights_at(torch.zeros(2, 3), torch.ones(2, 3)) == 0).all()
     unseen = fit_light_field(
         torch.full((4, 5), torch.nan), torch.zeros(4, 5).bool(), torch.ones(4, 3), torch.ones(4, 3)
     )

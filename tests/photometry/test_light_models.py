@@ -5,9 +5,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.harmonics import harmonics, second_harmonics
 from pimper_torch.photometry.light_field import LightField
-from pimper_torch.photometry.light_models import MIN_DISTANCE, PointLight, SoftLight
+from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
+
+
+def basis(normals):
+    return torch.cat([harmonics(normals), second_harmonics(normals)], dim=1)
 
 
 def draw(generator, *shape):
@@ -21,19 +25,20 @@ def samples(generator):
 
 def lights(generator, model, views=6):
     """Lights off all bounds; point lights three times as far as the samples."""
-    found = draw(generator, views, 4)
-    found[:, 0] = 0.1 + found[:, 0].abs()
-    if isinstance(model, SoftLight):
-        return found
-    return torch.cat([found, torch.full((views, 1), 0.3).double()], dim=1)
+    soft = draw(generator, views, model.basis.shape[1])
+    soft[:, 0] = 0.1 + soft[:, 0].abs()
+    if model.points is None:
+        return soft
+    return torch.cat([soft, draw(generator, views, 3), torch.full((views, 1), 0.3).double()], dim=1)
 
 
-@pytest.fixture(params=["soft", "point light"])
+@pytest.fixture(params=["soft", "point light", "room"])
 def model(request, samples):
     normals, points = samples
     if request.param == "soft":
-        return SoftLight(basis=harmonics(normals))
-    return PointLight(normals=normals, points=points)
+        return LightModel(basis=harmonics(normals))
+    terms = {"point light": 1, "room": 9}[request.param]
+    return LightModel(basis=basis(normals)[:, :terms], normals=normals, points=points)
 
 
 def test_the_jacobian_is_the_derivative_of_shading(model, generator):
@@ -48,24 +53,24 @@ def test_the_jacobian_is_the_derivative_of_shading(model, generator):
     assert (off == 0).all()  # a view's shading depends on its own light alone
 
 
-def test_a_point_light_shades_as_the_light_field_does(samples, generator):
+def test_both_lights_shade_as_the_light_field_does(samples, generator):
     normals, points = samples
-    model = PointLight(normals=normals, points=points)
+    model = LightModel(basis=basis(normals), normals=normals, points=points)
     given = lights(generator, model)
     field = LightField(
         origin=torch.zeros(3).double(),
-        soft=torch.cat([given[:, :1], torch.zeros(6, 3).double()], dim=1),
-        point_light=given[:, 1:4],
-        closeness=given[:, 4],
+        soft=given[:, :9],
+        point_light=given[:, 9:12],
+        closeness=given[:, 12],
     )
     direct = (field.point_light_at(points) * normals[:, None]).sum(dim=-1).clamp_min(0)
-    assert_close(model.shade(given), given[:, 0] + direct)
+    assert_close(model.shade(given), basis(normals) @ field.soft.mT + direct)
 
 
 def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(samples):
     normals, points = samples
     outside = torch.tensor([[-1.0, 2, -3, 4, -0.5], [1.0, 0, 0, 1, 9.0], [1.0, 0, 0, 1, 0.2]])
-    model = PointLight(normals=normals, points=points)
+    model = LightModel(basis=harmonics(normals)[:, :1], normals=normals, points=points)
     inside = model.clamp(outside.double())
     expected = outside.double()
     expected[0, 0], expected[0, 4], expected[1, 4] = 0, 0, 1 / MIN_DISTANCE
@@ -74,7 +79,7 @@ def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(sam
     free = torch.ones(3, 5, dtype=torch.bool)
     free[0, 0] = free[0, 4] = free[1, 4] = False
     assert (model.inside_bounds(inside) == free).all()
-    soft = SoftLight(basis=harmonics(normals))
+    soft = LightModel(basis=harmonics(normals))
     assert_close(soft.clamp(outside[:, :4].double()), expected[:, :4])
     assert (soft.inside_bounds(inside[:, :4]) == free[:, :4]).all()
 
@@ -86,7 +91,7 @@ def test_the_initial_soft_light_has_the_brightness_of_every_view(samples, genera
     gain = torch.tensor([0.5, 1.0, 3.0]).double()
     albedo = 0.2 + torch.rand(50, generator=generator, dtype=torch.float64)
     radiance = albedo[:, None] * gain
-    model = SoftLight(basis=harmonics(normals))
+    model = LightModel(basis=harmonics(normals))
     found, start = model.initialize(
         ImageSamples(radiance=radiance, seen=torch.ones(50, 3, dtype=torch.bool))
     )

@@ -27,7 +27,7 @@ def point_lights(places, distant=False):
     distance = places.norm(dim=1)
     return LightField(
         origin=torch.zeros(3).double(),
-        soft=torch.zeros(len(places), 4).double(),
+        soft=torch.zeros(len(places), 9).double(),
         point_light=2.0 * normalize(places, dim=1),
         closeness=torch.zeros_like(distance) if distant else 1 / distance,
     )

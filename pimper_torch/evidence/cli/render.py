@@ -28,7 +28,17 @@ _RARE = tuple(
         ),
         *("no-fixed-room", "no-fixed-table", "no-constant-light", "no-turned-over"),
         *("pan-jitter-px", "crop-jitter-px", "point-light-distance", "irradiance"),
-        *("flash", "bounces", "read-noise", "shot-noise", "supersample", "up", "rotation-deg"),
+        *(
+            "flash",
+            "window",
+            "lamp-colour",
+            "bounces",
+            "read-noise",
+            "shot-noise",
+            "supersample",
+            "up",
+            "rotation-deg",
+        ),
     ]
 )
 

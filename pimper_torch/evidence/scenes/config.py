@@ -49,6 +49,10 @@ class SceneConfig:
         irradiance: Of the point light, as the radiance of white facing it; a quarter more or less.
         ambient: Light from everywhere, as the radiance of white; a quarter more or less.
         flash: Of a second point light on the camera, like irradiance; 0 is none.
+        window: Of soft light from one side of the room, at rest in the world, as the radiance of
+            white facing it; 0 is none.
+        lamp_colour: How much the point light's colour differs between photographs: the standard
+            deviation of the logarithm of each channel; 0 is white.
         bounces: Of light between surfaces, on its way to the one that is seen.
         exposure: Radiance is multiplied by it; what exceeds 1 saturates.
         read_noise: Standard deviation of the sensor in the dark; 1 is saturation.
@@ -94,6 +98,8 @@ class SceneConfig:
     irradiance: Annotated[float, Range(least=0, most=1e12)] = 0.85
     ambient: Annotated[float, Range(least=0, most=1e12)] = 0.1
     flash: Annotated[float, Range(least=0, most=1e12)] = 0.0
+    window: Annotated[float, Range(least=0, most=1e12)] = 0.0
+    lamp_colour: Annotated[float, Range(least=0, most=2)] = 0.0
     bounces: Annotated[int, Range(least=0, most=8)] = 0
     exposure: float = 1.0
     read_noise: float = 0.002
@@ -150,7 +156,7 @@ class SceneConfig:
             not self.turned_over or (self.num_views >= 2 and not self._at_rest),
             "turned_over",
             self.turned_over,
-            "2 views or more, and no environment, fixed_point_light, fixed_room or fixed_table",
+            "2 views or more, and no environment, window, or anything fixed before the camera",
         )
         widest = 0.3 * min(self.width, self.height)
         needed = (
@@ -166,10 +172,10 @@ class SceneConfig:
             "no fixed_point_light, under which the light goes round the object",
         )
         require(
-            self.irradiance + self.ambient + self.flash > 0,
+            self.irradiance + self.ambient + self.flash + self.window > 0,
             "irradiance",
             self.irradiance,
-            "some light: irradiance, ambient or flash",
+            "some light: irradiance, ambient, flash or window",
         )
         _ = self.sensor  # refuses its own
         for channel in self.albedo or ():
@@ -192,7 +198,7 @@ class SceneConfig:
     def _at_rest(self) -> bool:
         """Whether something stands still in the room while the object does not."""
         fixed = self.fixed_point_light or self.fixed_room or self.fixed_table
-        return fixed or self.surrounded != "none"
+        return fixed or self.window > 0 or self.surrounded != "none"
 
     @property
     def jitter_px(self) -> float:

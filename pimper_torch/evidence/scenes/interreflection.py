@@ -42,6 +42,8 @@ class Interreflection:
     def light(self, stage: Stage, point_light: PointLight) -> Float[Tensor, "vertex channel"]:
         """Return what every vertex receives from other surfaces under a point light."""
         sent = self._albedo * _direct(stage, point_light)[:, None]
+        if point_light.colour is not None:
+            sent = sent * point_light.colour
         total = torch.zeros(self._fraction.shape[0], self._albedo.shape[1])
         for _ in range(self.bounces):
             received = torch.from_numpy(self._fraction @ sent.numpy())

@@ -24,12 +24,21 @@ class PointLight(Record):
     ambient: float
     flash: float
     environment: Environment | None = None
+    window: Float[Tensor, " 3"] | None = None
+    colour: Float[Tensor, " 3"] | None = None
 
     def surroundings(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Return the radiance that arrives from where there is no object; 0 without environment."""
         if self.environment is None:
             return torch.zeros_like(directions)
         return self.ambient * self.environment(directions)
+
+    def from_window(self, normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"] | float:
+        """Return the irradiance of the window's soft light; see :class:`Lights`."""
+        if self.window is None:
+            return 0.0
+        strength = self.window.norm()
+        return (strength + normals @ self.window) ** 2 / (4 * strength)
 
     def arriving(
         self, points: Float[Tensor, "*batch 3"], position: Float[Tensor, " 3"], irradiance: float
@@ -63,6 +72,9 @@ class Lights(Record):
             view, without shadows.
         environments: The picture that the ambient light comes from, one a view. Matte surfaces
             get its mean; mirrors and the background show it.
+        window: Direction to the middle of soft light times the irradiance ``w`` of what faces it;
+            what is turned by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
+        colour: Of the point lights.
     """
 
     positions_world: Float[Tensor, "view 3"]
@@ -71,6 +83,8 @@ class Lights(Record):
     target_world: Float[Tensor, " 3"]
     flash: Float[Tensor, " view"]
     environments: tuple[Environment, ...] | None = None
+    window: Float[Tensor, " 3"] | None = None
+    colour: Float[Tensor, "view 3"] | None = None
 
     def point_light(self, view: int) -> PointLight:
         """Pick the light of one photograph."""
@@ -81,6 +95,8 @@ class Lights(Record):
             ambient=float(self.ambient[view]),
             flash=float(self.flash[view]),
             environment=None if self.environments is None else self.environments[view],
+            window=None if self.window is None else self.window.float(),
+            colour=None if self.colour is None else self.colour[view].float(),
         )
 
     def harmonics_world(
@@ -96,7 +112,11 @@ class Lights(Record):
         if eyes_world is not None:
             toward_eye = normalize(eyes_world - self.target_world, dim=-1)
             directed = directed + self.flash[:, None] * toward_eye
-        return torch.cat([self.ambient[:, None], directed], dim=-1)
+        ambient = self.ambient
+        if self.window is not None:  # the quadratic part's mean over directions is a third
+            ambient = ambient + self.window.norm() / 3
+            directed = directed + self.window / 2
+        return torch.cat([ambient[:, None], directed], dim=-1)
 
 
 def wandering_lights(

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.cameras import (
@@ -50,6 +51,8 @@ OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
 _MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
 _ENVIRONMENT = 1 << 20  # numbers of environments; those of photographs' noise are smaller
 _PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs
+_COLOUR = (1 << 21) + 2  # number of the point lights' colours
+_WINDOW = (-0.74, -0.47, 0.48)  # direction: left of the cameras, and above
 _FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
@@ -142,7 +145,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
         config=config,
         objects=(*objects, *turning),
         cameras=taken.cameras,
-        lights=taken.lights.replace(environments=environments),
+        lights=_coloured(taken.lights, config).replace(environments=environments),
         fixed=fixed,
         world_from_room=world_from_room,
     )
@@ -211,12 +214,15 @@ def _turned_over(
         config=config,
         objects=objects,
         cameras=cameras.replace(cam_from_world=cameras.cam_from_world @ room_from_world),
-        lights=Lights(
-            positions_world=transform(world_from_room, positions[:, None])[:, 0],
-            irradiance=torch.cat([one.irradiance for one in lights]),
-            ambient=torch.cat([one.ambient for one in lights]),
-            target_world=lights[0].target_world,  # the box's centre, which stays where it is
-            flash=torch.cat([one.flash for one in lights]),
+        lights=_coloured(
+            Lights(
+                positions_world=transform(world_from_room, positions[:, None])[:, 0],
+                irradiance=torch.cat([one.irradiance for one in lights]),
+                ambient=torch.cat([one.ambient for one in lights]),
+                target_world=lights[0].target_world,  # the box's centre, which stays where it is
+                flash=torch.cat([one.flash for one in lights]),
+            ),
+            config,
         ),
         fixed=(TABLES[config.table](generator),),
         world_from_room=world_from_room,
@@ -260,6 +266,18 @@ def _lights(
     if config.fixed_point_light:
         return fixed_light(lights, rotated_about(aim, azimuths))
     return lights.take([0] * len(azimuths)) if config.constant_light else lights
+
+
+def _coloured(lights: Lights, config: SceneConfig) -> Lights:
+    """Add the window, and colours whose mean over the channels is 1."""
+    window = config.window * normalize(torch.tensor(_WINDOW, dtype=torch.float64), dim=0)
+    generator = _generator(config.seed, _COLOUR)
+    drawn = torch.randn(len(lights.irradiance), 3, generator=generator, dtype=torch.float64)
+    colour = (config.lamp_colour * drawn).exp()
+    return lights.replace(
+        window=window if config.window > 0 else None,
+        colour=colour / colour.mean(dim=1, keepdim=True) if config.lamp_colour > 0 else None,
+    )
 
 
 def _environments(

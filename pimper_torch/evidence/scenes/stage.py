@@ -145,11 +145,14 @@ class Stage:
         flashed = spots.object_index >= 0
         if flash is not None and point_light.flash > 0:
             flashed = self.lit(spots.points, spots.normals, flash)
-        received = torch.full_like(specular, point_light.ambient)
+        window = point_light.from_window(spots.normals)
+        received = torch.full_like(specular, point_light.ambient).add(window)[:, None]
         mirrored = torch.zeros_like(spots.points)
-        for position, irradiance, reached in (
-            (point_light.position, point_light.irradiance, lit),
-            (flash_position, point_light.flash, flashed),
+        white = torch.ones_like(specular[:1])
+        colour = white if point_light.colour is None else point_light.colour
+        for position, irradiance, reached, tone in (
+            (point_light.position, point_light.irradiance, lit, colour),
+            (flash_position, point_light.flash, flashed, white),
         ):
             if irradiance == 0:
                 continue
@@ -157,11 +160,10 @@ class Stage:
             matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
             half = normalize(toward + to_eye, dim=-1)
             tint = self._tint(spots.object_index, (half * toward).sum(dim=-1))
-            received = received + torch.where(reached, arriving * matte, 0)
-            mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint
-        total = received[:, None]
+            received = received + torch.where(reached, arriving * matte, 0)[:, None] * tone
+            mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint * tone
         if indirect is not None:
-            total = total + spots.hits.interpolate(indirect, self.mesh.faces)
+            received = received + spots.hits.interpolate(indirect, self.mesh.faces)
         (metal,) = torch.nonzero(
             self._metal[spots.object_index] & (spots.object_index >= 0), as_tuple=True
         )
@@ -170,7 +172,7 @@ class Stage:
                 spots, metal, to_eye[metal], point_light, indirect, flash_position, bounces - 1
             )
             mirrored = mirrored.index_add(0, metal, seen)
-        return Shaded(matte=spots.albedo * total, mirrored=mirrored, lit=lit)
+        return Shaded(matte=spots.albedo * received, mirrored=mirrored, lit=lit)
 
     def _mirrored(
         self,

@@ -125,6 +125,24 @@ def test_a_flash_lights_what_faces_the_camera_without_shadows():
     assert (scene.views.images > 0.2).all()
 
 
+def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
+    window = torch.tensor([0.3, 0.0, 0.4], dtype=torch.float64)
+    colour = torch.tensor([[1.2, 1.0, 0.8]], dtype=torch.float64)
+    lights = point_light(
+        [0.0, 0.0, 2.0],
+        irradiance=torch.tensor([0.2], dtype=torch.float64),
+        window=window,
+        colour=colour,
+    )
+    generator = torch.Generator().manual_seed(66)
+    scene = render_objects(
+        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
+    )
+    soft = 0.5 * ((1 + 0.8) / 2) ** 2
+    expected = torch.tensor([0.24, 0.2, 0.16]) + soft
+    assert_close(scene.views.images[0, :, 15, 15], expected, atol=1e-4, rtol=0)
+
+
 def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
     matte = SceneObject(mesh=table(3.0), texture=white)
     glossy = SceneObject(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)

@@ -1,0 +1,51 @@
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.photometry.light_colour import light_colours
+
+
+def scene(generator, views=8, samples=900):
+    """Radiance, what is seen, and the factors of the views: each sees a third, as on an arc."""
+    albedo = 0.2 + 0.6 * torch.rand(samples, 1, 3, generator=generator, dtype=torch.float64)
+    shading = 0.3 + torch.rand(samples, views, 1, generator=generator, dtype=torch.float64)
+    colour = (0.3 * torch.randn(views, 3, generator=generator, dtype=torch.float64)).exp()
+    place = torch.arange(samples)[:, None] / samples
+    seen = (place - torch.arange(views) / (views - 1)).abs() < 0.33
+    return albedo * shading, seen, colour
+
+
+def test_colours_are_found_up_to_those_of_the_albedo_whatever_the_shading(generator):
+    white, seen, colour = scene(generator)
+    found = light_colours(torch.where(seen[..., None], white * colour, torch.nan), seen)
+    ratio = (found / colour).log()
+    ratio = ratio - ratio.mean(dim=1, keepdim=True)  # brightness is the light's
+    assert_close(ratio, ratio.mean(dim=0).expand(8, 3), rtol=0, atol=2e-3)
+    common = found.log().mean(dim=0)
+    assert_close(common, common.mean().expand(3))
+
+
+def test_colours_leave_the_brightness_of_a_view(generator):
+    white, seen, colour = scene(generator)
+    seen = torch.ones_like(seen)
+    tinted = white * colour
+    found = light_colours(tinted, seen)
+    before, after = tinted.mean(dim=2).mean(dim=0), (tinted / found).mean(dim=2).mean(dim=0)
+    assert_close(before, after, rtol=0.02, atol=0)  # of the mean albedo, not of every view's
+
+
+def test_light_of_one_colour_is_white_though_noise_would_fit_another(generator):
+    white, seen, colour = scene(generator)
+    noise = 0.05 * torch.randn(white.shape, generator=generator, dtype=torch.float64)
+    found = light_colours(white * (1 + noise) * colour[:1], seen)
+    assert (found == 1).all()
+
+
+def test_gross_outliers_and_black_samples_do_not_tint(generator):
+    white, seen, colour = scene(generator)
+    tinted = white * colour
+    tinted[::7] = torch.rand(tinted[::7].shape, generator=generator).double()
+    tinted[3::11] = 0
+    found = light_colours(tinted, seen)
+    ratio = (found / colour).log()
+    ratio = ratio - ratio.mean(dim=1, keepdim=True)
+    assert (ratio - ratio.mean(dim=0)).abs().max() < 0.02
