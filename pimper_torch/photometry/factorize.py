@@ -493,8 +493,10 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
     found = []
     for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
         rows = rows_of(templates, registered, own)
-        centre = invert_rigid(templates.patch_from_world.to(own))[:, :3, 3]
-        lights = rotate_lights(templates.patch_from_world.to(own), field.lights_at(centre))
+        patch_from_world = templates.patch_from_world.to(own)
+        centre = invert_rigid(patch_from_world)[:, :3, 3]
+        lights = field.lights_at(centre, -patch_from_world[:, 2, :3])
+        lights = rotate_lights(patch_from_world, lights)
         gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
         some = rows.seen & (predicted > 0)
