@@ -1,5 +1,6 @@
 """What a run tells about its stages: time, memory, and the figures of each record."""
 
+import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import singledispatch
 from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from pimper_torch.geometry.topology import boundary_loops
@@ -25,6 +27,7 @@ from pimper_torch.records import (
     SparseScene,
     StageReport,
     Surface,
+    SweptPatches,
 )
 from pimper_torch.silhouettes.contours import Contours
 
@@ -298,6 +301,31 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
         "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
         "mean_residual": sum(float(end.residual.detach().sum()) for end in ended) / count,
     }
+
+
+@figures.register
+def _(swept: SweptPatches) -> dict[str, int | float]:
+    """Return how far priors are from what photographs tell, over what both claim; 1 is right."""
+    angles, normals, depths = [], [], []
+    for light, height in zip(swept.photometric.buckets, swept.buckets, strict=True):
+        if (guess := height.priors) is not None:
+            both = light.valid & (guess.normal_information > 0)
+            square = (guess.normals_patch - light.normals_patch)[both].square().sum(dim=-1)
+            claim = 1 / guess.normal_information[both] + 1 / light.information[both]
+            angles.append(square.detach())
+            normals.append((square / claim).detach())
+            both = (height.information > 0) & (guess.offset_information > 0)
+            square = (guess.offset - height.offset)[both].square()
+            claim = 1 / guess.offset_information[both] + 1 / height.information[both]
+            depths.append((square / claim).detach())
+    told: dict[str, int | float] = {}
+    if sum(map(len, normals)):
+        # Medians of squares of Gaussian noise in two components, and in one.
+        told["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
+        told["prior_normals_over_claim"] = float(torch.cat(normals).median() / math.log(2)) ** 0.5
+    if sum(map(len, depths)):
+        told["prior_depths_over_claim"] = float(torch.cat(depths).median() / 0.4549) ** 0.5
+    return told
 
 
 @figures.register

@@ -234,7 +234,8 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/priors.md", 2): photographs_and_maps,
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): a_scene_and_a_mesh,
-    ("docs/extending.md", 2): a_data_set_of_ones_own,
+    ("docs/extending.md", 2): a_scene_and_a_mesh,
+    ("docs/extending.md", 3): a_data_set_of_ones_own,
 }
 
 
@@ -253,7 +254,7 @@ def test_the_python_of_the_pages_runs(page, number, tmp_path, monkeypatch):
 
 def test_the_reader_of_the_pages_reads_the_cameras(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = run_block("docs/extending.md", 2, monkeypatch)
+    names = run_block("docs/extending.md", 3, monkeypatch)
     _, found = photographed()
     read = names["scene"].cameras
     torch.testing.assert_close(

@@ -6,12 +6,13 @@ are worked on side by side, and no more.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Protocol, runtime_checkable
 
+from pimper_torch.errors import caution
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.sources import Sources
 from pimper_torch.photometry.factorize import Illumination
@@ -29,6 +30,9 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import figures, stage
+
+# Priors that are so many times further off than claimed are warned of.
+_DOUBTED = 3.0
 
 
 @runtime_checkable
@@ -150,11 +154,30 @@ def photometry_and_heights(
         told["missing_fraction"] = 1 - sum(bucket.num_valid for bucket in found) / max(1, samples)
         told.update(figures(photometric))
         told.update(clock.fractions())
-    return SweptPatches(
-        photometric=photometric,
-        buckets=tuple(bucket.heights for bucket in found),
-        averaged=found[0].averaged,
-    )
+        swept = SweptPatches(
+            photometric=photometric,
+            buckets=tuple(bucket.heights for bucket in found),
+            averaged=found[0].averaged,
+        )
+        told.update(off := figures(swept))
+    warn_of_priors(off)
+    return swept
+
+
+def warn_of_priors(told: Mapping[str, int | float]) -> None:
+    """Warn of priors that are far from what the photographs tell.
+
+    Args:
+        told: Figures of the swept patches.
+    """
+    for what in ("normals", "depths"):
+        over = told.get(f"prior_{what}_over_claim", 0.0)
+        if over > _DOUBTED:
+            caution(
+                f"Prior {what} are {over:.1f} times as far from what the photographs tell as both "
+                "claim: they count for less. Look whether they are of these photographs, and how "
+                "far off they are said to be."
+            )
 
 
 @dataclass(slots=True)

@@ -1,4 +1,5 @@
 import math
+import warnings
 from functools import cache
 
 import pytest
@@ -7,14 +8,16 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.chains.streaming import warn_of_priors
 from pimper_torch.coarse.remesh import Remesh
-from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.terms import ContourRays, KeptSlopes, Normals, SweptHeights, Term
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
+from pimper_torch.reporting import figures
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
 
@@ -463,6 +466,8 @@ def guessed(lifted, given, lean: float, error_deg: float):
             normal_information=torch.full_like(own.offset, math.radians(error_deg) ** -2),
             offset=torch.zeros_like(own.offset),
             offset_information=torch.zeros_like(own.offset),
+            albedo=torch.zeros_like(own.offset),
+            albedo_variance=torch.full_like(own.offset, math.inf),
         )
         buckets.append(own.replace(priors=priors))
     return given.replace(buckets=tuple(buckets))
@@ -503,3 +508,17 @@ def test_guessed_normals_tell_slopes_where_light_tells_none(swept):
     along = along / float(given.patches.buckets[0].spacing[0])
     slope = ((along - along.mean()) * away).mean() / along.var(correction=0)
     assert -0.1 < slope < -0.08  # kept slopes stand beside it
+
+
+def test_a_run_tells_how_far_guesses_are_from_the_photographs_and_warns(swept):
+    lifted, given = swept(0.5)
+    assert figures(given) == {}
+    right = figures(guessed(lifted, given, lean=0.0, error_deg=1.0))
+    assert right["prior_normals_deg"] < 0.1
+    wrong = figures(guessed(lifted, given, lean=0.3, error_deg=1.0))
+    assert abs(wrong["prior_normals_deg"] - math.degrees(math.atan(0.3))) < 0.5
+    with pytest.warns(PimperWarning, match=r"Prior normals are 7\.0 times"):
+        warn_of_priors(wrong)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_priors(right)
