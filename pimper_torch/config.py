@@ -39,7 +39,6 @@ def require_at_most(config: object, section: str = "", /, **most: int | float) -
     """Refuse values above the bounds of their fields: slips that no memory or time suffices for.
 
     Args:
-        section: Of the config, for the message.
         most: The largest value of each field.
 
     Raises:
@@ -94,7 +93,6 @@ def require_ranges(config: object, section: str = "") -> None:
 
     Args:
         config: Whose fields they are; ``None`` is in every range.
-        section: Of the config, for the message.
 
     Raises:
         ConfigError: Names the field, its value and the bound.

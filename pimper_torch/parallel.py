@@ -43,7 +43,6 @@ def side_by_side(
 
     Args:
         work: Called in a worker thread.
-        items: What it is called with.
         tracked: Whether progress is reported after every result.
 
     Raises:

@@ -93,9 +93,6 @@ def depth_maps(
 ) -> tuple[DepthMaps, ...]:
     """Search every view's depths: the whole range at low resolution, then near what was found.
 
-    Args:
-        scene: Photographs, cameras and cloud.
-
     Returns:
         The maps of every resolution, the coarsest first.
 

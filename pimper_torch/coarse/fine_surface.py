@@ -100,8 +100,6 @@ class FineSurface(Record):
     """The surface before it is simplified to facets.
 
     Attributes:
-        vertices_world: Its vertices.
-        faces: Its faces.
         support: Of each, a value of :class:`~pimper_torch.records.Support`.
         pixel: Size of a pixel of the finest depth maps there, scene units.
     """
@@ -135,7 +133,6 @@ def fine_surface(
     illuminated in two views.
 
     Args:
-        scene: Photographs, cameras and cloud.
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
 
@@ -298,7 +295,6 @@ def near_points(
     the air beside it by strips along points, which the margin cuts through.
 
     Args:
-        counts: Of the views that see each.
         pixel: Size of one, scene units.
     """
     supported = support == Support.POINTS
@@ -319,7 +315,6 @@ def supports(
     """Return the :class:`~pimper_torch.records.Support` of each face of a fine surface.
 
     Args:
-        counts: Of the views that see each face.
         reach: Distance to a point, or a contour point, that supports a face.
     """
     found = torch.full_like(counts.seen, Support.NOTHING)
@@ -351,7 +346,6 @@ def seen_surface(
     strips along the border are dropped.
 
     Args:
-        counts: Of the views that see each.
         inside: True for faces in the visual hull.
         pixel: Size of one, scene units.
         fraction: Of the supported area, that a component needs.

@@ -85,7 +85,6 @@ def compare_with_scene(
     meet the mesh at the point, or nowhere, as those to the background do.
 
     Args:
-        mesh: In the scene's frame.
         silhouettes: Compared too where they are masks that came with the photographs.
 
     Returns:

@@ -62,7 +62,6 @@ class OrientedPoints(Record):
     """Points of surfaces with normals and noise.
 
     Attributes:
-        points_world: Positions.
         normals_world: Unit, towards the cameras.
         noise: Standard deviation along the normal, scene units.
     """
@@ -309,7 +308,6 @@ def sparse_oriented(
     neighbours lie on none is left out.
 
     Args:
-        scene: Cameras, cloud and tracks.
         reach: Distance to a dense point within which a sparse one is left out.
     """
     points = scene.points_world[index]

@@ -79,7 +79,6 @@ class CoarseSurface(Stage):
         """Make the coarse mesh of depth maps and silhouettes, or of a given mesh.
 
         Args:
-            scene: Photographs, cameras and cloud.
             contours: Of the silhouettes: all of the object gets facets, and nothing else does.
                 Where they constrain nothing, surface far from all points gets none.
             mesh: A surface in the scene's frame, used in place of the photographs' own.
@@ -132,7 +131,6 @@ def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh
     turned to the cameras. The number of faces stays: a chain wants some hundreds to thousands.
 
     Args:
-        mesh: In the scene's frame.
         scene: Cameras and photographs; points where it has some.
         reference: Name or stem of the frontal photograph; empty chooses it.
 

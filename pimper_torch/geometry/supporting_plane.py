@@ -24,7 +24,6 @@ class PlaneSearch:
         tolerance: Distance up to which a point lies on it, as a fraction of the cameras' distance.
         min_on: Fraction of the points that lie on it.
         max_below: Fraction of the points that may lie below it.
-        seed: Of the trials.
     """
 
     tolerance: float = 0.004

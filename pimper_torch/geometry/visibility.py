@@ -30,7 +30,6 @@ class Hits(Record):
     Attributes:
         face: Index of the face; -1 where the ray meets nothing.
         distance: Along the ray in units of its direction's length; infinite for a miss.
-        barycentric: Coordinates in the face.
     """
 
     face: Int[Tensor, "*batch"]
@@ -105,7 +104,6 @@ class RayCaster:
         """Find the first face each ray meets.
 
         Args:
-            origins: World.
             reach: How far each goes, in lengths of its direction; without, to infinity.
         """
         shape = directions.shape[:-1]
@@ -138,7 +136,6 @@ class RayCaster:
         """Return whether the mesh hides points from a camera.
 
         Args:
-            points: World.
             center: Of the camera, world.
             tolerance: A surface closer than this in front of the point does not count: it
                 is the surface the point itself lies on. Scene units.
@@ -157,7 +154,6 @@ class RayCaster:
         """Return whether a ray meets any face at all; several times as fast as its first one.
 
         Args:
-            origins: World.
             reach: How far each goes, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]

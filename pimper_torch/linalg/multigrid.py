@@ -35,7 +35,6 @@ class Iterate:
 
     Attributes:
         values: The solution, float64; one column a right-hand side where there are several.
-        iterations: Cycles taken.
     """
 
     values: Float[Tensor, "unknown ..."]
@@ -88,9 +87,6 @@ def solve_by_cycles(
 ) -> Iterate:
     """Solve as :func:`solve_with_hierarchy`, by kernels on the CPU, the hierarchy in float32.
 
-    Args:
-        matrix: A, float64, both triangles.
-
     Raises:
         SingularSystemError: See there.
     """
@@ -120,7 +116,6 @@ def _checked(
 
     Args:
         reached: Values, steps and whether they converged.
-        rhs: Right-hand side.
 
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.

@@ -19,10 +19,7 @@ class PreparedMatrix(ABC):
     must be given.
 
     Args:
-        rows: Row of each entry.
-        cols: Column of each entry.
         values: Of the entries; solutions are differentiable in them.
-        size: Rows of the square matrix.
         what: Names the system in errors, such as ``"the alignment"``.
 
     Raises:

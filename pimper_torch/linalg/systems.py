@@ -43,9 +43,7 @@ def prepare(
 
     Args:
         rows: Row of each entry; duplicate entries add up.
-        cols: Column of each entry.
         values: Of the entries; solutions are differentiable in them.
-        size: Rows of the square matrix.
         what: Names the system in errors.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
 
@@ -76,8 +74,6 @@ def solutions(
 
     Args:
         rows: As in :func:`prepare`.
-        sides: Right-hand sides, one at least.
-        what: Names the system in errors.
 
     Differentiable in ``values`` and in the sides.
 
@@ -105,11 +101,6 @@ def solve_compressed(
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
     """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients.
-
-    Args:
-        matrix: Symmetric positive definite; float64.
-        sides: Right-hand sides, float64, on the CPU.
-        what: Names the system in errors.
 
     Raises:
         SingularSystemError: See :func:`prepare`.

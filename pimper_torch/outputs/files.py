@@ -14,7 +14,6 @@ def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
     """Refuse, before the work, a file that cannot be written or is not ours.
 
     Args:
-        overwrite: Replace a former one.
         sign: Text that every file of this kind holds.
 
     Raises:

@@ -72,9 +72,6 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
     made for the block, and in which nothing was kept or written, is removed at its end. A block
     inside another one is part of it.
 
-    Args:
-        overwrite: As of :func:`prepare_output`.
-
     Yields:
         The folder, without links.
 
@@ -117,7 +114,6 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
 
     Args:
         folder: New, or empty but for what a former run kept; its parents are made.
-        overwrite: Replace a former result of that kind.
 
     Raises:
         OutputError: As :func:`held_output`, or the disk refuses on the way; then nothing stays

@@ -43,7 +43,6 @@ class Marker:
     """The list of a folder.
 
     Attributes:
-        kind: Which command wrote it.
         files: Relative to the folder, with slashes.
     """
 

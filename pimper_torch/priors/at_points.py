@@ -15,8 +15,6 @@ class AtPoints(Record):
     """Observations of points in views that have a map.
 
     Attributes:
-        point: Index in the cloud.
-        view: Of the scene.
         place: Map, row and column: the pixel of the map that shows the point.
         pixels: Of the undistorted photograph.
         depth: Of the point, along the camera's axis.

@@ -33,8 +33,6 @@ class Maps(NamedTuple):
     """Maps of photographs, of whatever kind.
 
     Attributes:
-        names: Of the photographs.
-        sizes_px: Width and height of each map.
         values: Padded with NaN.
         variance: NaN where nothing is said of it.
     """

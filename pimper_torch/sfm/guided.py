@@ -30,7 +30,6 @@ class Features(Record):
     """Features of one photograph.
 
     Attributes:
-        pixels: Where.
         descriptors: Of length 1, but for rounding.
     """
 
@@ -74,7 +73,6 @@ def match_guided(
     Args:
         space: With pairs matched and verified.
         pairs: Which; those that are not verified stay as they are.
-        settings: What counts as a match.
     """
     features: dict[int, Features] = {}
     with quiet(), loaded().Database.open(space.database) as stored:

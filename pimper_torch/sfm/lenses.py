@@ -18,7 +18,6 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
     of their own.
 
     Args:
-        sizes: Width and height of each.
         focals_px: Focal length of each; NaN where it is not known.
 
     Returns:

@@ -21,10 +21,6 @@ class SparseModel(Record):
     Attributes:
         names: Of the registered photographs.
         lenses: One a view, before undistortion.
-        cam_from_world: Rigid.
-        points_world: The cloud.
-        observation_point: Which point each observation sees.
-        observation_view: Which view it is made in.
         observation_pixels: Where, in the photograph before undistortion.
         background_from_view: Maps from pixels of each photograph, before undistortion, to those
             where the background is at rest before which the object turns; NaN where a view shows

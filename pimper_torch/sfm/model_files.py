@@ -61,10 +61,8 @@ class FileImage:
     """An image as its file has it.
 
     Attributes:
-        image: Its number.
         quaternion: Of ``cam_from_world``, real part first.
         translation: Of ``cam_from_world``.
-        camera: Number of its camera.
         name: Of its file.
         pixels: Of its features, ``feature 2``.
         points: The point that each sees; negative where none.
@@ -84,8 +82,6 @@ class FilePoints:
     """All points as their file has them.
 
     Attributes:
-        points: Their numbers.
-        xyz: Where they are, ``point 3``.
         track_point: Position in ``points`` of what each element of a track belongs to.
         track_image: Number of the image of each element.
         track_feature: Position among the features of that image.

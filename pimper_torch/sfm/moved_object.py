@@ -77,8 +77,6 @@ def find_moved_object(
     Of the two bodies the object is the one nearer to the middle of the photographs.
 
     Args:
-        keypoints: Pixels, one tensor a photograph.
-        sizes_px: Width and height of each.
         verified: Matches of each pair that its geometry explains.
         outside: Matches of the same pairs that it does not.
         max_error_px: Distance from the epipolar line up to which a match is verified.
@@ -128,8 +126,6 @@ def object_votes(
     Features that match are of one body, and so are those of one geometry in a pair that has two.
 
     Args:
-        keypoints: Pixels, one tensor a photograph.
-        sizes_px: Width and height of each.
         verified: Matches of each pair that its geometry explains.
         seconds: Matches of a second body, where there is one.
     """
@@ -169,7 +165,6 @@ def series_of(
 
     Args:
         verified: Matches of each pair that its geometry explains.
-        seconds: Matches of a second body, where there is one.
         votes: As of :func:`object_votes`.
 
     Source: greedy additive edge contraction of Keuper et al., Efficient Decomposition of Image and

@@ -20,9 +20,6 @@ _SCALE_PX, _TOLERANCE = 1.0, 1e-5
 def doubt_one_lens(model: SparseModel) -> str:
     """State why photographs were taken with several lenses, if a lens each fits much better.
 
-    Args:
-        model: Adjusted.
-
     Returns:
         The reason, and what to do; empty where nothing speaks against the model's lenses.
     """

@@ -37,9 +37,6 @@ def turned_pixels(
 ) -> Float[Tensor, "*batch 2"]:
     """Return where pixels are after clockwise quarter turns of their picture.
 
-    Args:
-        quarters: Any whole number.
-
     >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
     tensor([5., 3.])
     """

@@ -213,7 +213,6 @@ class Reconstruct(Stage):
         """Place the photographs.
 
         Args:
-            views: At least 3.
             sparse_model: Folder of a COLMAP model, or a file of cameras (``transforms.json``,
                 Metashape, Meshroom, arrays), to take instead of running structure from motion.
                 Views are matched by file name; the cameras may have been made from photographs of
@@ -313,9 +312,6 @@ def kept_model(
 ) -> tuple[SparseModel, float]:
     """Take a model that was kept, or find one and keep it; what was warned of is warned of again.
 
-    Args:
-        store: Where; without it, or a key, nothing is kept.
-
     Returns:
         The model, and the seconds of wall clock in which it was found.
     """
@@ -341,9 +337,6 @@ def kept_model(
 
 def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:
     """Find features, match them, grow a model and find its points again in every view.
-
-    Args:
-        views: At least 3.
 
     Returns:
         The model of the registered views, in the photographs' order and under their names.

@@ -51,7 +51,6 @@ class TrackSettings:
     """How tracks are refined.
 
     Attributes:
-        iterations: Of finding points again and adjusting cameras.
         fewest_points: A view that shows fewer of the points that were found keeps its features.
         track_observations: When a point counts as found.
     """
@@ -73,7 +72,6 @@ def refine_tracks(
 
     Args:
         views: The photographs, in the model's order.
-        model: As structure from motion found it.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:

@@ -50,7 +50,6 @@ class RegistrationSettings:
     """How photographs are registered.
 
     Attributes:
-        matching: What counts as a match.
         mapping: How views are added to a model; ``pairs_count`` and further seeds are set by the
             pass.
         guided_pairs: Strongest pairs of each photograph that are matched along epipolar lines,

@@ -41,7 +41,6 @@ def poisson_surface(
 
     Args:
         points: On the surface, any unit.
-        normals: Outward.
         depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
             cells; 5 at least.
         point_weight: Of the points against the smoothness.

@@ -116,8 +116,6 @@ class TrackObservations(Record):
     """Where views show points.
 
     Attributes:
-        point: Which.
-        view: In which.
         pixels: Where, in the undistorted photograph.
     """
 
@@ -169,10 +167,6 @@ def sight(
 
     A point's place in its reference view is where the cameras put it: there the template is
     taken. In the other views it is where the same patch is found.
-
-    Args:
-        cameras: Theirs, float64.
-        settings: When a point counts as found.
 
     Returns:
         Sorted by point, then view; the reference's own is there where another view found

@@ -58,8 +58,6 @@ class TriangulationSettings:
     """How points are found.
 
     Attributes:
-        features: What counts as one.
-        matching: What counts as a match.
         guided_pairs: Of each photograph, that are matched along epipolar lines.
         tracks: How points are found again in every view; cameras are held fixed.
     """

@@ -26,10 +26,7 @@ class Contours(Record):
     """Rays that the surface is tangent to, and the hull that it lies in.
 
     Attributes:
-        silhouettes: Of all views.
         rays: Through the silhouettes of all reliable views.
-        cameras: Of all views.
-        hull: The visual hull of the same silhouettes.
     """
 
     silhouettes: Silhouettes

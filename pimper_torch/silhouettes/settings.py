@@ -44,7 +44,6 @@ class SilhouetteDetails:
         iterations: Of cutting and voting after the first cut.
         num_voxels: Of the visual hull.
         disagreeing: Fraction of the views that may see a voxel of the hull outside.
-        plane: What counts as the supporting plane.
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not reliable.
         max_exposed: Fraction of a view's silhouette that may show a background for certain: the

@@ -68,7 +68,6 @@ def contour_points(
     Args:
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
             any, positions are in the centre of what is in the hull.
-        normals_world: Theirs, unit, outward.
 
     Returns:
         At most one place a ray. A ray has none where it does not meet the hull, and where

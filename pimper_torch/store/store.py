@@ -51,9 +51,6 @@ class Store:
     def find(self, key: str, cls: type[AnyRecord]) -> tuple[AnyRecord, dict[str, Any]] | None:
         """Read a record; ``None`` where there is none, or a damaged one.
 
-        Args:
-            key: As it was kept under.
-
         Returns:
             The record, bit for bit and settled, and what was said when it was kept.
         """
