@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,7 +24,7 @@ from pimper_torch.coarse.trim import (
     view_counts,
     without_small_holes,
 )
-from pimper_torch.config import require
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import connected_to, face_components
@@ -87,12 +88,11 @@ class FineSurfaceConfig:
             such as the bottom of a deep concavity, to be closed.
     """
 
-    hole_px: float = 24.0
-    max_unseen: float = 0.02
+    hole_px: Annotated[float, Range(least=0)] = 24.0
+    max_unseen: Annotated[float, Range(least=0, below=1)] = 0.02
 
     def __post_init__(self) -> None:
-        require(self.hole_px >= 0, "fine_surface.hole_px", self.hole_px, "0 or more")
-        require(0 <= self.max_unseen < 1, "fine_surface.max_unseen", self.max_unseen, "in [0, 1)")
+        require_ranges(self, "fine_surface")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -14,9 +14,6 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
 
     Args:
         name: File name or stem; empty chooses the view.
-
-    Raises:
-        InputError: No view, or more than one, has that name.
     """
     if not name:
         observed = scene.observed.to(scene.points_world.dtype)
@@ -26,11 +23,7 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
 
 
 def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
-    """Find the one photograph of a name, with its suffix or without.
-
-    Raises:
-        InputError: None, or more than one, has that name.
-    """
+    """Find the one photograph of a name, with its suffix or without."""
     found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
     if len(found) != 1:
         raise InputError(

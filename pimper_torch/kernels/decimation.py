@@ -243,9 +243,6 @@ def _placed(
         index: The neighbour that the vertex is collapsed on.
         step_of: Result: the new face of each, counted around the neighbour from 1.
         errors: Result: distance and cosine of each.
-
-    Returns:
-        Whether all are within bounds.
     """
     count = len(ring)
     for item in range(len(removed)):

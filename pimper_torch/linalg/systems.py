@@ -8,7 +8,8 @@ from torch import Tensor
 
 from pimper_torch.failures import reason_of, skipped
 from pimper_torch.linalg.aggregation import parts_of
-from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_by_cycles
+from pimper_torch.linalg.multigrid import Multigrid, solve_by_cycles
+from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.sums import total
@@ -47,9 +48,6 @@ def prepare(
         what: Names the system in errors.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
 
-    Returns:
-        What ``solve(rhs)`` is called on.
-
     Raises:
         SingularSystemError: See :class:`~pimper_torch.linalg.sparse.SparseCholesky` and
             :class:`~pimper_torch.linalg.multigrid.Multigrid`.
@@ -76,9 +74,6 @@ def solutions(
         rows: As in :func:`prepare`.
 
     Differentiable in ``values`` and in the sides.
-
-    Raises:
-        SingularSystemError: See :func:`prepare`.
     """
     size = len(sides[0])
     prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
@@ -100,11 +95,7 @@ def solve_compressed(
     tolerance: float,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
-    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients.
-
-    Raises:
-        SingularSystemError: See :func:`prepare`.
-    """
+    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""
     from pimper_torch.kernels import aggregation as kernels
 
     diagonal = torch.from_numpy(matrix.diagonal())

@@ -15,9 +15,6 @@ def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
 
     Args:
         sign: Text that every file of this kind holds.
-
-    Raises:
-        OutputError: Something is there, or the path lies in no folder.
     """
     require_name(path.resolve(), OutputError)
     if path.is_dir():

@@ -39,9 +39,6 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
         folder: New, or empty but for what a former run kept.
         overwrite: Replace a former result of that kind, if nothing but its own files is there, as
             they were written.
-
-    Raises:
-        OutputError: The folder already holds something, is a file, or cannot be made.
     """
     folder = Path(folder)
     require_name(folder.resolve(), OutputError)
@@ -183,9 +180,6 @@ def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None
 
     Args:
         inputs: By what they are called. Links are followed.
-
-    Raises:
-        InputError: One is the folder, or lies in it.
     """
     target = Path(folder).resolve()
     for name, path in inputs.items():

@@ -120,11 +120,7 @@ def depth_from(
 
 
 def variance_of(maps: Maps, known: Tensor, default: Tensor | float) -> Tensor:
-    """Return the variance that comes along, or the default; infinite where nothing is known.
-
-    Raises:
-        InputError: Nothing is known anywhere.
-    """
+    """Return the variance that comes along, or the default; infinite where nothing is known."""
     if not bool(known.any()):
         low, high = maps.values.norm(dim=-1).nan_to_num(0).aminmax()
         raise InputError(

@@ -57,9 +57,6 @@ def find_features(
         focals_px: Focal length of each photograph where it is known before. A camera shared by
             several photographs gets their median.
         lenses: Number of each photograph's lens; those of one lens have one size.
-
-    Returns:
-        How many features each photograph has.
     """
     pycolmap = loaded()
 

@@ -105,9 +105,6 @@ def guided_matches(
 
     Args:
         max_ratio: Of the angles between a descriptor and the two most like it.
-
-    Returns:
-        Features that are each other's best match.
     """
     one, other = likeness(first, second, near)
     (some,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)

@@ -52,9 +52,6 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
         views: Photographs, see :func:`sensor_turns`.
         shared: One lens was asked for.
         own: One each was asked for.
-
-    Raises:
-        InputError: One lens for photographs of unlike sizes.
     """
     if own:
         return list(range(views.num_views))
