@@ -67,8 +67,6 @@ class DepthMaps(Record):
 
     Attributes:
         factor: Pixels of the photographs along a side of one here.
-        level: The photographs at that resolution.
-        inverse_depth: Of every pixel, valid or not.
         agreed: How many other views agree; 0 where the windows do not match.
         valid: True where enough of them agree, and the windows match.
         step: Change of inverse depth that moves a pixel by one in the sources; one a view.

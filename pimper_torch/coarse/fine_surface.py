@@ -189,11 +189,6 @@ def closed_surface(
     it: they are found in turn, from the points on. Parts that no camera sees do not count:
     behind an object seen from one side the hull is deep, and the surface fills it.
 
-    Args:
-        cloud: Matched points inside the silhouettes.
-        contours: Rays and visual hull of the same silhouettes.
-        pixel: Size of one, scene units.
-
     Returns:
         Vertices, faces, and the contour points that the surface goes through.
 
@@ -293,9 +288,6 @@ def near_points(
     A component of faces further than the margin from all points is not marked if one of them is
     further than the gap: surface that spans a gap inside the object is joined to surface in
     the air beside it by strips along points, which the margin cuts through.
-
-    Args:
-        pixel: Size of one, scene units.
     """
     supported = support == Support.POINTS
     distance = point_distances(centre, cloud.points_world)
@@ -347,7 +339,6 @@ def seen_surface(
 
     Args:
         inside: True for faces in the visual hull.
-        pixel: Size of one, scene units.
         fraction: Of the supported area, that a component needs.
     """
     known = support >= Support.CONTOUR

@@ -11,9 +11,6 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
 
     Each other view counts with the square root of the number of points shared, so that many
     views at the side weigh more than one close twin.
-
-    Args:
-        name: File name or stem; empty chooses the view.
     """
     if not name:
         observed = scene.observed.to(scene.points_world.dtype)

@@ -129,7 +129,6 @@ def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh
     turned to the cameras. The number of faces stays: a chain wants some hundreds to thousands.
 
     Args:
-        scene: Cameras and photographs; points where it has some.
         reference: Name or stem of the frontal photograph; empty chooses it.
 
     Raises:

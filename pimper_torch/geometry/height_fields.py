@@ -76,7 +76,6 @@ def intersect_height_field(
 
     Args:
         depth: z, patch frame; what invalid samples hold does not matter.
-        valid: True where there is a height field.
         ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
             float64 rays meet a float32 height field in float64.
         ray_directions: Any length and sign; the ray is the whole line.

@@ -97,11 +97,6 @@ def supporting_plane(
 ) -> Plane | None:
     """Find the plane that the object stands on, by RANSAC.
 
-    Args:
-        points_world: Well tracked.
-        eyes_world: The cameras' centres, all on its upper side.
-        distance: Of the cameras from what they look at.
-
     Returns:
         ``None`` where no plane has enough points on it and few enough below. Among those that
         do, the one with most points, refitted to them.

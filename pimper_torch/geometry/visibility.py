@@ -53,9 +53,6 @@ class Hits(Record):
     ) -> "Hits":
         """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
 
-        Args:
-            vertices: Of the mesh that was hit.
-
         Differentiable in vertices, origins and directions. A ray that lies in the plane of its
         face keeps what ray casting gave.
         """
@@ -136,7 +133,6 @@ class RayCaster:
         """Return whether the mesh hides points from a camera.
 
         Args:
-            center: Of the camera, world.
             tolerance: A surface closer than this in front of the point does not count: it
                 is the surface the point itself lies on. Scene units.
         """

@@ -238,8 +238,6 @@ def _placed(
 
     Args:
         points: See :func:`decimate`, as for the three that follow.
-        values: Normals and attributes.
-        cosine: Of the angle between normals.
         index: The neighbour that the vertex is collapsed on.
         step_of: Result: the new face of each, counted around the neighbour from 1.
         errors: Result: distance and cosine of each.
@@ -315,7 +313,6 @@ def decimate(
 
     Args:
         values: Unit normals, then attributes in units of their tolerance.
-        cosine: Of the angle between normals.
         free: Vertices that may be removed.
         candidates: Whether a vertex is to be tried; updated.
         faces: Updated: removed faces have -1 in their first slot.

@@ -57,7 +57,6 @@ class Near:
     Attributes:
         matrix: Fundamental matrix, or homography from the first photograph to the second.
         max_error_px: Largest distance: Sampson's from the epipolar line, or from the mapped point.
-        planar: Whether it is a homography.
     """
 
     matrix: Float[Tensor, "3 3"]

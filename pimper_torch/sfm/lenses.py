@@ -50,8 +50,6 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
 
     Args:
         views: Photographs, see :func:`sensor_turns`.
-        shared: One lens was asked for.
-        own: One each was asked for.
     """
     if own:
         return list(range(views.num_views))

@@ -134,10 +134,6 @@ def match_names(
     A model's image may lie in a subfolder, and its name may have been rewritten by another program:
     see :func:`~pimper_torch.file_names.match_files`.
 
-    Args:
-        where: The model came from, for the message.
-        photographs: Path of the folder that they lie in.
-
     Raises:
         InputError: No photograph is in the model, or a name may be any of several.
     """

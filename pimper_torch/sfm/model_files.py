@@ -62,8 +62,6 @@ class FileImage:
 
     Attributes:
         quaternion: Of ``cam_from_world``, real part first.
-        translation: Of ``cam_from_world``.
-        name: Of its file.
         pixels: Of its features, ``feature 2``.
         points: The point that each sees; negative where none.
     """

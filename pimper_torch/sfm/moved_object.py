@@ -124,10 +124,6 @@ def object_votes(
     """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
     Features that match are of one body, and so are those of one geometry in a pair that has two.
-
-    Args:
-        verified: Matches of each pair that its geometry explains.
-        seconds: Matches of a second body, where there is one.
     """
     inside = [
         1 - 2 * ((pixels - size / 2) / size).norm(dim=1)
@@ -162,10 +158,6 @@ def series_of(
     Correlation clustering: pairs in which one geometry explains features of both bodies attract,
     pairs that show two bodies repel, and pairs that match otherwise attract where nothing else
     tells.
-
-    Args:
-        verified: Matches of each pair that its geometry explains.
-        votes: As of :func:`object_votes`.
 
     Source: greedy additive edge contraction of Keuper et al., Efficient Decomposition of Image and
     Mesh Graphs by Lifted Multicuts, ICCV 2015.

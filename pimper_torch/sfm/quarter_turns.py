@@ -84,8 +84,6 @@ def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]
     """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
 
     Args:
-        width: Of what is cut out.
-        height: Of what is cut out.
         corner: Its pixel in the whole picture.
     """
     values, focals = list(lens.params), _focals(lens)

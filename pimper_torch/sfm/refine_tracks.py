@@ -52,7 +52,6 @@ class TrackSettings:
 
     Attributes:
         fewest_points: A view that shows fewer of the points that were found keeps its features.
-        track_observations: When a point counts as found.
     """
 
     iterations: int
@@ -71,7 +70,6 @@ def refine_tracks(
     Rounds before the last find a part of the points, for cameras alone.
 
     Args:
-        views: The photographs, in the model's order.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:

@@ -29,9 +29,6 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     points that are not finite; and observations that name an image or a feature that is not
     there, or not each other.
 
-    Args:
-        folder: Of the model, for messages.
-
     Raises:
         InputError: More than half of the images or points are broken: says why.
     """

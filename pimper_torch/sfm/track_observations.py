@@ -130,8 +130,6 @@ class _Templates(Record):
 
     Attributes:
         values: Light taken out; the window's square root is in them.
-        slopes: By a step along the plane.
-        inverse: Of the slopes' normal equations.
         usable: True where the reference shows nearly all of the patch, with texture.
     """
 

@@ -26,7 +26,6 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 
     Args:
         views: Any; padding stays zero.
-        lenses: One a view, of the photograph's size.
 
     Returns:
         The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
@@ -152,9 +151,6 @@ def photograph_pixels(
     lens: Lens, width: int = 0, height: int = 0
 ) -> Float[Tensor, "height width 2"]:
     """Find where in the photograph each pixel of its pinhole image comes from.
-
-    Args:
-        width: Of a map that covers the photograph; the photograph's by default.
 
     Returns:
         In pixels of the map, float64; NaN where the lens cannot image the direction.

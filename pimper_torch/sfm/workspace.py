@@ -27,7 +27,6 @@ class Workspace:
         files: Names of the photographs in ``images``, in the order of the views.
         masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
             behind, as COLMAP wants them.
-        database_name: File of COLMAP's database.
     """
 
     folder: Path
