@@ -41,13 +41,7 @@ def at_points(
     pixels, depth = pixels[:, 0], depth[:, 0]
     place, within = places(prior, scene, view, pixels)
     within &= known[place.unbind(dim=-1)] & (depth > 0)
-    return AtPoints(
-        point=point[within],
-        view=view[within],
-        place=place[within],
-        pixels=pixels[within],
-        depth=depth[within],
-    )
+    return AtPoints(point=point, view=view, place=place, pixels=pixels, depth=depth).take(within)
 
 
 def places(

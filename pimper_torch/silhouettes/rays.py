@@ -92,14 +92,7 @@ def contour_rays(
         )
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
-    found = [_nothing(cameras), *side_by_side(of_view, views)]
-    return ContourRays(
-        view=torch.cat([one.view for one in found]),
-        pixels=torch.cat([one.pixels for one in found]),
-        rays_world=torch.cat([one.rays_world for one in found]),
-        normals_world=torch.cat([one.normals_world for one in found]),
-        sigma_px=torch.cat([one.sigma_px for one in found]),
-    )
+    return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])
 
 
 def _nothing(cameras: Cameras) -> ContourRays:
