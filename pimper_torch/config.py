@@ -26,35 +26,9 @@ _MAX_BYTES = 1_000_000  # all settings with comments take 20 kB
 
 
 def require(ok: bool, field: str, value: object, needed: str) -> None:
-    """Refuse an impossible setting.
-
-    Raises:
-        ConfigError: Names the field, its value and what was needed.
-    """
+    """Refuse an impossible setting."""
     if not ok:
         raise ConfigError(f"{field} is {value!r}; needed: {needed}.")
-
-
-def require_at_most(config: object, section: str = "", /, **most: int | float) -> None:
-    """Refuse values above the bounds of their fields: slips that no memory or time suffices for.
-
-    Args:
-        section: Of the config, for the message.
-        most: The largest value of each field.
-
-    Raises:
-        ConfigError: Names the field, its value and the bound.
-
-    >>> from pimper_torch.coarse.densify import DensifyConfig
-    >>> require_at_most(DensifyConfig(), "densify", levels=2)
-    Traceback (most recent call last):
-        ...
-    pimper_torch.errors.ConfigError: densify.levels is 3; needed: 2 at most.
-    """
-    for name, bound in most.items():
-        value = getattr(config, name)
-        field = f"{section}.{name}" if section else name
-        require(value <= bound, field, value, f"{bound:,.12g} at most")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,10 +68,6 @@ def require_ranges(config: object, section: str = "") -> None:
 
     Args:
         config: Whose fields they are; ``None`` is in every range.
-        section: Of the config, for the message.
-
-    Raises:
-        ConfigError: Names the field, its value and the bound.
     """
     for name, hint in typing.get_type_hints(type(config), include_extras=True).items():
         for mark in getattr(hint, "__metadata__", ()):

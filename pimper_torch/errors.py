@@ -49,7 +49,6 @@ def caution(message: str, stacklevel: int = 1) -> None:
     """Warn of something, at once or, inside :func:`held`, when the block's owner says so.
 
     Args:
-        message: Of the :class:`PimperWarning`.
         stacklevel: As of :func:`warnings.warn`, counted from the caller.
     """
     for listener in _listeners.get():

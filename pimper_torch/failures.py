@@ -177,7 +177,6 @@ def over_patches(
 
     Args:
         work: Called with a range of patches; gives their record.
-        facets: One for each patch.
         lost: Gives the record of a patch that failed.
         done: What that means, for the warning.
 

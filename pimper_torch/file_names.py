@@ -27,8 +27,6 @@ def match_files(
     the end on; where some folders agree, a file from another folder is not taken.
 
     Args:
-        wanted: Names, all different.
-        present: Names that they are looked for in.
         folder: Path that wanted names lie under.
         where: Where the present ones are, for the message.
         what: What the present ones are called there.

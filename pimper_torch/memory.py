@@ -26,9 +26,6 @@ _UNITS = {"MB": 10**6, "GB": 10**9}
 def bytes_of(size: str, field: str = "max_memory") -> float:
     """Read a size such as ``4GB`` or ``800 MB``; infinite where nothing is said.
 
-    Raises:
-        ConfigError: It is none.
-
     >>> bytes_of("1.5 GB")
     1500000000.0
     """
@@ -47,9 +44,6 @@ def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -
         limit: Bytes that the process may hold.
         scale: Of the photographs in that round.
         last: Of the photographs in the last one.
-
-    Raises:
-        ReconstructionError: Says what would be needed, and what to do.
     """
     if math.isinf(limit):
         return

@@ -43,7 +43,6 @@ def side_by_side(
 
     Args:
         work: Called in a worker thread.
-        items: What it is called with.
         tracked: Whether progress is reported after every result.
 
     Raises:
@@ -70,9 +69,6 @@ def over_rows(
     Args:
         kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
         size: How many rows of usual work one of them is.
-
-    Returns:
-        What the calls returned, in the order of the rows.
     """
     workers = num_workers() if rows * size >= _WORTHWHILE_ROWS else 1
     bounds = [rows * part // workers for part in range(workers + 1)]

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import pimper_torch
-from pimper_torch.config import Range, build, require_at_most, require_ranges, to_yaml
+from pimper_torch.config import Range, build, require_ranges, to_yaml
 from pimper_torch.errors import ConfigError
 
 ABSURD = (10**11, -1, 0, math.nan, math.inf)
@@ -116,19 +116,6 @@ def test_every_config_is_looked_at():
     assert len(NUMBERS) > 100
     listed = {f"{kind.__name__}.{name}" for kind, name, _ in NUMBERS}
     assert listed >= MAY_BE_INFINITE | {*AMOUNTS}
-
-
-@dataclasses.dataclass(frozen=True)
-class Some:
-    count: int = 3
-
-
-def test_the_bound_itself_is_allowed():
-    require_at_most(Some(), count=3)
-    with pytest.raises(ConfigError, match=r"some.count is 3; needed: 2 at most"):
-        require_at_most(Some(), "some", count=2)
-    with pytest.raises(ConfigError, match="count is nan"):
-        require_at_most(Some(count=math.nan), count=2)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,3 @@
-import re
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -233,26 +232,6 @@ def test_settings_say_which_chain_they_are_for():
         load_config("default", {"chain": "other"})
     with pytest.raises(ConfigError, match="no setting `sweep`"):
         load_config("paper", {"sweep": {"steps": 9}})
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"rounds": {"scales": [1.0]}}, "`rounds.scales` is `scales` now"),
-        ({"outline": {"num_voxels": 9}}, "`outline` is `silhouettes`, with object"),
-        ({"enclose": {"gap_px": 9.0}}, "`enclose` is `coarse_surface`, with reference"),
-        ({"rims": {"per_view": 9}}, "`rims` is no setting: `contour_rays` takes a `RayConfig` now"),
-        (
-            {"triangulate": {"fill_smoothing": 9.0}},
-            "`triangulate.fill_smoothing` is a constant now",
-        ),
-        ({"adapt": {"max_facets": 9}}, "`adapt` is `remesh` now"),
-        ({"sweep": {"step_samples": 9.0}}, "`sweep.step_samples` is a constant now"),
-    ],
-)
-def test_a_former_name_of_a_setting_is_refused_with_what_it_is_now(changes, told):
-    with pytest.raises(ConfigError, match=re.escape(told)):
-        load_config("default", changes)
 
 
 def test_changes_are_laid_over_a_preset():

@@ -26,11 +26,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``clean``, and tell how much was freed.
-
-    Raises:
-        OutputError: A folder that is not ours, or that a run holds.
-    """
+    """Carry out ``clean``, and tell how much was freed."""
     job = checked(command, arguments)
     freed = clean_output(job.out)
     outcome = f"{freed / 1e6:.1f} MB freed" if freed else "nothing to remove"
@@ -39,12 +35,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is not ours.
-
-    Raises:
-        OutputError: The folder.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a folder that is not ours."""
     job = read_arguments(_Job, command, arguments)
     require_cleanable(job.out)
     return job

@@ -22,9 +22,6 @@ def tell_death(ended: int, said: str) -> int:
     Args:
         ended: The exit code of a process that told nothing; less than 0, of which signal it died.
         said: What native libraries said before.
-
-    Returns:
-        The exit code.
     """
     code = 128 - ended if ended < 0 else ended
     name = _name(ended)

@@ -39,11 +39,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``doctor``: tell each finding in a line, with what to do.
-
-    Raises:
-        InputError: A run would be refused.
-    """
+    """Carry out ``doctor``: tell each finding in a line, with what to do."""
     job = checked(command, arguments)
     findings = list(machine())
     _tell(output, findings)
@@ -62,12 +58,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder without photographs.
-
-    Raises:
-        InputError: The folder.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a folder without photographs."""
     job = read_arguments(_Job, command, arguments, levels=True)
     if job.photos is not None:
         list_images(job.photos)

@@ -46,11 +46,7 @@ class Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``export``: read the result, and write all formats or none.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``export``: read the result, and write all formats or none."""
     job = checked(command, arguments)
     with (
         output.observer(),
@@ -67,12 +63,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and check what can be checked without reading RESULT.
-
-    Raises:
-        PimperError: No format, the folder for them is taken, or there is no result.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and check what can be checked without reading RESULT."""
     job = read_arguments(Job, command, arguments)
     require(len(job.formats) > 0, "--format", "nothing", "one format or more")
     require_apart(job.out, {"RESULT": job.result, "--photos": job.photos})

@@ -40,11 +40,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``frames``.
-
-    Raises:
-        PimperError: No video, nothing moves in it, or a folder that holds something else.
-    """
+    """Carry out ``frames``."""
     job = checked(command, arguments)
     with output.observer():
         with stage("scan") as told:
@@ -83,12 +79,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is taken.
-
-    Raises:
-        PimperError: The folder, or a wrong argument.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a folder that is taken."""
     job = read_arguments(_Job, command, arguments)
     require_apart(job.out, {"VIDEO": job.video})
     prepare_output(job.out, "frames", job.overwrite)

@@ -71,7 +71,8 @@ albedo and light.
 Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
 143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
 """
-# Where each is carried out, and where its arguments are read if that is elsewhere.
+# Where each is carried out, and where its arguments are read if that is elsewhere. `--help` ends
+# `checked` with SystemExit; it and `run` refuse with PimperError before anything is written.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
     "doctor": "pimper_torch.cli.doctor",

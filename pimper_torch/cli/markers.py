@@ -35,11 +35,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``markers``.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``markers``."""
     job = checked(command, arguments)
     with file_written_whole(job.out) as fresh:
         write_sheet(fresh, job.side_mm, job.paper)
@@ -51,12 +47,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a file that is not ours.
-
-    Raises:
-        PimperError: The file, or a wrong argument.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a file that is not ours."""
     job = read_arguments(_Job, command, arguments)
     require(job.out.suffix.lower() == ".pdf", "SHEET", job.out.name, "a name ending in .pdf")
     layout(job.side_mm, job.paper)

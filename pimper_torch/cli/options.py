@@ -227,11 +227,7 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
 
 
 def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
-    """Refuse an option that this preset lacks and others have.
-
-    Raises:
-        ConfigError: Names the option and the presets that have it.
-    """
+    """Refuse an option that this preset lacks and others have."""
 
     def options(name: str) -> set[str]:
         every = options_of(_command(command, load_config(name)))
@@ -249,12 +245,7 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and check what can be checked without reading photographs.
-
-    Raises:
-        PimperError: As :func:`parse`; the folder for the result is taken, there are no
-            photographs, or none of the name of the reference.
-    """
+    """Read the arguments, and check what can be checked without reading photographs."""
     job = parse(command, arguments)
     if job.common.view:
         require_viser()

@@ -42,11 +42,7 @@ from pimper_torch.viz.preview import draw_preview
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``reconstruct`` or ``demo``.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``reconstruct`` or ``demo``."""
     job = checked(command, arguments)
     _check_device(job.common.device)
     with opened() if job.common.view else nullcontext() as viewer:

@@ -31,11 +31,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``config``.
-
-    Raises:
-        PimperError: No such preset or setting.
-    """
+    """Carry out ``config``."""
     job = checked(command, arguments)
     value: object = job.config
     owner = value
@@ -51,12 +47,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and find what is asked for.
-
-    Raises:
-        ConfigError: No such preset or setting; names the nearest.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and find what is asked for."""
 
     def config(
         name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "",

@@ -39,11 +39,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``view``.
-
-    Raises:
-        PimperError: No surface to show, or no such address.
-    """
+    """Carry out ``view``."""
     job = checked(command, arguments)
     # Ctrl-C ends the page and no work.
     with opened(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
@@ -60,12 +56,7 @@ def tell_place(viewer: Viewer, output: Output, port: int = PORT) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a result that is not there.
-
-    Raises:
-        PimperError: Wrong arguments, nothing to show, or viser is missing.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a result that is not there."""
     job = read_arguments(_Job, command, arguments)
     require_viser()
     if not job.out.exists():

@@ -30,9 +30,6 @@ def point_covariances(
     the median of the cloud, as a short track says little about its own noise. Cameras are
     taken as exact.
 
-    Args:
-        scene: Cameras, cloud and tracks.
-
     Returns:
         Scene units squared.
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from pimper_torch.coarse.matching import Level, Matcher, Windows, level_of, pair, shifted
 from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
@@ -47,17 +48,12 @@ class DensifyConfig:
         max_hypotheses: Of the search of the whole range.
     """
 
-    coarsest_px: int = 100
-    levels: int = 3
-    max_hypotheses: int = 160
+    coarsest_px: Annotated[int, Range(least=32, most=65_535)] = 100
+    levels: Annotated[int, Range(least=1, most=16)] = 3
+    max_hypotheses: Annotated[int, Range(least=8, most=10_000)] = 160
 
     def __post_init__(self) -> None:
-        require(self.coarsest_px >= 32, "coarsest_px", self.coarsest_px, "32 or more")
-        require(self.levels >= 1, "levels", self.levels, "1 or more")
-        require(self.max_hypotheses >= 8, "max_hypotheses", self.max_hypotheses, "8 or more")
-        # A search of a pixel takes 4 bytes a hypothesis and source; photographs end at
-        # 65,535.
-        require_at_most(self, coarsest_px=65_535, levels=16, max_hypotheses=10_000)
+        require_ranges(self)
 
     def factors(self, longest_px: int) -> tuple[int, ...]:
         """Return by how much photographs of that size are reduced, the coarsest first."""
@@ -71,8 +67,6 @@ class DepthMaps(Record):
 
     Attributes:
         factor: Pixels of the photographs along a side of one here.
-        level: The photographs at that resolution.
-        inverse_depth: Of every pixel, valid or not.
         agreed: How many other views agree; 0 where the windows do not match.
         valid: True where enough of them agree, and the windows match.
         step: Change of inverse depth that moves a pixel by one in the sources; one a view.
@@ -92,9 +86,6 @@ def depth_maps(
     scene: SparseScene, points: Int[Tensor, " chosen"], config: DensifyConfig
 ) -> tuple[DepthMaps, ...]:
     """Search every view's depths: the whole range at low resolution, then near what was found.
-
-    Args:
-        scene: Photographs, cameras and cloud.
 
     Returns:
         The maps of every resolution, the coarsest first.

@@ -23,6 +23,7 @@ from pimper_torch.coarse.matching import Matcher, Windows, pair
 from pimper_torch.errors import caution
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
+from pimper_torch.geometry.supporting_plane import fixation
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.scene import photographed
@@ -138,17 +139,9 @@ def _along_rays(cameras: Cameras, views: Views, view: int) -> Float[Tensor, "poi
 
 def _distance(cameras: Cameras, view: int) -> Float[Tensor, ""]:
     """Return distance to the point nearest to all optical axes, or else to the other cameras."""
-    axes, centers = cameras.cam_from_world[:, 2, :3].double(), cameras.centers_world.double()
-    across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None, :]
-    right = (across @ centers[..., None]).sum(dim=0)[:, 0]
-    apart = (centers - centers[view]).norm(dim=1).max()
-    system = across.sum(dim=0)
-    if float(torch.linalg.eigvalsh(system)[0]) > 1e-4 * len(axes):
-        meeting = torch.linalg.solve(system, right)
-        ahead = float((meeting - centers[view]) @ axes[view])
-        if ahead > 0:
-            return cameras.intrinsics.new_tensor(ahead)
-    return apart.to(cameras.intrinsics)
+    poses, centers = cameras.cam_from_world, cameras.centers_world
+    ahead = (fixation(poses).fixation_world - centers[view]) @ poses[view, 2, :3]
+    return ahead if ahead > 0 else (centers - centers[view]).norm(dim=1).max()
 
 
 def _framed(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,7 +24,7 @@ from pimper_torch.coarse.trim import (
     view_counts,
     without_small_holes,
 )
-from pimper_torch.config import require
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import connected_to, face_components
@@ -87,12 +88,11 @@ class FineSurfaceConfig:
             such as the bottom of a deep concavity, to be closed.
     """
 
-    hole_px: float = 24.0
-    max_unseen: float = 0.02
+    hole_px: Annotated[float, Range(least=0)] = 24.0
+    max_unseen: Annotated[float, Range(least=0, below=1)] = 0.02
 
     def __post_init__(self) -> None:
-        require(self.hole_px >= 0, "fine_surface.hole_px", self.hole_px, "0 or more")
-        require(0 <= self.max_unseen < 1, "fine_surface.max_unseen", self.max_unseen, "in [0, 1)")
+        require_ranges(self, "fine_surface")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -100,8 +100,6 @@ class FineSurface(Record):
     """The surface before it is simplified to facets.
 
     Attributes:
-        vertices_world: Its vertices.
-        faces: Its faces.
         support: Of each, a value of :class:`~pimper_torch.records.Support`.
         pixel: Size of a pixel of the finest depth maps there, scene units.
     """
@@ -135,7 +133,6 @@ def fine_surface(
     illuminated in two views.
 
     Args:
-        scene: Photographs, cameras and cloud.
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
 
@@ -191,11 +188,6 @@ def closed_surface(
     Where each ray touches it follows from the surface, and the surface from where rays touch
     it: they are found in turn, from the points on. Parts that no camera sees do not count:
     behind an object seen from one side the hull is deep, and the surface fills it.
-
-    Args:
-        cloud: Matched points inside the silhouettes.
-        contours: Rays and visual hull of the same silhouettes.
-        pixel: Size of one, scene units.
 
     Returns:
         Vertices, faces, and the contour points that the surface goes through.
@@ -296,10 +288,6 @@ def near_points(
     A component of faces further than the margin from all points is not marked if one of them is
     further than the gap: surface that spans a gap inside the object is joined to surface in
     the air beside it by strips along points, which the margin cuts through.
-
-    Args:
-        counts: Of the views that see each.
-        pixel: Size of one, scene units.
     """
     supported = support == Support.POINTS
     distance = point_distances(centre, cloud.points_world)
@@ -319,7 +307,6 @@ def supports(
     """Return the :class:`~pimper_torch.records.Support` of each face of a fine surface.
 
     Args:
-        counts: Of the views that see each face.
         reach: Distance to a point, or a contour point, that supports a face.
     """
     found = torch.full_like(counts.seen, Support.NOTHING)
@@ -351,9 +338,7 @@ def seen_surface(
     strips along the border are dropped.
 
     Args:
-        counts: Of the views that see each.
         inside: True for faces in the visual hull.
-        pixel: Size of one, scene units.
         fraction: Of the supported area, that a component needs.
     """
     known = support >= Support.CONTOUR

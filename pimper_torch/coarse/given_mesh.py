@@ -28,9 +28,6 @@ def prepared(
 ) -> tuple[Mesh, dict[str, int | float]]:
     """Weld a mesh, drop faces that are none, and compare it with the scene.
 
-    Args:
-        mesh: In the scene's frame.
-
     Returns:
         The mesh, of the scene's floating-point type and device, and figures of how far off it is.
         Warns of what was dropped, and of a mesh that is off.
@@ -48,9 +45,6 @@ def prepared(
 
 def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
     """Weld vertices at the same place; drop faces without area and those that stand twice.
-
-    Args:
-        mesh: In any frame.
 
     Returns:
         Its surface, and how many of which faces were dropped, in words.

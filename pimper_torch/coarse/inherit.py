@@ -41,8 +41,6 @@ def fitted_normals(
     vertex, the facets' own normals.
 
     Args:
-        mesh: After splitting and dropping.
-        split: From the one to the other.
         index: Of each child among the mesh's faces; -1 for a dropped one.
     """
     vertices, faces = mesh.vertices_world.double(), mesh.faces
@@ -87,8 +85,6 @@ def with_points(
     facet, at its own position with its own covariance.
 
     Args:
-        split: From the one to the other.
-        index: Of each child among the mesh's faces; -1 for a dropped one.
         source: The old vertex that each vertex is or is a copy of; new ones follow the old.
     """
     old, points, covariance = coarse.mesh.vertices_world, coarse.points, coarse.covariance_world

@@ -24,8 +24,6 @@ def matched_cloud(
     """Match the photographs densely, and merge the depth maps and the sparse points.
 
     Args:
-        scene: Photographs, cameras and cloud.
-        reliable: Points of the cloud, 4 at least.
         cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
 
     Returns:

@@ -77,8 +77,6 @@ class Pairing(Record):
     :math:`A_s (u, v, 1)^T + q \, b_s` is the homogeneous form of.
 
     Attributes:
-        view: The view.
-        sources: Those it is matched with.
         ray: ``A_s (u, v, 1)`` of every pixel of the view, or of some.
         shift: ``b_s``.
     """

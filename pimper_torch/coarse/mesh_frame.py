@@ -45,7 +45,6 @@ class Rays(Record):
     """Rays of the cameras, and what is known of each.
 
     Attributes:
-        origins: Centres of the cameras.
         directions: To a point, with its distance for length; through a pixel.
         inside: Whether a pixel's mask has it; true for points.
         to_point: Whether it goes to a point.
@@ -85,7 +84,6 @@ def compare_with_scene(
     meet the mesh at the point, or nowhere, as those to the background do.
 
     Args:
-        mesh: In the scene's frame.
         silhouettes: Compared too where they are masks that came with the photographs.
 
     Returns:

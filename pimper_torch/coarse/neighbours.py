@@ -20,10 +20,6 @@ def choose_sources(
 ) -> Int[Tensor, " source"]:
     """Choose the views to match a view with by shared points and the angles at them.
 
-    Args:
-        view: The view that is matched.
-        count: Maximum number.
-
     Returns:
         The best first; fewer than ``count`` if the others share nothing.
     """

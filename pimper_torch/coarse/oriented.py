@@ -62,7 +62,6 @@ class OrientedPoints(Record):
     """Points of surfaces with normals and noise.
 
     Attributes:
-        points_world: Positions.
         normals_world: Unit, towards the cameras.
         noise: Standard deviation along the normal, scene units.
     """
@@ -83,9 +82,6 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
 
     A point that more views contradict than agree with is dropped. Coarse pixels give points
     where no finer ones are near: their windows match weaker texture.
-
-    Args:
-        maps: Of all resolutions, the coarsest first.
     """
 
     def of_view(view: int) -> OrientedPoints:
@@ -150,7 +146,6 @@ def fitted_planes(
     """Fit a plane to the inverse depths round every pixel; a plane's are affine in the pixel.
 
     Args:
-        valid: Pixels that count.
         step: Change of inverse depth that moves a pixel by one in the sources.
 
     Returns:
@@ -309,7 +304,6 @@ def sparse_oriented(
     neighbours lie on none is left out.
 
     Args:
-        scene: Cameras, cloud and tracks.
         reach: Distance to a dense point within which a sparse one is left out.
     """
     points = scene.points_world[index]

@@ -11,12 +11,6 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
 
     Each other view counts with the square root of the number of points shared, so that many
     views at the side weigh more than one close twin.
-
-    Args:
-        name: File name or stem; empty chooses the view.
-
-    Raises:
-        InputError: No view, or more than one, has that name.
     """
     if not name:
         observed = scene.observed.to(scene.points_world.dtype)
@@ -26,11 +20,7 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
 
 
 def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
-    """Find the one photograph of a name, with its suffix or without.
-
-    Raises:
-        InputError: None, or more than one, has that name.
-    """
+    """Find the one photograph of a name, with its suffix or without."""
     found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
     if len(found) != 1:
         raise InputError(

@@ -1,6 +1,7 @@
 """Remeshing: facets that the surface departs from are split, unseen ones dropped."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +10,7 @@ from torch import Tensor
 from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
 from pimper_torch.coarse.splitting import mark_edges, split_edges
 from pimper_torch.coarse.trim import enclosed_holes
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_edges, vertex_fans
@@ -55,24 +56,14 @@ class RemeshConfig:
             than this fraction of the mesh's area together.
     """
 
-    max_departure: float = 2.0
-    max_spread_deg: float = 12.0
-    min_samples: float = 12.0
-    max_facets: int = 5000
-    max_hole: float = 0.02
+    max_departure: Annotated[float, Range(above=0)] = 2.0
+    max_spread_deg: Annotated[float, Range(above=0, most=180)] = 12.0
+    min_samples: Annotated[float, Range(above=0, most=1e9)] = 12.0
+    max_facets: Annotated[int, Range(least=1, most=1_000_000)] = 5000
+    max_hole: Annotated[float, Range(least=0, below=1)] = 0.02
 
     def __post_init__(self) -> None:
-        require(self.max_departure > 0, "remesh.max_departure", self.max_departure, "above 0")
-        require(self.max_spread_deg > 0, "remesh.max_spread_deg", self.max_spread_deg, "above 0")
-        require(self.min_samples > 0, "remesh.min_samples", self.min_samples, "above 0")
-        require(self.max_facets >= 1, "remesh.max_facets", self.max_facets, "1 or more")
-        require(0 <= self.max_hole < 1, "remesh.max_hole", self.max_hole, "in [0, 1)")
-        # A facet of fewer samples than 45 says nothing of its light.
-        require_at_most(self, "remesh", max_facets=1_000_000)
-        # No directions differ by more.
-        require_at_most(self, "remesh", max_spread_deg=180.0)
-        # One facet has not more.
-        require_at_most(self, "remesh", min_samples=1e9)
+        require_ranges(self, "remesh")
 
 
 class Remesh(Stage):

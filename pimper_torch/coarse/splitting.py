@@ -74,7 +74,6 @@ def mark_edges(
     that no angle shrinks below half of the smallest there was, however often this is done.
 
     Args:
-        wanted: To be split in four.
         forbidden: Faces that keep all their edges, even if angles of others shrink.
     """
     edges, face_edge = face_edges(faces)

@@ -1,6 +1,7 @@
 """The coarse mesh: a surface through the cloud and the contours, simplified to facets."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +15,7 @@ from pimper_torch.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.coarse.matched import pixel_size
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.trim import supported_components
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
@@ -47,15 +48,12 @@ class CoarseSurfaceConfig:
     """
 
     reference: str = ""
-    num_facets: int = 3000
+    num_facets: Annotated[int, Range(least=4, most=1_000_000)] = 3000
     levels: int = 3
 
     def __post_init__(self) -> None:
-        require(self.num_facets >= 4, "num_facets", self.num_facets, "4 or more")
+        require_ranges(self, "coarse_surface")
         DensifyConfig(levels=self.levels)
-        # A facet of fewer samples than 45 says nothing of its light: 45 million are a
-        # pass's.
-        require_at_most(self, "coarse_surface", num_facets=1_000_000)
 
 
 class CoarseSurface(Stage):
@@ -79,7 +77,6 @@ class CoarseSurface(Stage):
         """Make the coarse mesh of depth maps and silhouettes, or of a given mesh.
 
         Args:
-            scene: Photographs, cameras and cloud.
             contours: Of the silhouettes: all of the object gets facets, and nothing else does.
                 Where they constrain nothing, surface far from all points gets none.
             mesh: A surface in the scene's frame, used in place of the photographs' own.
@@ -132,8 +129,6 @@ def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh
     turned to the cameras. The number of faces stays: a chain wants some hundreds to thousands.
 
     Args:
-        mesh: In the scene's frame.
-        scene: Cameras and photographs; points where it has some.
         reference: Name or stem of the frontal photograph; empty chooses it.
 
     Raises:

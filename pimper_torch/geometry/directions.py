@@ -26,7 +26,6 @@ def cosine_fan(
     """Spread rays round normals as densely as a matte surface weighs light.
 
     Args:
-        normals: Unit.
         rotations: Of each fan about its normal, in radians: neighbours' fans then differ.
     """
     step = torch.arange(num_rays)

@@ -24,11 +24,8 @@ class Elements:
     """The faces of a mesh as its functions see them.
 
     Attributes:
-        faces: Vertices of each face.
         rotated: Of each corner, the gradient of the function that is 1 there and 0 at the
             other two, times twice the area: the opposite edge, turned into the face.
-        area: Of each face.
-        count: Vertices of the mesh.
     """
 
     faces: Int[Tensor, "face 3"]

@@ -33,8 +33,6 @@ def sample_raster(
     Args:
         values: Anything kept on the raster: depth, normals, albedo, confidence.
         xy: Where, patch frame. Outside the raster the nearest border answers.
-        origin: x and y of the first sample.
-        spacing: Between samples.
         valid: Samples that are false stay out of the blend and the others share their
             weight; where no neighbour is valid the answer is zero. ``None`` trusts all.
 
@@ -78,9 +76,6 @@ def intersect_height_field(
 
     Args:
         depth: z, patch frame; what invalid samples hold does not matter.
-        valid: True where there is a height field.
-        origin: x and y of the first sample.
-        spacing: Between samples.
         ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
             float64 rays meet a float32 height field in float64.
         ray_directions: Any length and sign; the ray is the whole line.

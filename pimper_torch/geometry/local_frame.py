@@ -31,7 +31,6 @@ def local_origin(
     change nothing.
 
     Args:
-        cam_from_world: Rigid.
         points_world: The cloud; may be empty.
 
     >>> poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)

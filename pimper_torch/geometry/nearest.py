@@ -23,8 +23,6 @@ class Nearest(Record):
     """Where surfaces are nearest to points.
 
     Attributes:
-        distance: Scene units.
-        points: Nearest places of the surface.
         face: That they lie in; of a point cloud the index of the point.
     """
 

@@ -19,11 +19,6 @@ def project(
 ) -> tuple[Float[Tensor, "*batch point 2"], Float[Tensor, "*batch point"]]:
     """Find where points appear in an image, and how deep they lie.
 
-    Args:
-        points_world: Scene units.
-        cam_from_world: Rigid.
-        intrinsics: ``K`` in pixels.
-
     Returns:
         Pixels, and depth along the camera's z. Behind the camera (depth <= 0) the pixels
         mean nothing, and the caller masks them. Differentiable where depth is not 0.
@@ -57,7 +52,6 @@ def triangulate_rays(
     """Find the points nearest to their rays in the least-squares sense.
 
     Args:
-        pixels: Where each view shows each point.
         seen: True where it does; by two views each point, from two places.
     """
     rays = rays_through(pixels.movedim(0, 1), cameras.cam_from_world, cameras.intrinsics)

@@ -39,8 +39,6 @@ class Subdivision(Record):
         facet: A facet each vertex lies in; a vertex on an edge or a corner of the coarse
             mesh exists once and names one of its facets.
         barycentric: Where in that facet; exactly 0 on its edges.
-        faces: With the orientation of the facets.
-        face_facet: The facet each face is a piece of.
     """
 
     points: Float[Tensor, "vertex 3"]

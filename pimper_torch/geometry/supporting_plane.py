@@ -24,7 +24,6 @@ class PlaneSearch:
         tolerance: Distance up to which a point lies on it, as a fraction of the cameras' distance.
         min_on: Fraction of the points that lie on it.
         max_below: Fraction of the points that may lie below it.
-        seed: Of the trials.
     """
 
     tolerance: float = 0.004
@@ -97,11 +96,6 @@ def supporting_plane(
     search: PlaneSearch = PlaneSearch(),
 ) -> Plane | None:
     """Find the plane that the object stands on, by RANSAC.
-
-    Args:
-        points_world: Well tracked.
-        eyes_world: The cameras' centres, all on its upper side.
-        distance: Of the cameras from what they look at.
 
     Returns:
         ``None`` where no plane has enough points on it and few enough below. Among those that

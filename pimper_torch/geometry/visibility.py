@@ -30,7 +30,6 @@ class Hits(Record):
     Attributes:
         face: Index of the face; -1 where the ray meets nothing.
         distance: Along the ray in units of its direction's length; infinite for a miss.
-        barycentric: Coordinates in the face.
     """
 
     face: Int[Tensor, "*batch"]
@@ -53,9 +52,6 @@ class Hits(Record):
         directions: Float[Tensor, "*batch 3"],
     ) -> "Hits":
         """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
-
-        Args:
-            vertices: Of the mesh that was hit.
 
         Differentiable in vertices, origins and directions. A ray that lies in the plane of its
         face keeps what ray casting gave.
@@ -105,7 +101,6 @@ class RayCaster:
         """Find the first face each ray meets.
 
         Args:
-            origins: World.
             reach: How far each goes, in lengths of its direction; without, to infinity.
         """
         shape = directions.shape[:-1]
@@ -138,8 +133,6 @@ class RayCaster:
         """Return whether the mesh hides points from a camera.
 
         Args:
-            points: World.
-            center: Of the camera, world.
             tolerance: A surface closer than this in front of the point does not count: it
                 is the surface the point itself lies on. Scene units.
         """
@@ -157,7 +150,6 @@ class RayCaster:
         """Return whether a ray meets any face at all; several times as fast as its first one.
 
         Args:
-            origins: World.
             reach: How far each goes, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]

@@ -17,9 +17,6 @@ def welded(
 ) -> tuple[Float[Tensor, "kept 3"], Int[Tensor, "face 3"]]:
     """Merge vertices that are closer than a millionth of the diagonal; drop those without faces.
 
-    Args:
-        vertices: Finite.
-
     Returns:
         The first vertex of each place, in their order, and as many faces, some of which may now
         name a vertex twice. A mesh that has nothing to merge comes back as it is.

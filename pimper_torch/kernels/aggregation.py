@@ -122,14 +122,11 @@ def strong_connections(
     """Find the strong connections, which may root an aggregate.
 
     Args:
-        starts: Of the rows.
         largest: Coupling of each row.
         coupled: Sum of each row's couplings over its diagonal.
         min_strength: Of an entry over the largest coupling of both rows.
         min_coupled: Of an unknown; below it, smoothing alone solves for it.
         strong: Written.
-        first: Row.
-        last: Row after those.
     """
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):
@@ -304,13 +301,7 @@ def coarser(
     first: int,
     last: int,
 ) -> tuple[Array, Array, Array]:
-    """Return rows of the Galerkin product ``P^T A P``, without an intermediate product.
-
-    Args:
-        starts: Of the rows of A.
-        first: Row.
-        last: Row after those.
-    """
+    """Return rows of the Galerkin product ``P^T A P``, without an intermediate product."""
     size = len(restrict_starts) - 1
     counts = np.empty(last - first, np.int32)
     marker, touched, sums = np.full(size, -1, np.int32), np.empty(size, np.int32), np.empty(size)

@@ -33,7 +33,6 @@ def update_shading(equations: Floats, shading: Floats, steps: int) -> None:
 
     Args:
         equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.
-        shading: 4 rows.
         steps: Of each sample; one that does not lower its objective is rejected.
     """
     tile = np.empty(18 * TILE, np.float64)
@@ -219,8 +218,6 @@ def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
     """Return the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
 
     Args:
-        equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.
-        shading: 4 rows.
         vectors: Becomes 12 rows: three vectors of four.
     """
     tile, found = np.empty(18 * TILE, np.float64), np.empty(12 * TILE, np.float64)

@@ -101,7 +101,6 @@ def _fan(vertex: int, faces: Indices, links: Indices, ring: Numbers, owner: Numb
 
     Args:
         vertex: Removed faces, with -1 in their first slot, are unlinked from its list.
-        links: See :func:`link_corners`.
         ring: Result: the neighbours in order.
         owner: Result: the face between each neighbour and the next.
 
@@ -180,7 +179,6 @@ def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64
     """Compute the worst new shape for every neighbour that a vertex may be collapsed on.
 
     Args:
-        ring: Its neighbours in order.
         score: Result, of every neighbour; -1 where a new face is too thin or folded.
     """
     count, least = len(ring), _MIN_SHAPE
@@ -240,15 +238,9 @@ def _placed(
 
     Args:
         points: See :func:`decimate`, as for the three that follow.
-        values: Normals and attributes.
-        cosine: Of the angle between normals.
-        ring: The neighbours in order.
         index: The neighbour that the vertex is collapsed on.
         step_of: Result: the new face of each, counted around the neighbour from 1.
         errors: Result: distance and cosine of each.
-
-    Returns:
-        Whether all are within bounds.
     """
     count = len(ring)
     for item in range(len(removed)):
@@ -321,7 +313,6 @@ def decimate(
 
     Args:
         values: Unit normals, then attributes in units of their tolerance.
-        cosine: Of the angle between normals.
         free: Vertices that may be removed.
         candidates: Whether a vertex is to be tried; updated.
         faces: Updated: removed faces have -1 in their first slot.

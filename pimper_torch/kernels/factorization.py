@@ -478,7 +478,6 @@ def solve_on_cone(
         given: The weights; 0 where missing.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The deviation is estimated from every ``stride``-th sample.
-        max_iterations: Maximum number of steps.
         curvature_samples: See the twin; 0 for all.
         lights: The start, replaced by the solution.
         shading: The start, replaced by the solution; samples without weight keep it.

@@ -372,10 +372,8 @@ def fit(
         geometry: Rows of the samples: the harmonics; with a point light, coordinates of the
             normals and of the points, too.
         radiance: View by sample; zero where not seen.
-        seen: 1 or 0.
         level: Mean brightness of each view.
         max_closeness: Upper bound of a point light's inverse distance.
-        limit: Maximum number of steps.
         min_gain: A step that lowers the loss by less than this fraction is the last.
         lights: View by parameter; the start, replaced by the solution.
         albedo: Of each sample; the start, replaced by the solution.

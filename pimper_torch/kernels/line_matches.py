@@ -32,9 +32,7 @@ def most_alike(
 
     Args:
         first: Pixels in one photograph.
-        first_descriptors: Of length 1.
         matrix: Homography from the first photograph, or fundamental matrix.
-        planar: Whether it is a homography.
         max_error_px: Distance from the mapped point, or Sampson's from the epipolar line.
         first_products: Result, -1 before: the largest and the second largest.
         second_products: The same for features of the other photograph.

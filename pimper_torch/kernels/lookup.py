@@ -19,7 +19,6 @@ def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int,
 
     Args:
         x: To the right, counted from the first pixel's centre; clamped to the border.
-        y: Down.
 
     Returns:
         An index, the steps to the pixels at the right and below (0 at the border), and the
@@ -40,7 +39,6 @@ def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
 
     Args:
         squared_footprint: Area of the footprint, pixels of the finest level.
-        count: Number of levels.
     """
     if squared_footprint <= 1:
         return 0, 0.0

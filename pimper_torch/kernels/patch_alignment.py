@@ -37,8 +37,6 @@ def align(
         homographies: From steps of the plane to pixels, one a point.
         chosen: The template of each point.
         values: Of the templates, light taken out.
-        slopes: By a step along the plane.
-        inverse: Of the slopes' normal equations.
         offsets: Steps of the plane, homogeneous, one column a sample.
         light: Basis of changes of light, orthonormal columns.
         limits: Iterations; the longest step; the step that converges; iterations after which the

@@ -168,7 +168,6 @@ def costs(
         levels: Height, width and offset of every level.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
-        focals: In pixels.
         outward: Unit, along which a sample is swept; patch frame.
         normals: That light shades, patch frame.
         lights: First-order harmonics of every patch and view.

@@ -29,7 +29,6 @@ def conjugate_gradients(
     Args:
         product: Of A, symmetric and positive semidefinite.
         precondition: Approximates the inverse of A, symmetric and positive definite too.
-        rhs: ``b``.
         start: Where to begin; zero if not given.
         dims: Of the unknowns of one system; the others are those of the batch.
         tolerance: Of the error's energy norm, as ``precondition`` estimates it, relative to that
@@ -89,9 +88,7 @@ def compressed_gradients(
     """Solve as :func:`conjugate_gradients`, for a matrix in compressed rows, by kernels.
 
     Args:
-        matrix: Float64, on the CPU.
         precondition: Approximates the inverse in ``dtype``; it may reuse the memory of its result.
-        rhs: Float64, one column a right-hand side.
         start: Where to begin; zero if not given.
         dtype: Of the vectors of ``precondition``.
     """

@@ -26,11 +26,8 @@ def normal_equations(
     r"""Return :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
 
     Args:
-        unknowns: Indices of each equation's unknowns.
         coefficients: Of these. Pad shorter equations with 0 of any unknown.
-        targets: Right-hand side of each equation.
         weights: Of each equation, not negative.
-        size: Number of unknowns.
 
     Returns:
         Rows, columns and values of the matrix, duplicate entries adding up, and the

@@ -176,7 +176,6 @@ class Hierarchy:
     """Levels of a symmetric positive definite matrix, cycled as a preconditioner.
 
     Args:
-        matrix: In float64; both triangles.
         product: Of the matrix, if there is a faster one than by compressed rows.
         dtype: Of compiled cycles: float32 takes half the memory, and as many cycles.
 

@@ -3,22 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
-from pimper_torch.linalg.hierarchy import (
-    Hierarchy,
-    Product,
-    sparse_product,
-    with_product,
-)
+from pimper_torch.linalg.hierarchy import Hierarchy, Product, sparse_product, with_product
 from pimper_torch.linalg.prepared import PreparedMatrix
 from pimper_torch.linalg.singular import WORST_RESIDUAL, SingularSystemError
-
-# Of the error's energy norm relative to the solution's: a choice; a digit costs one to two cycles.
-DEFAULT_TOLERANCE = 1e-10
 
 # A choice: the hardest systems of `benchmarks/linear_systems.py` take 25 cycles.
 _MAX_CYCLES = 300
@@ -35,7 +27,6 @@ class Iterate:
 
     Attributes:
         values: The solution, float64; one column a right-hand side where there are several.
-        iterations: Cycles taken.
     """
 
     values: Float[Tensor, "unknown ..."]
@@ -86,14 +77,7 @@ def solve_by_cycles(
     what: str,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Iterate:
-    """Solve as :func:`solve_with_hierarchy`, by kernels on the CPU, the hierarchy in float32.
-
-    Args:
-        matrix: A, float64, both triangles.
-
-    Raises:
-        SingularSystemError: See there.
-    """
+    """Solve as :func:`solve_with_hierarchy`, by kernels on the CPU, the hierarchy in float32."""
     half = torch.float32
     reached = compressed_gradients(
         matrix,
@@ -120,10 +104,6 @@ def _checked(
 
     Args:
         reached: Values, steps and whether they converged.
-        rhs: Right-hand side.
-
-    Raises:
-        SingularSystemError: No convergence, with the iterations and the residual reached.
     """
     found, cycles, converged = reached
     scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
@@ -149,30 +129,18 @@ class Multigrid(PreparedMatrix):
     of :class:`~pimper_torch.linalg.sparse.SparseCholesky`. For graph Laplacians and similar
     matrices, whose off-diagonal entries are mostly negative.
 
-    Args:
-        rows: See :class:`~pimper_torch.linalg.prepared.PreparedMatrix`.
-        tolerance: Of the error, in the energy norm, relative.
-
     >>> index = torch.tensor([0, 1])
     >>> grid = Multigrid(index, index, torch.tensor([2.0, 4.0]), size=2)
     >>> grid.solve(torch.tensor([1.0, 1.0]))
     tensor([0.5000, 0.2500])
     """
 
-    def __init__(
-        self,
-        rows: Int[Tensor, " entry"],
-        cols: Int[Tensor, " entry"],
-        values: Float[Tensor, " entry"],
-        size: int,
-        what: str = "the linear system",
-        tolerance: float = DEFAULT_TOLERANCE,
-    ) -> None:
-        super().__init__(rows, cols, values, size, what)
+    def _prepare(self, tolerance: float) -> None:
         self._tolerance = tolerance
-        self._diagonal = self._diagonal.to(values.device)
-        self._product = sparse_product(self._matrix, values.device)
-        self._hierarchy = Hierarchy(self._matrix, values.device)
+        device = self._values.device
+        self._diagonal = self._diagonal.to(device)
+        self._product = sparse_product(self._matrix, device)
+        self._hierarchy = Hierarchy(self._matrix, device)
 
     def iterate(self, rhs: Float[Tensor, "unknown ..."]) -> Iterate:
         """Solve and report the iterations; not differentiable."""

@@ -18,11 +18,7 @@ class SingularSystemError(NumericalError):
 def refuse_hopeless(
     entries: Float[Tensor, " entry"], diagonal: Float[Tensor, " unknown"], what: str
 ) -> None:
-    """Refuse entries that are not finite and unknowns without a positive diagonal.
-
-    Raises:
-        SingularSystemError: There are some.
-    """
+    """Refuse entries that are not finite and unknowns without a positive diagonal."""
     if not bool(entries.isfinite().all()):
         raise SingularSystemError(
             f"{what} has {int((~entries.isfinite()).sum())} entries that are not finite "

@@ -10,7 +10,7 @@ from weakref import WeakSet
 import numpy as np
 import torch
 from cholespy import CholeskySolverD, MatrixType
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.sparse import coo_array
 from torch import Tensor
 
@@ -39,21 +39,13 @@ class SparseCholesky(PreparedMatrix):
     tensor([0.5000, 0.2500])
     """
 
-    def __init__(
-        self,
-        rows: Int[Tensor, " entry"],
-        cols: Int[Tensor, " entry"],
-        values: Float[Tensor, " entry"],
-        size: int,
-        what: str = "the linear system",
-    ) -> None:
-        super().__init__(rows, cols, values, size, what)
+    def _prepare(self, tolerance: float) -> None:
         # A unit diagonal makes the condition a property of the problem, not of its units.
         self._scale = self._diagonal.rsqrt()
         self._scaled = scaled = coo_array(self._matrix)
         scale = self._scale.numpy()
         scaled.data *= scale[scaled.row] * scale[scaled.col]
-        self._solver = self._factor(scaled) if size else None
+        self._solver = self._factor(scaled) if len(scale) else None
         _ALIVE.add(self)
         self._check_condition()
 

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from pimper_torch.failures import reason_of, skipped
 from pimper_torch.linalg.aggregation import parts_of
-from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Multigrid, solve_by_cycles
+from pimper_torch.linalg.multigrid import Multigrid, solve_by_cycles
+from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
 from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.sums import total
@@ -43,14 +44,9 @@ def prepare(
 
     Args:
         rows: Row of each entry; duplicate entries add up.
-        cols: Column of each entry.
         values: Of the entries; solutions are differentiable in them.
-        size: Rows of the square matrix.
         what: Names the system in errors.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
-
-    Returns:
-        What ``solve(rhs)`` is called on.
 
     Raises:
         SingularSystemError: See :class:`~pimper_torch.linalg.sparse.SparseCholesky` and
@@ -76,13 +72,8 @@ def solutions(
 
     Args:
         rows: As in :func:`prepare`.
-        sides: Right-hand sides, one at least.
-        what: Names the system in errors.
 
     Differentiable in ``values`` and in the sides.
-
-    Raises:
-        SingularSystemError: See :func:`prepare`.
     """
     size = len(sides[0])
     prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
@@ -104,16 +95,7 @@ def solve_compressed(
     tolerance: float,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
-    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients.
-
-    Args:
-        matrix: Symmetric positive definite; float64.
-        sides: Right-hand sides, float64, on the CPU.
-        what: Names the system in errors.
-
-    Raises:
-        SingularSystemError: See :func:`prepare`.
-    """
+    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""
     from pimper_torch.kernels import aggregation as kernels
 
     diagonal = torch.from_numpy(matrix.diagonal())

@@ -45,9 +45,6 @@ def closed(mesh: Mesh) -> Closed:
 
     Positions and albedo of caps are differentiable in those of the borders.
 
-    Args:
-        mesh: With faces, facing outwards.
-
     Raises:
         InputError: Faces on two sides of an edge face opposite ways.
     """

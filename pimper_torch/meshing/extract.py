@@ -1,14 +1,14 @@
 """Extraction: the joined surface in, one connected mesh out."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import component_areas
 from pimper_torch.geometry.topology import face_components, vertex_fans
@@ -47,19 +47,14 @@ class ExtractConfig:
             be kept; 1 keeps the largest only.
     """
 
-    max_expected_error: float = 0.02
-    max_hole: float = 1.0
-    max_stretch: float = 10.0
+    max_expected_error: Annotated[float, Range(above=0)] = 0.02
+    max_hole: Annotated[float, Range(least=0)] = 1.0
+    max_stretch: Annotated[float, Range(above=1)] = 10.0
     overturned: Literal["folded", "all", "none"] = "folded"
-    min_piece: float = 0.01
+    min_piece: Annotated[float, Range(least=0, most=1)] = 0.01
 
     def __post_init__(self) -> None:
-        require(
-            self.max_expected_error > 0, "max_expected_error", self.max_expected_error, "above 0"
-        )
-        require(self.max_hole >= 0, "max_hole", self.max_hole, "0 or more")
-        require(self.max_stretch > 1, "max_stretch", self.max_stretch, "above 1")
-        require(0 <= self.min_piece <= 1, "min_piece", self.min_piece, "in [0, 1]")
+        require_ranges(self)
 
 
 class Extract(Stage):
@@ -83,9 +78,6 @@ class Extract(Stage):
 
         A surface without support anywhere, as of photographs without texture under one light, is
         kept whole.
-
-        Raises:
-            ReconstructionError: Nothing is left.
         """
         vertices = surface.vertices_world.detach()
         supported = surface.supported

@@ -31,7 +31,6 @@ class Faults:
     several. Overturned faces without a fold round their component are on a facet that bends far.
 
     Attributes:
-        faces: Of the surface.
         along: Mean normal of each face's facet, of any length.
         longest: Longest side of a sound face, scene units.
     """
@@ -105,7 +104,6 @@ def faults(
     """Take the criteria for defective faces from a surface as it is.
 
     Args:
-        vertices: World.
         facet: Of each vertex; a face belongs to the facet of most of its vertices.
         max_stretch: Longest side, in multiples of the median.
     """

@@ -15,7 +15,6 @@ def small_groups(
     """Find the vertices ``among`` whose connected component is small.
 
     Args:
-        vertices: World.
         among: Vertices to connect along edges.
         max_extent: Diagonal of a component's bounding box.
     """

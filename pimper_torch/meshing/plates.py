@@ -21,7 +21,6 @@ def least_bent(
     nothing.
 
     Args:
-        vertices: World.
         free: Vertices to move; every connected component needs a neighbour that is not free.
 
     Differentiable in the fixed vertices; one solve.

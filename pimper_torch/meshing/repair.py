@@ -97,7 +97,6 @@ def repair(
     the border, or extends too far, or stays defective, is left as it is.
 
     Args:
-        vertices: World.
         faces: Of the surface. Edges without two of them are its border.
         broken: Marks defective faces, for any position of the vertices.
         max_extent: Diagonal of a component's bounding box, once it has moved.

@@ -70,7 +70,6 @@ def simplify(
 
     Args:
         mesh: Any; without normals, those of its shape are taken.
-        bounds: On distances and normals.
         values: More that is interpolated over the faces, in units of its bound: the value of a
             removed vertex and that interpolated on its face differ by 1 at most.
     """

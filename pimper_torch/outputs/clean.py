@@ -10,11 +10,7 @@ from pimper_torch.outputs.stages import is_ours, kept, locked
 
 
 def require_cleanable(folder: Path | str) -> None:
-    """Refuse a folder in which there is nothing of ours.
-
-    Raises:
-        OutputError: It is not a result, and nothing is kept in it.
-    """
+    """Refuse a folder in which there is nothing of ours."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; needed: the folder of a result.")
@@ -30,9 +26,6 @@ def clean_output(folder: Path | str) -> int:
     """Remove what is kept in a folder for the next run into it, and what killed runs left there.
 
     A result stays. One whose writing was cut off when it was whole is brought to its place.
-
-    Returns:
-        How many bytes were freed.
 
     Raises:
         OutputError: It holds nothing of ours, another run holds it, or the disk refuses.

@@ -14,11 +14,7 @@ def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
     """Refuse, before the work, a file that cannot be written or is not ours.
 
     Args:
-        overwrite: Replace a former one.
         sign: Text that every file of this kind holds.
-
-    Raises:
-        OutputError: Something is there, or the path lies in no folder.
     """
     require_name(path.resolve(), OutputError)
     if path.is_dir():

@@ -39,9 +39,6 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
         folder: New, or empty but for what a former run kept.
         overwrite: Replace a former result of that kind, if nothing but its own files is there, as
             they were written.
-
-    Raises:
-        OutputError: The folder already holds something, is a file, or cannot be made.
     """
     folder = Path(folder)
     require_name(folder.resolve(), OutputError)
@@ -71,9 +68,6 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
     What a killed run left is removed, or put in its place where it was whole. A folder that was
     made for the block, and in which nothing was kept or written, is removed at its end. A block
     inside another one is part of it.
-
-    Args:
-        overwrite: As of :func:`prepare_output`.
 
     Yields:
         The folder, without links.
@@ -117,7 +111,6 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
 
     Args:
         folder: New, or empty but for what a former run kept; its parents are made.
-        overwrite: Replace a former result of that kind.
 
     Raises:
         OutputError: As :func:`held_output`, or the disk refuses on the way; then nothing stays
@@ -187,9 +180,6 @@ def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None
 
     Args:
         inputs: By what they are called. Links are followed.
-
-    Raises:
-        InputError: One is the folder, or lies in it.
     """
     target = Path(folder).resolve()
     for name, path in inputs.items():

@@ -43,7 +43,6 @@ class Marker:
     """The list of a folder.
 
     Attributes:
-        kind: Which command wrote it.
         files: Relative to the folder, with slashes.
     """
 
@@ -109,9 +108,6 @@ def remove_written(folder: Path, marker: Marker) -> None:
     """Remove the files that the list names, and nothing else.
 
     A folder inside that holds anything else stays.
-
-    Raises:
-        OSError: A file cannot be removed.
     """
     for path in reversed(_inside(folder)):
         if _is_folder(path):

@@ -11,7 +11,6 @@ def require_name(name: Path | str, error: type[PimperError]) -> None:
     """Refuse, before any work, a name that libraries and files of text cannot hold.
 
     Args:
-        name: Of a file or folder.
         error: What is raised where it is not UTF-8.
     """
     text = fspath(name)

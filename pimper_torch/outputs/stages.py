@@ -54,9 +54,6 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
     Args:
         target: The folder, without links. It is made, and its parents are.
         shown: As the user names it.
-
-    Raises:
-        OutputError: Another run holds it, or the disk refuses.
     """
     # Local: a refusal of arguments does not need it.
     from filelock import FileLock, Timeout

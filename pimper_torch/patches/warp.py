@@ -3,13 +3,14 @@
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
@@ -44,23 +45,19 @@ class WarpConfig:
         occlusion_stride: Samples between the rays that test for occlusion.
     """
 
-    dark_level: float = 0.01
+    dark_level: Annotated[float, Range(least=0, below=1)] = 0.01
     saturation_level: float = SATURATED
-    max_tilt_deg: float = 75.0
-    occlusion_stride: int = 4
+    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
+    occlusion_stride: Annotated[int, Range(least=1, most=65_535)] = 4
 
     def __post_init__(self) -> None:
-        require(0 <= self.dark_level < 1, "dark_level", self.dark_level, "in [0, 1)")
+        require_ranges(self)
         require(
             self.saturation_level > self.dark_level,
             "saturation_level",
             self.saturation_level,
             f"above dark_level {self.dark_level}",
         )
-        require(0 < self.max_tilt_deg < 90, "max_tilt_deg", self.max_tilt_deg, "in (0, 90)")
-        require(self.occlusion_stride >= 1, "occlusion_stride", self.occlusion_stride, ">= 1")
-        # Wider than any template.
-        require_at_most(self, occlusion_stride=65_535)
 
 
 class Warp(Stage):

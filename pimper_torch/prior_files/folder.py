@@ -66,11 +66,7 @@ def read_maps(
 
 
 def single(path: Path, values: np.ndarray) -> np.ndarray:
-    """Return the one channel of a map, also where a file has it three times.
-
-    Raises:
-        InputError: It has colours.
-    """
+    """Return the one channel of a map, also where a file has it three times."""
     if not (values == values[..., :1]).all(where=np.isfinite(values)):
         raise InputError(
             f"{path}: has colours; needed: one value a pixel, not a picture of it in colours."

@@ -8,12 +8,14 @@ import torch
 
 from pimper_torch.errors import InputError
 from pimper_torch.prior_files.folder import read_maps, single
+from pimper_torch.priors.from_maps import Maps, stacked
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.size.given import Mark, number_of, require_inside
 
 _BYTE = 255
 _MOST_LABELS = 32  # files of 8 bits whose levels are all below hold labels: all but 0 is object
 _KINDS = ("mask", "silhouette", "alpha", "inside")  # how names of arrays begin
+_UNKNOWN = 0.5
 _RASTER, _REACH = 512, 1  # longer side of a click's map, and its pixels to each side
 
 
@@ -32,13 +34,7 @@ def read_silhouettes(
     Raises:
         InputError: A file or its name, shape or values cannot be used: says which.
     """
-    maps = read_maps(folder, views, _KINDS, _chance, cut_out=True)
-    return SilhouettePrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        inside=maps.values[..., 0].nan_to_num(0.5),
-        undistorted=undistorted,
-    )
+    return _prior(read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted)
 
 
 def _chance(path: Path, values: np.ndarray) -> np.ndarray:
@@ -73,14 +69,18 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
         require_inside(pointer, *full)
         scale = min(1.0, _RASTER / max(size))
         width, height = (max(1, round(scale * side)) for side in size)
-        inside = maps.setdefault(view, torch.full((height, width), 0.5))
+        inside = maps.setdefault(view, torch.full((height, width, 1), _UNKNOWN))
         column = min(int(pointer.x * width / full[0]), width - 1)
         row = min(int(pointer.y * height / full[1]), height - 1)
         around = slice(max(0, row - _REACH), row + _REACH + 1)
         inside[around, max(0, column - _REACH) : column + _REACH + 1] = 1
-    sizes = torch.tensor([one.shape[::-1] for one in maps.values()])
-    padded = torch.full((len(maps), int(sizes[:, 1].max()), int(sizes[:, 0].max())), 0.5)
-    for index, one in enumerate(maps.values()):
-        padded[index, : one.shape[0], : one.shape[1]] = one
-    names = tuple(views.names[view] for view in maps)
-    return SilhouettePrior(names=names, sizes_px=sizes, inside=padded)
+    return _prior(stacked({views.names[view]: (one, None) for view, one in maps.items()}))
+
+
+def _prior(maps: Maps, *, undistorted: bool = False) -> SilhouettePrior:
+    return SilhouettePrior(
+        names=maps.names,
+        sizes_px=maps.sizes_px,
+        inside=maps.values[..., 0].nan_to_num(_UNKNOWN),
+        undistorted=undistorted,
+    )

@@ -15,8 +15,6 @@ class AtPoints(Record):
     """Observations of points in views that have a map.
 
     Attributes:
-        point: Index in the cloud.
-        view: Of the scene.
         place: Map, row and column: the pixel of the map that shows the point.
         pixels: Of the undistorted photograph.
         depth: Of the point, along the camera's axis.
@@ -43,13 +41,7 @@ def at_points(
     pixels, depth = pixels[:, 0], depth[:, 0]
     place, within = places(prior, scene, view, pixels)
     within &= known[place.unbind(dim=-1)] & (depth > 0)
-    return AtPoints(
-        point=point[within],
-        view=view[within],
-        place=place[within],
-        pixels=pixels[within],
-        depth=depth[within],
-    )
+    return AtPoints(point=point, view=view, place=place, pixels=pixels, depth=depth).take(within)
 
 
 def places(

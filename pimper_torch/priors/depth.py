@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
-from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.priors.at_points import AtPoints, at_points, means_by
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.sfm.squares import ERRORS, standard_errors
@@ -115,6 +116,12 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
     return _in_scene(prior, scene, along, inverse, lines[best, gauge], off)
 
 
+def _lengths(pixels: Tensor, scene: SparseScene, views: Tensor) -> Tensor:
+    """Return how long rays through pixels ``view pixel 2`` are for a depth of 1."""
+    poses, intrinsics = scene.cameras.cam_from_world[views], scene.cameras.intrinsics[views]
+    return rays_through(pixels, poses.to(pixels), intrinsics.to(pixels)).norm(dim=-1)
+
+
 def _in_scene(
     prior: DepthPrior, scene: SparseScene, along: Along, inverse: bool, lines: Tensor, off: Tensor
 ) -> DepthPrior:
@@ -124,15 +131,19 @@ def _in_scene(
         lines: Factor and offset of each map; NaN where too few points tell them.
         off: Relative error of each map at the points, of which the standard error is at least.
     """
-    parts = (*lines.nan_to_num(0).unbind(dim=-1), off)
-    slope, offset, off = (one[:, None, None].to(prior.depth) for one in parts)
+    parts = torch.cat([lines.nan_to_num(0), off[:, None]], dim=1).to(prior.depth)
+    slope, offset, off = parts.mT[..., None, None]
     truth = slope * prior.depth + offset
     known = prior.variance.isfinite() & (truth > 0)
     truth = torch.where(known, truth, 1)
     relative = slope * torch.where(known, prior.variance, 1).sqrt() / truth
     depth = 1 / truth if inverse else truth
     if along == "ray":
-        depth = depth / _lengths(prior, scene)
+        views = torch.tensor([scene.views.names.index(name) for name in prior.names])
+        zoom = (scene.cameras.sizes_px[views] / prior.sizes_px)[:, None, None]
+        height, width = depth.shape[1:]
+        places = pixel_centers(width, height, like=depth) * zoom.to(depth)
+        depth = depth / _lengths(places.flatten(1, 2), scene, views).view_as(depth)
     variance = (depth * torch.maximum(relative, off)).square()
     return prior.replace(
         depth=torch.where(known, depth, 0),
@@ -141,16 +152,6 @@ def _in_scene(
         inverse=False,
         gauge="scene",
     )
-
-
-def _lengths(prior: DepthPrior, scene: SparseScene) -> Float[Tensor, "map height width"]:
-    """Return how long rays through the pixels of each map are for a depth of 1."""
-    height, width = prior.depth.shape[1:]
-    views = torch.tensor([scene.views.names.index(name) for name in prior.names])
-    zoom = (scene.cameras.sizes_px[views] / prior.sizes_px)[:, None, None]
-    pixels = homogeneous(pixel_centers(width, height, like=prior.depth) * zoom.to(prior.depth))
-    inverse = torch.linalg.inv(scene.cameras.intrinsics[views]).to(pixels)
-    return (pixels @ inverse[:, None].mT).norm(dim=-1)
 
 
 @torch.no_grad()
@@ -166,17 +167,12 @@ def _compared(
     seen = at_points(prior, prior.variance.isfinite(), scene)
     count = torch.bincount(seen.place[:, 0], minlength=len(prior.names))
     seen = seen.take(count[seen.place[:, 0]] >= _FEWEST)
-    K, ends = scene.cameras.intrinsics[seen.view], homogeneous(seen.pixels)[..., None]
-    lengths = torch.linalg.solve(K, ends).norm(dim=1)[:, 0].double()
+    lengths = _lengths(seen.pixels[:, None], scene, seen.view)[:, 0].double()
     values, axis = prior.depth[seen.place.unbind(dim=-1)].double(), seen.depth.double()
-    depths = [axis * lengths if along == "ray" else axis for _, along in _READINGS]
-    truths = [
-        1 / depth if inverse else depth
-        for depth, (inverse, _) in zip(depths, _READINGS, strict=True)
-    ]
-    lines = values.new_full((len(truths) + 1, len(_GAUGES), len(prior.names), 2), torch.nan)
-    lines[:, 0] = lines.new_tensor([1.0, 0.0])
+    truths = [axis, axis * lengths, 1 / axis, 1 / (axis * lengths)]  # as in _READINGS
     pairs = [*((values, truth) for truth in truths), (torch.zeros_like(values), axis)]
+    lines = values.new_full((len(pairs), len(_GAUGES), len(prior.names), 2), torch.nan)
+    lines[:, 0] = lines.new_tensor([1.0, 0.0])
     for one in torch.unique(seen.place[:, 0]).tolist():
         here = seen.place[:, 0] == one
         for reading, (given, truth) in enumerate(pairs):

@@ -33,8 +33,6 @@ class Maps(NamedTuple):
     """Maps of photographs, of whatever kind.
 
     Attributes:
-        names: Of the photographs.
-        sizes_px: Width and height of each map.
         values: Padded with NaN.
         variance: NaN where nothing is said of it.
     """
@@ -122,11 +120,7 @@ def depth_from(
 
 
 def variance_of(maps: Maps, known: Tensor, default: Tensor | float) -> Tensor:
-    """Return the variance that comes along, or the default; infinite where nothing is known.
-
-    Raises:
-        InputError: Nothing is known anywhere.
-    """
+    """Return the variance that comes along, or the default; infinite where nothing is known."""
     if not bool(known.any()):
         low, high = maps.values.norm(dim=-1).nan_to_num(0).aminmax()
         raise InputError(

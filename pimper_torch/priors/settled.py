@@ -13,9 +13,6 @@ def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> Spars
     told in a warning; what contradicts the scene by far is refused by name. Where the scene tells
     nothing, what is stated is believed.
 
-    Args:
-        silhouettes: Of the object, where they are known.
-
     Returns:
         Normals in our axes of the camera, or in the world; depth along its axis in scene units.
         Differentiable in what priors hold.

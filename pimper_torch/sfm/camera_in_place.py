@@ -61,9 +61,7 @@ def reference_from_photographs(
     together, of which only the room's agree.
 
     Args:
-        keypoints: Pixels, one tensor a photograph.
         max_error_px: Distance up to which a match follows a map.
-        fewest: Matches that tie a photograph.
 
     Returns:
         ``A`` of each photograph, the identity where one cannot be tied; ``None`` where most
@@ -105,7 +103,6 @@ def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float
     found; with 2 px 69 %.
 
     Args:
-        keypoints: Mapped pixels.
         least_px: Given where more would not be needed.
     """
     lengths = torch.cat(
@@ -139,9 +136,6 @@ def tied_to(
 
     Args:
         matched: Pixels in the reference and in each other photograph.
-        max_error_px: Distance up to which a match follows a map.
-        fewest: Matches that tie a photograph.
-        any_homography: See :func:`fit_map`.
 
     Returns:
         The map to the reference of each photograph that can be tied, and the matches that follow.

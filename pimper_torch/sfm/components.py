@@ -50,11 +50,7 @@ def wide_points(model: SparseModel) -> Bool[Tensor, " point"]:
 
 
 def require_motion(rest: StaticBackground, num_views: int) -> None:
-    """Refuse photographs in which nothing moves.
-
-    Raises:
-        ReconstructionError: Most matches lie still, and nowhere do enough others move.
-    """
+    """Refuse photographs in which nothing moves."""
     if rest.nothing_moves:
         raise ReconstructionError(
             f"Nothing moves in {num_views} photographs: {rest.still_fraction:.0%} of the matches "

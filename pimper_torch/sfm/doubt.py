@@ -40,11 +40,7 @@ _MOST = 0.5
 
 
 def doubt(model: SparseModel, num_photographs: int) -> str:
-    """State why the cameras may be wrong, and what to do; empty where nothing speaks against them.
-
-    Args:
-        num_photographs: Registered or not.
-    """
+    """State why the cameras may be wrong, and what to do; empty where nothing does."""
     following = following_fraction(model)
     if following > _MOST_FOLLOWING:
         return (

@@ -26,12 +26,7 @@ class FeatureSettings:
     """What counts as a feature; the words are those of COLMAP's SIFT.
 
     Attributes:
-        camera_model: COLMAP's name.
-        peak_threshold: Contrast.
-        edge_threshold: Ratio of curvatures.
         max_features: In a photograph.
-        affine_shape: Adapt features to slanted surfaces.
-        threads: At least 1.
     """
 
     camera_model: str
@@ -59,13 +54,9 @@ def find_features(
     Args:
         space: Without a database, which is made. Where it has masks, features lie where they
             are not black.
-        settings: What counts as a feature.
         focals_px: Focal length of each photograph where it is known before. A camera shared by
             several photographs gets their median.
         lenses: Number of each photograph's lens; those of one lens have one size.
-
-    Returns:
-        How many features each photograph has.
     """
     pycolmap = loaded()
 

@@ -30,7 +30,6 @@ class Features(Record):
     """Features of one photograph.
 
     Attributes:
-        pixels: Where.
         descriptors: Of length 1, but for rounding.
     """
 
@@ -58,7 +57,6 @@ class Near:
     Attributes:
         matrix: Fundamental matrix, or homography from the first photograph to the second.
         max_error_px: Largest distance: Sampson's from the epipolar line, or from the mapped point.
-        planar: Whether it is a homography.
     """
 
     matrix: Float[Tensor, "3 3"]
@@ -74,7 +72,6 @@ def match_guided(
     Args:
         space: With pairs matched and verified.
         pairs: Which; those that are not verified stay as they are.
-        settings: What counts as a match.
     """
     features: dict[int, Features] = {}
     with quiet(), loaded().Database.open(space.database) as stored:
@@ -107,9 +104,6 @@ def guided_matches(
 
     Args:
         max_ratio: Of the angles between a descriptor and the two most like it.
-
-    Returns:
-        Features that are each other's best match.
     """
     one, other = likeness(first, second, near)
     (some,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)

@@ -51,7 +51,6 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
     Args:
         database: With features, matches and verified pairs. Where nothing is at rest it stays
             as it is.
-        settings: What counts as a match.
 
     Returns:
         What was found, with the former features in the order of the photographs' names.
@@ -93,9 +92,6 @@ class Matched:
 
     Attributes:
         ids: Of the photographs in the database, in the order of their names.
-        cameras: COLMAP's, one a photograph.
-        keypoints: Pixels, one tensor a photograph.
-        pairs: Their matches.
     """
 
     ids: tuple[int, ...]

@@ -18,7 +18,6 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
     of their own.
 
     Args:
-        sizes: Width and height of each.
         focals_px: Focal length of each; NaN where it is not known.
 
     Returns:
@@ -51,11 +50,6 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
 
     Args:
         views: Photographs, see :func:`sensor_turns`.
-        shared: One lens was asked for.
-        own: One each was asked for.
-
-    Raises:
-        InputError: One lens for photographs of unlike sizes.
     """
     if own:
         return list(range(views.num_views))

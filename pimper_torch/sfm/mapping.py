@@ -24,7 +24,6 @@ class MapSettings:
         min_inliers: Points of the model that a new view must see.
         pairs_count: Points that only two views see take part, too: they tie views with
             little overlap, less exactly.
-        seed: Of everything random.
     """
 
     min_inliers: int

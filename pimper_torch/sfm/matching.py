@@ -34,8 +34,6 @@ class MatchSettings:
         max_ratio: Of the distances to the best and the second best descriptor.
         max_error_px: Distance from the epipolar line.
         min_inliers: Verified matches below which a pair does not count.
-        seed: Of everything random.
-        threads: At least 1.
     """
 
     max_ratio: float
@@ -47,13 +45,7 @@ class MatchSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class VerifiedPair(Record):
-    """Matches of two photographs that one epipolar geometry explains.
-
-    Attributes:
-        views: Numbers of the photographs.
-        first: Pixels in the first.
-        second: Pixels in the second.
-    """
+    """Matches of two photographs that one epipolar geometry explains."""
 
     views: PhotographPair
     first: Float[Tensor, "match 2"]
@@ -70,7 +62,6 @@ def match_pairs(space: Workspace, pairs: Sequence[PhotographPair], settings: Mat
 
     Args:
         pairs: Not matched before.
-        settings: What counts as a match.
     """
     pycolmap = loaded()
 
@@ -117,7 +108,6 @@ def strongest(
 
     Args:
         counts: Verified matches of each pair, or another weight.
-        num_views: How many photographs there are.
     """
     chosen: set[PhotographPair] = set()
     for view in range(num_views):

@@ -21,10 +21,6 @@ class SparseModel(Record):
     Attributes:
         names: Of the registered photographs.
         lenses: One a view, before undistortion.
-        cam_from_world: Rigid.
-        points_world: The cloud.
-        observation_point: Which point each observation sees.
-        observation_view: Which view it is made in.
         observation_pixels: Where, in the photograph before undistortion.
         background_from_view: Maps from pixels of each photograph, before undistortion, to those
             where the background is at rest before which the object turns; NaN where a view shows
@@ -137,10 +133,6 @@ def match_names(
 
     A model's image may lie in a subfolder, and its name may have been rewritten by another program:
     see :func:`~pimper_torch.file_names.match_files`.
-
-    Args:
-        where: The model came from, for the message.
-        photographs: Path of the folder that they lie in.
 
     Raises:
         InputError: No photograph is in the model, or a name may be any of several.

@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from pimper_torch.errors import InputError
+from pimper_torch.records import Lens
 
 Parsed = TypeVar("Parsed")
 
@@ -46,26 +47,11 @@ _AGAIN = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FileCamera:
-    """A camera as its file has it; any number may be nonsense."""
-
-    camera: int
-    model: str
-    width: int
-    height: int
-    params: tuple[int | float, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FileImage:
     """An image as its file has it.
 
     Attributes:
-        image: Its number.
         quaternion: Of ``cam_from_world``, real part first.
-        translation: Of ``cam_from_world``.
-        camera: Number of its camera.
-        name: Of its file.
         pixels: Of its features, ``feature 2``.
         points: The point that each sees; negative where none.
     """
@@ -84,8 +70,6 @@ class FilePoints:
     """All points as their file has them.
 
     Attributes:
-        points: Their numbers.
-        xyz: Where they are, ``point 3``.
         track_point: Position in ``points`` of what each element of a track belongs to.
         track_image: Number of the image of each element.
         track_feature: Position among the features of that image.
@@ -102,7 +86,7 @@ class FilePoints:
 class FileModel:
     """The three files of a model."""
 
-    cameras: tuple[FileCamera, ...]
+    cameras: tuple[Lens, ...]  # any number may be nonsense
     images: tuple[FileImage, ...]
     points: FilePoints
 
@@ -204,7 +188,7 @@ class _Bytes:
         return text
 
 
-def _binary_cameras(data: bytes) -> tuple[FileCamera, ...]:
+def _binary_cameras(data: bytes) -> tuple[Lens, ...]:
     file = _Bytes(data)
     cameras = []
     for _ in range(file.count("cameras", 48)):
@@ -212,15 +196,8 @@ def _binary_cameras(data: bytes) -> tuple[FileCamera, ...]:
         if not 0 <= kind < len(CAMERA_MODELS):
             raise _Broken(f"has a camera of the unknown model {int(kind)}")
         model, params = CAMERA_MODELS[int(kind)]
-        cameras.append(
-            FileCamera(
-                camera=int(camera),
-                model=model,
-                width=int(width),
-                height=int(height),
-                params=file.take(f"<{params}d"),
-            )
-        )
+        values, size = file.take(f"<{params}d"), {"width": int(width), "height": int(height)}
+        cameras.append(Lens(camera=int(camera), model=model, params=values, **size))
     return tuple(cameras)
 
 
@@ -298,7 +275,7 @@ def _whole(word: str, number: int) -> int:
     return value
 
 
-def _text_cameras(data: bytes) -> tuple[FileCamera, ...]:
+def _text_cameras(data: bytes) -> tuple[Lens, ...]:
     cameras = []
     for number, line in _lines(data):
         words = line.split()
@@ -312,7 +289,7 @@ def _text_cameras(data: bytes) -> tuple[FileCamera, ...]:
             raise _Broken(f"has in line {number} {len(params)} parameters; needed: {needed}")
         camera, width, height = (_whole(words[at], number) for at in (0, 2, 3))
         cameras.append(
-            FileCamera(camera=camera, model=words[1], width=width, height=height, params=params)
+            Lens(camera=camera, model=words[1], width=width, height=height, params=params)
         )
     return tuple(cameras)
 

@@ -77,8 +77,6 @@ def find_moved_object(
     Of the two bodies the object is the one nearer to the middle of the photographs.
 
     Args:
-        keypoints: Pixels, one tensor a photograph.
-        sizes_px: Width and height of each.
         verified: Matches of each pair that its geometry explains.
         outside: Matches of the same pairs that it does not.
         max_error_px: Distance from the epipolar line up to which a match is verified.
@@ -126,12 +124,6 @@ def object_votes(
     """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
     Features that match are of one body, and so are those of one geometry in a pair that has two.
-
-    Args:
-        keypoints: Pixels, one tensor a photograph.
-        sizes_px: Width and height of each.
-        verified: Matches of each pair that its geometry explains.
-        seconds: Matches of a second body, where there is one.
     """
     inside = [
         1 - 2 * ((pixels - size / 2) / size).norm(dim=1)
@@ -166,11 +158,6 @@ def series_of(
     Correlation clustering: pairs in which one geometry explains features of both bodies attract,
     pairs that show two bodies repel, and pairs that match otherwise attract where nothing else
     tells.
-
-    Args:
-        verified: Matches of each pair that its geometry explains.
-        seconds: Matches of a second body, where there is one.
-        votes: As of :func:`object_votes`.
 
     Source: greedy additive edge contraction of Keuper et al., Efficient Decomposition of Image and
     Mesh Graphs by Lifted Multicuts, ICCV 2015.

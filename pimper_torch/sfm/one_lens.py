@@ -18,14 +18,7 @@ _SCALE_PX, _TOLERANCE = 1.0, 1e-5
 
 
 def doubt_one_lens(model: SparseModel) -> str:
-    """State why photographs were taken with several lenses, if a lens each fits much better.
-
-    Args:
-        model: Adjusted.
-
-    Returns:
-        The reason, and what to do; empty where nothing speaks against the model's lenses.
-    """
+    """State why photographs were taken with several lenses, if a lens each fits much better."""
     shared = Counter(lens.camera for lens in model.lenses)
     if not shared or max(shared.values()) < _FEWEST or not len(model.points_world):
         return ""

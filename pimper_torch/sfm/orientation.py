@@ -44,9 +44,6 @@ def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
     Args:
         model: Its views are the photographs, in their order, and have their shapes.
         where: The model is, for messages, as a sentence starts.
-
-    Raises:
-        InputError: A photograph may be turned by a quarter either way.
     """
     allowed, exif = allowed_turns(model, views), _exif_turns(views)
     upright, stored = _hypotheses(exif, allowed)

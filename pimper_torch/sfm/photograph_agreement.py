@@ -73,10 +73,7 @@ def require_agreement(
     """Refuse cameras that explain too little of what photographs show in common.
 
     Args:
-        model: Cameras; its views are the photographs.
         verified: Matches that an epipolar geometry of their own explains.
-        max_error_px: Distance from epipolar lines.
-        where: The cameras are, for the message.
 
     Raises:
         InputError: Names the convention that would fit, if one of the usual does.

@@ -113,7 +113,6 @@ class OneAPose(NamedTuple):
 
     Attributes:
         scene: Those photographs alone, with what all of their poses observe.
-        chosen: Which views of the whole scene they are.
         of: Which of them has the pose of each view of the whole scene.
     """
 

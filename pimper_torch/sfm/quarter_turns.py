@@ -37,9 +37,6 @@ def turned_pixels(
 ) -> Float[Tensor, "*batch 2"]:
     """Return where pixels are after clockwise quarter turns of their picture.
 
-    Args:
-        quarters: Any whole number.
-
     >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
     tensor([5., 3.])
     """
@@ -87,8 +84,6 @@ def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]
     """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
 
     Args:
-        width: Of what is cut out.
-        height: Of what is cut out.
         corner: Its pixel in the whole picture.
     """
     values, focals = list(lens.params), _focals(lens)

@@ -4,10 +4,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import (
     InputError,
@@ -83,51 +84,24 @@ class ReconstructConfig:
     camera_model: str = "SIMPLE_RADIAL"
     shared_camera: bool = False
     own_cameras: bool = False
-    peak_threshold: float = 0.002
-    edge_threshold: float = 10.0
-    max_features: int = 4096
+    peak_threshold: Annotated[float, Range(above=0, most=1)] = 0.002
+    edge_threshold: Annotated[float, Range(above=0, most=1e6)] = 10.0
+    max_features: Annotated[int, Range(least=8, most=65_536)] = 4096
     affine_shape: bool = True
-    max_ratio: float = 0.8
-    guided_pairs: int = 10
-    max_error_px: float = 2.0
-    starts: int = 3
-    track_iterations: int = 2
-    threads: int = 0
-    seed: int = 0
+    max_ratio: Annotated[float, Range(above=0, most=1)] = 0.8
+    guided_pairs: Annotated[int, Range(least=0, most=100_000)] = 10
+    max_error_px: Annotated[float, Range(above=0, most=1e6)] = 2.0
+    starts: Annotated[int, Range(least=0, most=1000)] = 3
+    track_iterations: Annotated[int, Range(least=0, most=1000)] = 2
+    threads: Annotated[int, Range(least=0, most=1024)] = 0
+    seed: Annotated[int, Range(least=0, most=2**31 - 1)] = 0
 
     def __post_init__(self) -> None:
-        require(
-            self.camera_model in CAMERA_MODELS,
-            "camera_model",
-            self.camera_model,
-            "one of " + ", ".join(CAMERA_MODELS),
-        )
-        require(
-            not (self.shared_camera and self.own_cameras),
-            "own_cameras",
-            self.own_cameras,
-            "false where shared_camera is true",
-        )
-        require(self.peak_threshold > 0, "peak_threshold", self.peak_threshold, "more than 0")
-        require(self.edge_threshold > 0, "edge_threshold", self.edge_threshold, "more than 0")
-        require(self.max_features >= 8, "max_features", self.max_features, "at least 8")
-        require(0 < self.max_ratio <= 1, "max_ratio", self.max_ratio, "in (0, 1]")
-        require(self.max_error_px > 0, "max_error_px", self.max_error_px, "more than 0")
-        require(self.guided_pairs >= 0, "guided_pairs", self.guided_pairs, "0 or more")
-        require(self.starts >= 0, "starts", self.starts, "0 or more")
-        require(self.track_iterations >= 0, "track_iterations", self.track_iterations, "0 or more")
-        require(self.threads >= 0, "threads", self.threads, "0 for all cores, or a number of them")
-        require(self.seed >= 0, "seed", self.seed, "0 or more")
-        # Two photographs' matches take 4 bytes for every pair of features.
-        require_at_most(self, max_features=65_536)
-        # More than any photograph has neighbours, and more processors than COLMAP counts.
-        require_at_most(self, guided_pairs=100_000, threads=1024)
-        # A structure from motion each, and a bundle adjustment each.
-        require_at_most(self, starts=1000, track_iterations=1000)
-        # COLMAP's seeds are whole numbers of 32 bits.
-        require_at_most(self, seed=2**31 - 1)
-        # Contrasts are fractions of full scale; the others reach beyond any photograph.
-        require_at_most(self, peak_threshold=1.0, edge_threshold=1e6, max_error_px=1e6)
+        known = "one of " + ", ".join(CAMERA_MODELS)
+        require(self.camera_model in CAMERA_MODELS, "camera_model", self.camera_model, known)
+        both = self.shared_camera and self.own_cameras
+        require(not both, "own_cameras", self.own_cameras, "false where shared_camera is true")
+        require_ranges(self)
 
     @property
     def num_threads(self) -> int:
@@ -213,7 +187,6 @@ class Reconstruct(Stage):
         """Place the photographs.
 
         Args:
-            views: At least 3.
             sparse_model: Folder of a COLMAP model, or a file of cameras (``transforms.json``,
                 Metashape, Meshroom, arrays), to take instead of running structure from motion.
                 Views are matched by file name; the cameras may have been made from photographs of
@@ -311,14 +284,7 @@ def find_model(
 def kept_model(
     store: Store | None, key: str | None, find: Callable[[], SparseModel]
 ) -> tuple[SparseModel, float]:
-    """Take a model that was kept, or find one and keep it; what was warned of is warned of again.
-
-    Args:
-        store: Where; without it, or a key, nothing is kept.
-
-    Returns:
-        The model, and the seconds of wall clock in which it was found.
-    """
+    """Take a model that was kept, or find one and keep it; its warnings are repeated."""
     kept = store.find(key, SparseModel) if store and key else None
     if kept is not None:
         model, told = kept
@@ -341,9 +307,6 @@ def kept_model(
 
 def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:
     """Find features, match them, grow a model and find its points again in every view.
-
-    Args:
-        views: At least 3.
 
     Returns:
         The model of the registered views, in the photographs' order and under their names.

@@ -51,9 +51,7 @@ class TrackSettings:
     """How tracks are refined.
 
     Attributes:
-        iterations: Of finding points again and adjusting cameras.
         fewest_points: A view that shows fewer of the points that were found keeps its features.
-        track_observations: When a point counts as found.
     """
 
     iterations: int
@@ -72,8 +70,6 @@ def refine_tracks(
     Rounds before the last find a part of the points, for cameras alone.
 
     Args:
-        views: The photographs, in the model's order.
-        model: As structure from motion found it.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:

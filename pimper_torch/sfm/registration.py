@@ -50,7 +50,6 @@ class RegistrationSettings:
     """How photographs are registered.
 
     Attributes:
-        matching: What counts as a match.
         mapping: How views are added to a model; ``pairs_count`` and further seeds are set by the
             pass.
         guided_pairs: Strongest pairs of each photograph that are matched along epipolar lines,
@@ -122,12 +121,6 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     lines: pairs of missing photographs, or all where some are misplaced. Then it starts the mapper
     several times, with other random numbers, and at last lets points count that only two views see.
     The first complete model ends it.
-
-    Returns:
-        The best of all runs.
-
-    Raises:
-        ReconstructionError: Nothing moves from photograph to photograph.
     """
     match_pairs(space, all_pairs(len(space.files)), settings.matching)
     other = space.with_copied_database("other.db")

@@ -152,9 +152,6 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     Args:
         folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
             installed COLMAP writes; made if it does not exist.
-
-    Raises:
-        OutputError: The files cannot be written.
     """
     model = SparseModel(
         names=scene.views.names,

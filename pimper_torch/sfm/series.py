@@ -56,9 +56,6 @@ def with_series(
 
     Views of a series that is hardly in the model are left out: little but the object ties them to
     the others.
-
-    Args:
-        model: In the object's frame; of all photographs or some.
     """
     kept = torch.nonzero(torch.bincount(numbers)[numbers] >= FEWEST_VIEWS)[:, 0]
     small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS

@@ -12,7 +12,7 @@ from pimper_torch.geometry.frames import rigid
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Lens
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.model_files import FileCamera, FileImage, FileModel
+from pimper_torch.sfm.model_files import FileImage, FileModel
 
 # Choices: a model of which more is broken is not believed; no photograph is wider or higher.
 _MAX_BROKEN, _MAX_SIDE = 0.5, 10**6
@@ -29,13 +29,10 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     points that are not finite; and observations that name an image or a feature that is not
     there, or not each other.
 
-    Args:
-        folder: Of the model, for messages.
-
     Raises:
         InputError: More than half of the images or points are broken: says why.
     """
-    lenses = {one.camera: _lens(one) for one in files.cameras if _camera_fault(one) == ""}
+    lenses = {one.camera: one for one in files.cameras if _camera_fault(one) == ""}
     kept, faults, seen = [], dict[str, list[str]](), set[object]()
     for image in sorted(files.images, key=lambda one: one.image):
         fault = _image_fault(image, files, lenses)
@@ -91,7 +88,7 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     )
 
 
-def _camera_fault(camera: FileCamera) -> str:
+def _camera_fault(camera: Lens) -> str:
     if camera.model == "EQUIRECTANGULAR":
         return "have a camera without a focal length, EQUIRECTANGULAR"
     if not all(0 < side <= _MAX_SIDE for side in (camera.width, camera.height)):
@@ -101,16 +98,6 @@ def _camera_fault(camera: FileCamera) -> str:
     one = camera.model.startswith(("SIMPLE", "RADIAL"))  # focal length for both axes
     positive = min(camera.params[: 1 if one else 2]) > 0
     return "" if positive else "have a camera whose focal length is not above 0"
-
-
-def _lens(camera: FileCamera) -> Lens:
-    return Lens(
-        camera=camera.camera,
-        model=camera.model,
-        params=camera.params,
-        width=camera.width,
-        height=camera.height,
-    )
 
 
 def _image_fault(image: FileImage, files: FileModel, lenses: dict[int, Lens]) -> str:

@@ -28,9 +28,6 @@ def sound(scene: SparseScene) -> SparseScene:
 
     Args:
         scene: Photographs, cameras and cloud. Where all can be used, it is returned as it is.
-
-    Raises:
-        ReconstructionError: Fewer than three views are left.
     """
     finite = scene.points_world.isfinite().all(dim=1)
     leave_out("sfm.sound_points", ~finite)

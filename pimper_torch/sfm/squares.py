@@ -50,7 +50,6 @@ def sides_of(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2
     """Compute the sides of each observation's square, a step long, in pixels of the photographs.
 
     Args:
-        model: Its views are the photographs, in their order.
         views: Resized, in the orientation of the model's pictures or turned by quarters.
     """
     axes = _axes(model, views)

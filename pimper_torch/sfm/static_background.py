@@ -37,8 +37,6 @@ class Pair(Record):
     """Matched features of two photographs.
 
     Attributes:
-        first: Number of a photograph.
-        second: Of another.
         matches: A feature of the first and one of the second in each row.
     """
 
@@ -104,7 +102,6 @@ def find_static_background(
     matches and do not vote.
 
     Args:
-        keypoints: Pixels, one tensor a photograph.
         verify: Gives those matches of each pair that one epipolar geometry explains; called for
             moving matches only.
         still_px: Distance between the features of a still match, less than.

@@ -27,7 +27,6 @@ class Tangents(Record):
     """Planes through points, float64.
 
     Attributes:
-        points_world: Their centres.
         steps_world: Two vectors along the plane, right-angled and equally long: about a pixel of
             the reference view each.
         reference: The view that shows the plane best among those that see the point.
@@ -81,7 +80,6 @@ def plane_normals(
     """Return the unit normals of the planes that points and their nearest ones lie on.
 
     Args:
-        points: At least one.
         towards: Unit; what a normal points to, and what it is where neighbours say otherwise.
     """
     places = points.detach().cpu().numpy()

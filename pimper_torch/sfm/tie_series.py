@@ -31,7 +31,6 @@ def tie_series(
     Args:
         database: With features, matches and verified pairs. Where nothing was moved it stays as it
             is.
-        settings: What counts as a match.
 
     Returns:
         The series, and the matches of the surroundings, within series and between.

@@ -116,8 +116,6 @@ class TrackObservations(Record):
     """Where views show points.
 
     Attributes:
-        point: Which.
-        view: In which.
         pixels: Where, in the undistorted photograph.
     """
 
@@ -132,8 +130,6 @@ class _Templates(Record):
 
     Attributes:
         values: Light taken out; the window's square root is in them.
-        slopes: By a step along the plane.
-        inverse: Of the slopes' normal equations.
         usable: True where the reference shows nearly all of the patch, with texture.
     """
 
@@ -169,10 +165,6 @@ def sight(
 
     A point's place in its reference view is where the cameras put it: there the template is
     taken. In the other views it is where the same patch is found.
-
-    Args:
-        cameras: Theirs, float64.
-        settings: When a point counts as found.
 
     Returns:
         Sorted by point, then view; the reference's own is there where another view found

@@ -58,10 +58,7 @@ class TriangulationSettings:
     """How points are found.
 
     Attributes:
-        features: What counts as one.
-        matching: What counts as a match.
         guided_pairs: Of each photograph, that are matched along epipolar lines.
-        tracks: How points are found again in every view; cameras are held fixed.
     """
 
     features: FeatureSettings
@@ -94,7 +91,6 @@ def triangulate(
     Args:
         models: Of them, in their order: cameras in the ways in which they may be meant; the one
             that fits best is taken. Points that it has are replaced where more are found.
-        where: The cameras are, for messages.
         crops: Of them, those of photographs that may have been cropped.
 
     Returns:

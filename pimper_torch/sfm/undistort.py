@@ -26,7 +26,6 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 
     Args:
         views: Any; padding stays zero.
-        lenses: One a view, of the photograph's size.
 
     Returns:
         The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
@@ -81,10 +80,8 @@ def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _G
     """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
 
     Args:
-        lens: Of the photograph.
         like: Of the grid's device and type.
         width: Of a map that covers the photograph, in its own pixels; the photograph's by default.
-        height: Of the map.
 
     Returns:
         Places for ``grid_sample``; nothing for a lens without distortion.
@@ -154,11 +151,6 @@ def photograph_pixels(
     lens: Lens, width: int = 0, height: int = 0
 ) -> Float[Tensor, "height width 2"]:
     """Find where in the photograph each pixel of its pinhole image comes from.
-
-    Args:
-        lens: Of the photograph.
-        width: Of a map that covers the photograph; the photograph's by default.
-        height: Of the map.
 
     Returns:
         In pixels of the map, float64; NaN where the lens cannot image the direction.

@@ -76,9 +76,6 @@ def level_up(cam_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
 
     Least squares with Cauchy's weights, as some cameras may have been turned: x axes are level, y
     axes point down. Where x axes do not differ, it is the mean of the y axes, turned round.
-
-    Args:
-        cam_from_world: Rigid, of photographs that are turned as EXIF says.
     """
     right, down = cam_from_world[:, 0, :3].double(), cam_from_world[:, 1, :3].double()
     up = normalize(-down.mean(dim=0), dim=0)

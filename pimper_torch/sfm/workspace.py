@@ -24,11 +24,9 @@ class Workspace:
     """A folder with the files of one run.
 
     Attributes:
-        folder: Holds the files.
         files: Names of the photographs in ``images``, in the order of the views.
         masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
             behind, as COLMAP wants them.
-        database_name: File of COLMAP's database.
     """
 
     folder: Path
@@ -60,11 +58,7 @@ class Workspace:
 
 @contextmanager
 def workspace(views: Views, threads: int) -> Iterator[Workspace]:
-    """Write photographs and masks to a temporary folder, which goes when the block ends.
-
-    Args:
-        threads: That write at the same time; at least 1.
-    """
+    """Write photographs and masks to a temporary folder, which goes when the block ends."""
     with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
         space = Workspace(
             folder=Path(folder),

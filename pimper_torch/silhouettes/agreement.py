@@ -31,7 +31,6 @@ class Agreement(Record):
     as at the end of an arc. A cut outside contradicts them, as where its camera is misplaced.
 
     Attributes:
-        overlap: Intersection over union.
         covered: Fraction of the cut that is inside the projection.
         extent: Fraction of the picture that the cut takes.
         exposed: Fraction of the cut that shows a background for certain.

@@ -17,7 +17,6 @@ def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) ->
     """Find silhouettes in the views of each series, and put them side by side.
 
     Args:
-        scene: With series or without.
         find: From the scene of one series to its silhouettes.
 
     Returns:

@@ -22,7 +22,6 @@ class SplitCloud(Record):
     """The cloud's points, divided into object and background.
 
     Attributes:
-        on_object: The object's.
         background: Certainly not the object's; the remainder may be either.
     """
 
@@ -43,7 +42,6 @@ def split_cloud(
     that point.
 
     Args:
-        fixation: Where the cameras look.
         tolerance: Of the plane, scene units.
         box_world: What is outside is not the object.
     """

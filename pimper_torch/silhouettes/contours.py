@@ -26,10 +26,7 @@ class Contours(Record):
     """Rays that the surface is tangent to, and the hull that it lies in.
 
     Attributes:
-        silhouettes: Of all views.
         rays: Through the silhouettes of all reliable views.
-        cameras: Of all views.
-        hull: The visual hull of the same silhouettes.
     """
 
     silhouettes: Silhouettes
@@ -61,12 +58,7 @@ class Contours(Record):
     def touching(
         self, points_world: Float[Tensor, "point 3"], normals_world: Float[Tensor, "point 3"]
     ) -> ContourPoints:
-        """Find where the rays touch a surface; see :func:`.contour_points`.
-
-        Args:
-            points_world: Of the surface: a cloud or a mesh's vertices.
-            normals_world: Theirs, unit, outward.
-        """
+        """Find where the rays touch a surface; see :func:`.contour_points`."""
         if not self.confine:
             rays, none = self.rays, points_world.new_zeros(0)
             return ContourPoints(

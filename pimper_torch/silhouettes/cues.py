@@ -34,9 +34,7 @@ class Cues(Record):
     """What is known of the object before any view is cut.
 
     Attributes:
-        pictures: At the working size.
         object_px: Pixels of the object's points, one tensor a view.
-        background_px: Of points that are not the object's.
         plane: That the object stands on.
         background_from_view: Maps to a room at rest before which the object turns; empty without.
         agreement: With the texture of plane and room, the better of both.
@@ -132,11 +130,7 @@ class Cues(Record):
 
 
 def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:
-    """Gather what is known of the object from photographs, cameras and cloud.
-
-    Args:
-        details: Settings that are the same for all photographs.
-    """
+    """Gather what is known of the object from photographs, cameras and cloud."""
     scene = scene.to("cpu", torch.float32)
     pictures = working_pictures(scene.views, scene.cameras, config.size_px)
     cameras, points = pictures.cameras, scene.points_world

@@ -39,9 +39,6 @@ class FindSilhouettes(Stage):
     def forward(self, scene: SparseScene) -> Silhouettes:
         """Find silhouettes, or take the masks for them.
 
-        Args:
-            scene: Photographs, cameras and cloud.
-
         Returns:
             Everything where that is asked for. A mask that clearly contradicts those of the others
             is not believed: the hull of these stands in for it. Where silhouettes cannot be

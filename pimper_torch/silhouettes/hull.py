@@ -73,7 +73,6 @@ class Hull(Record):
         """Find points inside, or so little outside that silhouettes do not tell.
 
         Args:
-            points_world: Anywhere.
             tolerance: Scene units outside that do not count, if they are more than that.
         """
         return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
@@ -176,7 +175,6 @@ def visual_hull(
     memory grow with the voxels.
 
     Args:
-        silhouettes: Where the views show the object.
         box_world: Smallest and largest corner of the region to look in; the grid is fitted to
             what it holds.
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.

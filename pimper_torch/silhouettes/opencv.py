@@ -54,7 +54,6 @@ def warped(
 
     Args:
         homography: From pixels of the result to those of ``picture``.
-        size_px: Width and height of the result.
     """
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from centres
     matrix = np.linalg.inv(half) @ homography.double().numpy() @ half

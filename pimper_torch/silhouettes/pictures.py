@@ -27,7 +27,6 @@ class Pictures(Record):
         colours: Encoded as sRGB, exposed alike; padding is black.
         opponent: Brightness and two ratios of colours, which shadows change little.
         grey: Logarithm of the mean radiance.
-        cameras: Of these sizes.
         factors: Size of these pictures over that of the photographs, across and down.
     """
 

@@ -18,11 +18,7 @@ _SOFT = 0.5  # working pixels: the width of a border
 
 
 def silhouettes_of(cuts: Cuts, views: Views, details: SilhouetteDetails) -> Silhouettes:
-    """Repair single cuts, and give silhouettes at the photographs' size.
-
-    Args:
-        details: What makes a view reliable.
-    """
+    """Repair single cuts, and give silhouettes at the photographs' size."""
     cuts = repaired(cuts)
     found = _at_full_size(cuts, views)
     reliable = agreement_of(cuts).reliable(details).to(found.device)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from skimage.measure import find_contours
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
@@ -48,37 +48,17 @@ class RayConfig:
         min_length_px: Shorter silhouettes are specks.
     """
 
-    per_view: int = 300
-    blur_px: float = 1.0
-    tangent_px: float = 3.0
-    corner_px: float = 6.0
-    max_convex_deg: float = 90.0
-    max_concave_deg: float = 40.0
-    border_px: float = 3.0
-    min_length_px: float = 24.0
+    per_view: Annotated[int, Range(least=1, most=1_000_000)] = 300
+    blur_px: Annotated[float, Range(above=0, most=65_535)] = 1.0
+    tangent_px: Annotated[float, Range(above=0, most=65_535)] = 3.0
+    corner_px: Annotated[float, Range(least=1, most=65_535)] = 6.0
+    max_convex_deg: Annotated[float, Range(above=0, most=180)] = 90.0
+    max_concave_deg: Annotated[float, Range(above=0, most=180)] = 40.0
+    border_px: Annotated[float, Range(least=0, most=65_535)] = 3.0
+    min_length_px: Annotated[float, Range(least=0, most=65_535)] = 24.0
 
     def __post_init__(self) -> None:
-        require(self.per_view >= 1, "contours.per_view", self.per_view, "1 or more")
-        require(self.blur_px > 0, "contours.blur_px", self.blur_px, "above 0")
-        require(self.tangent_px > 0, "contours.tangent_px", self.tangent_px, "above 0")
-        require(self.corner_px >= 1, "contours.corner_px", self.corner_px, "1 or more")
-        for name in ("max_convex_deg", "max_concave_deg"):
-            degrees = getattr(self, name)
-            require(0 < degrees <= 180, f"contours.{name}", degrees, "in (0, 180]")
-        require(self.border_px >= 0, "contours.border_px", self.border_px, "0 or more")
-        require(self.min_length_px >= 0, "contours.min_length_px", self.min_length_px, "0 up")
-        # A pixel of a contour each; the longest photographs' have so many.
-        require_at_most(self, "contours", per_view=1_000_000)
-        # Photographs end there.
-        require_at_most(
-            self,
-            "contours",
-            blur_px=65_535.0,
-            tangent_px=65_535.0,
-            corner_px=65_535.0,
-            border_px=65_535.0,
-            min_length_px=65_535.0,
-        )
+        require_ranges(self, "contours")
 
 
 def contour_rays(
@@ -112,14 +92,7 @@ def contour_rays(
         )
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
-    found = [_nothing(cameras), *side_by_side(of_view, views)]
-    return ContourRays(
-        view=torch.cat([one.view for one in found]),
-        pixels=torch.cat([one.pixels for one in found]),
-        rays_world=torch.cat([one.rays_world for one in found]),
-        normals_world=torch.cat([one.normals_world for one in found]),
-        sigma_px=torch.cat([one.sigma_px for one in found]),
-    )
+    return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])
 
 
 def _nothing(cameras: Cameras) -> ContourRays:

@@ -1,9 +1,9 @@
 """Settings of finding and correcting silhouettes."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.geometry.supporting_plane import PlaneSearch
 
 
@@ -23,15 +23,13 @@ class SilhouetteConfig:
 
     object: Literal["auto", "masks", "everything"] = "auto"
     region: tuple[float, ...] = ()
-    size_px: int = 640
+    size_px: Annotated[int, Range(least=64, most=65_535)] = 640
 
     def __post_init__(self) -> None:
-        require(self.size_px >= 64, "size_px", self.size_px, "64 or more")
+        require_ranges(self)
         low, high = self.region[:3], self.region[3:]
         fits = len(self.region) in (0, 6) and all(a < b for a, b in zip(low, high, strict=True))
         require(fits, "region", self.region, "nothing, or smallest x, y, z, then largest")
-        # Photographs end there.
-        require_at_most(self, size_px=65_535)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +42,6 @@ class SilhouetteDetails:
         iterations: Of cutting and voting after the first cut.
         num_voxels: Of the visual hull.
         disagreeing: Fraction of the views that may see a voxel of the hull outside.
-        plane: What counts as the supporting plane.
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not reliable.
         max_exposed: Fraction of a view's silhouette that may show a background for certain: the

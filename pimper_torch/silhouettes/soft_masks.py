@@ -30,7 +30,6 @@ class SoftMasks(Record):
 
     Attributes:
         inside: Probability of the object; one half where nothing is said.
-        given: Views with a mask.
         seeds_px: Pixels of the object in each view, from maps that say nothing else.
     """
 

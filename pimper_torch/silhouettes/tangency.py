@@ -1,6 +1,7 @@
 """Where contour rays touch the surface."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pimper_torch.config import require, require_at_most
+from pimper_torch.config import Range, require_ranges
 from pimper_torch.parallel import num_workers
 from pimper_torch.records import Cameras, ContourPoints, ContourRays
 from pimper_torch.silhouettes.hull import Hull
@@ -34,20 +35,13 @@ class TangencyConfig:
             that they differ by less than this: nothing tells which of them it touches.
     """
 
-    steps: int = 128
-    refined_steps: int = 12
-    tolerance_px: float = 1.5
-    ambiguous_px: float = 2.0
+    steps: Annotated[int, Range(least=4, most=100_000)] = 128
+    refined_steps: Annotated[int, Range(least=2, most=100_000)] = 12
+    tolerance_px: Annotated[float, Range(least=0, most=65_535)] = 1.5
+    ambiguous_px: Annotated[float, Range(least=0, most=65_535)] = 2.0
 
     def __post_init__(self) -> None:
-        require(self.steps >= 4, "touch.steps", self.steps, "4 or more")
-        require(self.refined_steps >= 2, "touch.refined_steps", self.refined_steps, "2 or more")
-        require(self.tolerance_px >= 0, "touch.tolerance_px", self.tolerance_px, "0 or more")
-        require(self.ambiguous_px >= 0, "touch.ambiguous_px", self.ambiguous_px, "0 or more")
-        # Each takes every ray's nearest distance.
-        require_at_most(self, "touch", steps=100_000, refined_steps=100_000)
-        # Photographs end there.
-        require_at_most(self, "touch", tolerance_px=65_535.0, ambiguous_px=65_535.0)
+        require_ranges(self, "touch")
 
 
 @torch.no_grad()
@@ -68,7 +62,6 @@ def contour_points(
     Args:
         points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
             any, positions are in the centre of what is in the hull.
-        normals_world: Theirs, unit, outward.
 
     Returns:
         At most one place a ray. A ray has none where it does not meet the hull, and where

@@ -49,14 +49,7 @@ class Store:
     fresh: bool = False
 
     def find(self, key: str, cls: type[AnyRecord]) -> tuple[AnyRecord, dict[str, Any]] | None:
-        """Read a record; ``None`` where there is none, or a damaged one.
-
-        Args:
-            key: As it was kept under.
-
-        Returns:
-            The record, bit for bit and settled, and what was said when it was kept.
-        """
+        """Read a record; ``None`` where there is none, or a damaged one."""
         if self.fresh:
             return None
         try:
@@ -81,9 +74,6 @@ class Store:
 
         Returns:
             Whether it is kept: it is not where it alone is larger than the folder may be.
-
-        Raises:
-            OutputError: The folder cannot be written.
         """
         hashed = digest(record)
         if hashed is None:

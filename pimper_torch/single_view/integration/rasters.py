@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.linalg.multigrid import DEFAULT_TOLERANCE, Iterate
+from pimper_torch.linalg.multigrid import Iterate
+from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
 from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.single_view.integration.free_components import FreeComponents, free_components
