@@ -137,11 +137,11 @@ def read_reference(path: Path | str) -> str | None:
         ) from error
 
 
-def mask_path(folder: Path, name: str) -> Path:
+def mask_path(folder: Path | str, name: str) -> Path:
     """Return where the mask of a photograph is written: under its name, never outside the folder.
 
     >>> mask_path(Path("masks"), "pose_03/../light_02.jpg").as_posix()
     'masks/pose_03/light_02.png'
     """
     parts = PurePosixPath(name.replace("\\", "_")).with_suffix(".png").parts
-    return folder.joinpath(*(part for part in parts if part not in ("/", "..")))
+    return Path(folder).joinpath(*(part for part in parts if part not in ("/", "..")))

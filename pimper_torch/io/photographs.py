@@ -160,9 +160,9 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
     return torch.tensor([folders.index(path.parent) for path in paths])
 
 
-def image_name(path: Path, folder: Path | str) -> str:
+def image_name(path: Path | str, folder: Path | str) -> str:
     """Return the name of an image of a folder, with the folder inside that it lies in."""
-    return path.relative_to(folder).as_posix()
+    return Path(path).relative_to(folder).as_posix()
 
 
 def _named_path(folder: Path | str) -> str:
