@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.ambiguity import Ambiguity
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 
@@ -22,9 +20,7 @@ class Problem(Record):
         mask: True at the pixels.
         lights: If known.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
-        generator: On the CPU.
         robust: Whether shadows and highlights lose weight.
-        ambient: Whether pixels have ambient radiance.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -33,9 +29,7 @@ class Problem(Record):
     mask: Bool[Tensor, "height width"]
     lights: Float[Tensor, "view 3"] | None
     intrinsics: Float[Tensor, "3 3"] | None
-    generator: torch.Generator
     robust: bool
-    ambient: bool
 
     @property
     def gray(self) -> Float[Tensor, "view pixel"]:
@@ -58,9 +52,9 @@ class Solution(Record):
 
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view unknown"]
+    lights: Float[Tensor, "view 3"]
     weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | Ambiguity | None
+    applied: BasRelief | None
     free: str
 
 
