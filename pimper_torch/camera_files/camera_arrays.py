@@ -42,9 +42,6 @@ def read_camera_arrays(
     They belong to ``names``, if that array is there, or else to the photographs in plain order of
     their names (``10`` before ``2``), of which there are as many.
 
-    Args:
-        sizes_of: Of photographs, which the lenses are for.
-
     Returns:
         Without cameras of photographs that are not there.
 

@@ -155,8 +155,6 @@ def numbers(
 
     Args:
         value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
-        count: How many are needed.
-        what: Their name in the file.
         kind: The data set, as its users call it.
 
     Raises:

@@ -85,7 +85,6 @@ def frame_camera(
     Args:
         frame: Of :func:`read_frames`.
         name: Of its photograph, for messages too.
-        size_px: That the lens is for.
 
     Raises:
         InputError: It is no camera.

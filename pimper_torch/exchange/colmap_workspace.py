@@ -91,7 +91,6 @@ def write_pinholes(
 
     Args:
         cameras: Those of the scene, in the frame of ``scene.offset_world``.
-        files: Of the photographs, one a view.
         folder: Gets the binary files; made if it is not there.
 
     Raises:

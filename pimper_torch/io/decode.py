@@ -293,7 +293,6 @@ def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool
     """Open a file with Pillow.
 
     Args:
-        use: What to do with it.
         whole: Read all of it at once; not needed for its header.
     """
 

@@ -118,7 +118,6 @@ def write_result(
     Args:
         config: The dataclass of settings that it ran with.
         folder: New or empty; its parents are made.
-        overwrite: Replace a former result.
         about: More for ``summary.json``.
         files: How many faces the mesh has, and in which formats.
         report: Whether ``report.html`` is written.

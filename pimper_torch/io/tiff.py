@@ -52,7 +52,6 @@ class Layout:
         page: Number of the directory that holds the picture.
         deep: Read by :func:`read_deep_tiff`: colour or opacity of more than 8 bits.
         inverted: 0 is white, and Pillow does not undo it.
-        opacity: What the sample after the colours is.
         full: Level of full scale that the file tells.
         cautions: What cannot be followed, or had to be chosen.
     """

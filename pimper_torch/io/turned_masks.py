@@ -59,8 +59,6 @@ def choose_ways(
 
     Args:
         ways: Of every mask; of two, the first as it is.
-        pictures: The photographs, of the masks' sizes.
-        where: The masks are, for messages.
     """
     open_ones = [
         (masks, picture)

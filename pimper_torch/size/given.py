@@ -80,8 +80,6 @@ class ScaleBar:
     """Two places, and how far apart they are.
 
     Attributes:
-        first: One end.
-        second: The other.
         length: Between them, in the unit wanted.
     """
 
@@ -104,7 +102,6 @@ class CameraDistance:
 
     Attributes:
         first: Name of a photograph, with its suffix or without.
-        second: Name of the other.
         length: Between the centres of projection, in the unit wanted.
     """
 

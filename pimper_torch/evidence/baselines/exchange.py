@@ -51,7 +51,6 @@ def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path
     """Write pinholes, cloud and tracks as a COLMAP model, binary, in the scene's own frame.
 
     Args:
-        names: Of the written photographs, one a view.
         folder: Gets ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
 
     Raises:

@@ -24,7 +24,6 @@ class Program:
     Attributes:
         name: As it is called on the command line.
         variable: Environment variable that may name it, or the folder it lies in.
-        source: Where to get it.
         folders: Folders that its installer uses and that are seldom on the PATH.
     """
 
@@ -82,7 +81,6 @@ class Deadline:
     """A limit of time that several programs share.
 
     Attributes:
-        minutes: From now on.
         began: Set by itself.
     """
 
@@ -127,7 +125,6 @@ def run_program(
 
     Args:
         folder: Working directory. What the program prints is kept there too.
-        threads: For programs that ask OpenMP.
 
     Returns:
         What it printed.

@@ -111,7 +111,6 @@ def thin_plate(
     """Return the positions of the subdivided mesh's vertices on the surface of least bending.
 
     Args:
-        subdivision: Of the coarse mesh.
         weights: ``w`` of its vertices; one at least, in every piece, above 0.
 
     Raises:

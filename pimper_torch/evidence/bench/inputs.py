@@ -30,7 +30,6 @@ class Inputs(Record):
         scene: Cameras and cloud, found or true, and the photographs.
         coarse: Facets for the baselines that start from some; of the default preset.
         capture: The truth, without photographs and maps.
-        surface: Its surface, prepared for the comparison with all methods.
         maps: Of the methods' reference view alone, for those of all fill the memory.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
@@ -48,7 +47,6 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
 
     Args:
         name: Of a rendered scene, or a folder with ``truth`` in it.
-        workspace: Where a rendering goes.
 
     Raises:
         InputError: No scene, mesh or folder has that name.

@@ -28,9 +28,7 @@ class Outcome(Record):
         estimate: Surface, cameras, lights.
         seconds: Wall clock without structure from motion.
         mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
-        triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
-        missing_fraction: Of the samples.
         external: A program of its own did the work, whose memory is not this process's.
     """
 

@@ -111,7 +111,6 @@ class Table(Record):
 
     Attributes:
         rows: In the order they are shown.
-        machine: That they were measured on.
         date: ISO 8601.
         scale: ``quick`` or ``full``.
         settings: Whatever else decides the figures, as JSON can hold it.

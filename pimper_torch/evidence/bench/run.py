@@ -39,8 +39,6 @@ class Measured(Record):
     """One cell of the bench: a method on a scene.
 
     Attributes:
-        row: Its figures.
-        panels: Its pictures.
         covered: True where rays of the reference view meet truth and surface; ``None`` if it
             has no surface.
     """
@@ -75,7 +73,6 @@ def run_bench(
 
     Args:
         folder: New or empty.
-        observer: Hears of every scene and method.
         cache: Folder where the models of structure from motion are kept from run to run.
 
     Raises:

@@ -63,7 +63,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
         Args:
             out: Folder for the table, its figures and all surfaces; new or empty.
-            config: Scenes and methods.
             cache: Folder where structure from motion is kept from run to run, so that a change
                 of a later stage costs only the later stages.
             overwrite: Replace a former result in OUT.

@@ -184,7 +184,6 @@ class TruthRead:
     Attributes:
         capture: All its views, perhaps without maps.
         maps: The views to compare in, with maps; ``None`` where ``capture`` has them.
-        protocol: Of the DTU set.
     """
 
     capture: Capture

@@ -38,7 +38,6 @@ class PointLightFiles(Record):
     """The photographs of one viewpoint and their lights, in the files' own axes.
 
     Attributes:
-        paths: One photograph a light.
         directions: Unit, from the object to the point light; x right, y up, z to the viewer.
         intensities: Red, green, blue.
     """

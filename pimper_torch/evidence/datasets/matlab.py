@@ -17,7 +17,6 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
     """Read numeric arrays of a MATLAB file (up to version 7).
 
     Args:
-        names: Of the variables wanted.
         kind: The data set, for messages.
 
     Raises:

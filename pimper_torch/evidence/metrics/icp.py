@@ -55,7 +55,6 @@ class IcpResult(Record):
         truth_from_world: Similarity.
         distance: What was measured: ``plane`` or ``point``.
         residual: Root mean square distance of the samples that were kept, scene units.
-        iterations: Taken.
         converged: False where the limit of iterations stopped it.
     """
 

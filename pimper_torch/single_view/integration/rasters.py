@@ -48,7 +48,6 @@ class RasterSystem:
             ``"mean_zero"`` gives each the mean 0, and ignores the mean of its right-hand side;
             ``"refuse"`` raises.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
-        what: Names the system in errors.
 
     Raises:
         InputError: Weights that are negative or not finite; ``"cosine"`` where they differ.

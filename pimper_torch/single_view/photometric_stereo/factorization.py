@@ -55,7 +55,6 @@ def factorize_photographs(
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        rank: 3 for point lights.
         robust: Whether to reweight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
 

@@ -43,7 +43,6 @@ class Curls(Record):
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
         down: ``s ^ ds/dy``.
-        weight: Of each equation.
         noise: Covariance of ``across``, and of ``down``, from the noise of the pseudo-normals;
             up to a factor.
     """

@@ -147,7 +147,6 @@ class Method:
     """A method by its name.
 
     Attributes:
-        solve: From the problem and the name of a resolver.
         resolvers: Of its ambiguity; the first is the default.
         calibrated: Whether it needs lights.
         perspective: Whether it needs intrinsics.

@@ -18,7 +18,6 @@ class Problem(Record):
         radiance: Linear; zero where missing.
         weight: 0 where missing.
         mask: True at the pixels.
-        lights: If known.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
         robust: Whether shadows and highlights lose weight.
     """
@@ -43,9 +42,6 @@ class Solution(Record):
 
     Attributes:
         normals: Unit or zero.
-        albedo: Of each colour.
-        lights: Of the views that have samples.
-        weight: Final weight of each sample.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -66,7 +62,6 @@ class Surfaced(Record):
         shading: Albedo times normal.
         lights: Of the same factorization.
         reliability: Of each pixel; 0 leaves it out.
-        weight: Of each sample.
     """
 
     shading: Float[Tensor, "3 pixel"]

@@ -85,7 +85,6 @@ def reweigh(
     """Update the samples' weights by their residuals.
 
     Args:
-        radiance: Observed.
         predicted: By a fit; below zero for lights from behind.
         widen: Multiple of the scale.
 
@@ -119,7 +118,6 @@ def determined(
     """Find which pixels have as many samples as unknowns, and lights that span them.
 
     Args:
-        weight: Of the samples, after a regression.
         lights: The scale of each column does not matter.
         least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
             1 % in the images is as large as the solution.

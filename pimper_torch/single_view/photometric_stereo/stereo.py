@@ -42,7 +42,6 @@ class PhotometricStereo(Record):
         finding: A :class:`Finding` for each pixel.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
-        unused_views: Without any sample.
     """
 
     normals: Float[Tensor, "height width 3"]
