@@ -24,9 +24,6 @@ def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = Non
         kind: The data set, as its users call it.
         needed: What should be there.
         found: What is there instead; by default what the folder holds.
-
-    Raises:
-        InputError: Not ``ok``.
     """
     if ok:
         return

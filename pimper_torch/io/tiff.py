@@ -154,11 +154,7 @@ def _full(tags: Mapping[int, Any], bits: int) -> int:
 
 
 def read_deep_tiff(path: Path | str, layout: Layout) -> np.ndarray:
-    """Read colour of more than 8 bits, ``height width channel``; opacity comes last.
-
-    Raises:
-        Exception: Whatever tifffile and kornia_rs raise of a damaged file.
-    """
+    """Read colour of more than 8 bits, ``height width channel``; opacity comes last."""
     with tifffile.TiffFile(path) as file:
         page = file.pages[layout.page]
         assert isinstance(page, tifffile.TiffPage), "read one by one, pages are whole"

@@ -30,9 +30,6 @@ def mask_ways(
 
     Args:
         drawn: As the mask's file has it, turned by an EXIF of its own.
-
-    Raises:
-        InputError: None is of the photograph's size.
     """
     ways = [drawn]
     if header.orientation != 1 and found.orientation == 1:

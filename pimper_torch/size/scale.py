@@ -71,9 +71,6 @@ def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
 
     Args:
         lengths: One at least.
-
-    Raises:
-        InputError: A length is zero.
     """
     for length in lengths:
         if not (length.found > 0 and length.known > 0):

@@ -186,9 +186,6 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
     Args:
         rows: At least one; a method that is missing in one leaves its place empty there.
         path: Ends in ``.png``.
-
-    Raises:
-        InputError: There are no rows.
     """
     if not rows:
         raise InputError("there is no scene to draw; needed: one or more.")

@@ -69,9 +69,6 @@ def read_surface(path: Path, program: str, printed: str) -> Mesh:
     """Read the mesh or the points that a program wrote.
 
     Its colours are dropped: they are radiance under this light, no albedo.
-
-    Raises:
-        ReconstructionError: It left no file, none that can be read, or no points in it.
     """
     if not path.is_file():
         raise ReconstructionError(

@@ -38,9 +38,6 @@ class Program:
         Args:
             given: The executable itself, or the folder it lies in. If set, nowhere else is
                 looked.
-
-        Raises:
-            MissingProgramError: Says where it was looked for and where to get it.
         """
         named = given or (Path(os.environ[self.variable]) if self.variable in os.environ else None)
         if named is not None:
@@ -128,10 +125,6 @@ def run_program(
 
     Returns:
         What it printed.
-
-    Raises:
-        MissingProgramError: It cannot be started at all.
-        ReconstructionError: It failed or took too long; with its last lines.
     """
     name = Path(command[0]).name
     began = time.monotonic()

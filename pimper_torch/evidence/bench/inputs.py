@@ -47,9 +47,6 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
 
     Args:
         name: Of a rendered scene, or a folder with ``truth`` in it.
-
-    Raises:
-        InputError: No scene, mesh or folder has that name.
     """
     if (Path(name) / "truth").is_dir():
         return Path(name)
@@ -63,9 +60,6 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
     Args:
         cache: Folder where models are kept; the seconds of one from there are those that it
             took to find.
-
-    Raises:
-        PimperError: Not such a folder, or structure from motion fails.
     """
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
     if config.cameras == "true":

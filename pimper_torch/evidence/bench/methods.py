@@ -51,11 +51,7 @@ _BASELINES: dict[str, Callable[[], nn.Module]] = {
 
 
 def method_named(name: str) -> Method:
-    """Find a baseline by name, or a preset, or a YAML file of settings.
-
-    Raises:
-        ConfigError: Nothing has that name.
-    """
+    """Find a baseline by name, or a preset, or a YAML file of settings."""
     if name in _BASELINES:
         return _baseline(_BASELINES[name]())
     try:

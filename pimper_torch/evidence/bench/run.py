@@ -74,11 +74,6 @@ def run_bench(
     Args:
         folder: New or empty.
         cache: Folder where the models of structure from motion are kept from run to run.
-
-    Raises:
-        ConfigError: No such method.
-        InputError: No such scene.
-        OutputError: The folder holds something else, or cannot be written.
     """
     observer = observer or Silent()
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}

@@ -115,11 +115,7 @@ def read_diligent(
 
 
 def point_light_files(folder: Path, kind: str) -> PointLightFiles:
-    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``.
-
-    Raises:
-        InputError: Texts are missing, or photographs and lights differ in number.
-    """
+    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
     for name in ("light_directions.txt", "light_intensities.txt"):
         expect((folder / name).is_file(), folder, kind, name)
     directions = _rows_of_three(folder / "light_directions.txt", kind)

@@ -43,10 +43,6 @@ def dtu_capture(
             of positions in ascending order.
 
     Other arguments are those of the readers.
-
-    Raises:
-        InputError: A position or light that is not there, or a photograph that cannot be read or
-            has another size.
     """
     table = [position for position, _, _ in named], [light for _, light, _ in named]
     chosen = choose_photographs(

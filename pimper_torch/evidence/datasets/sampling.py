@@ -73,9 +73,6 @@ def choose_photographs(
 
     Returns:
         Indices of photographs, by position and then light.
-
-    Raises:
-        InputError: A position or light that does not exist.
     """
     _refuse_absent(position, positions, "positions", path, kind)
     _refuse_absent(light, lights, "lights", path, kind)

@@ -177,11 +177,7 @@ class TrueSurface:
 
 
 def true_surface(capture: Capture) -> Mesh:
-    """Return the true mesh of the object, or its points as a mesh without faces.
-
-    Raises:
-        InputError: There is neither.
-    """
+    """Return the true mesh of the object, or its points as a mesh without faces."""
     truth = capture.truth
     if truth.mesh is not None:
         return truth.mesh

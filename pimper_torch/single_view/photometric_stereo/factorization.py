@@ -58,9 +58,6 @@ def factorize_photographs(
         robust: Whether to reweight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
 
-    Raises:
-        InputError: Fewer views or fewer usable pixels than the rank.
-
     Constant to autograd.
 
     Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition; variable projection as in

@@ -95,9 +95,6 @@ def curls(
         weight: Of the pixels; 0 leaves one out.
         noise: Covariance of ``s``, up to a factor; by default noise is white, as after a singular
             value decomposition.
-
-    Raises:
-        InputError: Fewer equations than unknowns.
     """
     s, w = pseudo.double(), weight.double()
     moment = (w * s) @ s.mT
