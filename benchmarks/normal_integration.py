@@ -20,10 +20,10 @@ from statistics import fmean
 import matplotlib as mpl
 import torch
 from matplotlib import pyplot as plt
+from one_viewpoint import NormalMap, read_normal_map
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.datasets.diligent import NormalMap, read_normal_map
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map
 from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps

@@ -28,10 +28,7 @@ from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.photometry.cone import project_to_cone
-from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.radiometry import linear_from_srgb
-from pimper_torch.single_view.factorization.ambiguity import align_factorizations
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
 from pimper_torch.single_view.photometric_stereo.methods import METHODS
@@ -99,15 +96,6 @@ def scenes(folder: Path) -> dict[str, Callable[[], Scene]]:
         "bunny": lambda: rendered(
             folder / "bunny_hr.obj", "bunny, many strengths, one albedo", False
         ),
-        "soft": lambda: softened(
-            rendered(
-                folder / "bunny_hr.obj",
-                "bunny, soft light",
-                False,
-                spread_deg=110.0,
-                point_lights=80,
-            )
-        ),
     }
 
 
@@ -164,18 +152,11 @@ def figures(found: PhotometricStereo, truth: Tensor, lights: Tensor) -> list[str
     given = lights[used].double()
     mine = found.lights[used].double()
     best_normals, best_lights = normals, mine
-    if found.lights.shape[1] == 3 and found.free != "nothing":
+    if found.free != "nothing":
         relief = best_relief(normals, true)
         best_normals, best_lights = relief.on_shading(normals), relief.on_lights(mine)
-    elif found.lights.shape[1] == 4:
-        even = torch.ones(normals.shape[1], dtype=torch.float64)
-        cone = harmonics(normals.mT).mT
-        lorentz = align_factorizations(cone, harmonics(true.mT).mT, even)
-        best_normals = project_to_cone(lorentz.on_shading(cone).mT).mT[1:]
-        best_lights = lorentz.on_lights(mine)
     best = angles_deg(best_normals, true).mean()
-    point_lights = [one[:, 1:4] if one.shape[1] > 3 else one for one in (mine, best_lights)]
-    aims = [angles_deg(one.mT, given.mT).mean() for one in point_lights]
+    aims = [angles_deg(one.mT, given.mT).mean() for one in (mine, best_lights)]
     return [*cells, f"{best:.2f}", f"{aims[0]:.2f}", f"{aims[1]:.2f}"]
 
 
@@ -334,25 +315,6 @@ def rendered(
         mask=scene.foreground[0],
         lights=(strength[:, None] * directions).float(),
         normals=scene.normals_world[0] @ rotation.float().mT,
-    )
-
-
-def softened(scene: Scene) -> Scene:
-    """Mix photographs to those of a dozen and a half wide lights, brighter on one side."""
-    generator = torch.Generator().manual_seed(8)
-    count = 18
-    aims = normalize(torch.randn(count, 3, generator=generator), dim=1)
-    aims[:, 2] = -aims[:, 2].abs()
-    directions = normalize(scene.lights, dim=1)
-    # A lobe of 60 degrees or so over light from everywhere.
-    fraction = 0.4 + (3 * (aims @ directions.mT - 1)).exp()
-    fraction = fraction / len(directions) * 2
-    return Scene(
-        name=scene.name,
-        images=torch.einsum("vl,lchw->vchw", fraction, scene.images).clamp_max(1),
-        mask=scene.mask,
-        lights=fraction @ scene.lights,
-        normals=scene.normals,
     )
 
 

@@ -42,7 +42,6 @@ class Atlas(Record):
         uv: Right and down over the texture, in [0, 1].
         width: Texels.
         height: Texels.
-        charts: Connected pieces.
     """
 
     vertex: Int[Tensor, " copy"]

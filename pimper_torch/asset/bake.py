@@ -50,7 +50,6 @@ class Textured(Record):
         base_color: sRGB.
         normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
         reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
-        charts: Connected pieces of the textures.
     """
 
     mesh: Mesh

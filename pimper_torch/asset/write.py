@@ -32,7 +32,6 @@ def write_asset(
 
     Args:
         offset_world: Of the node; see ``SparseScene.offset_world``.
-        more: Of the vertices, by the attributes' names.
     """
     mesh, images = asset.mesh, [_png(asset.base_color), _png(asset.normal)]
     told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence, **(more or {})}

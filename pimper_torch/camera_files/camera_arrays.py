@@ -42,9 +42,6 @@ def read_camera_arrays(
     They belong to ``names``, if that array is there, or else to the photographs in plain order of
     their names (``10`` before ``2``), of which there are as many.
 
-    Args:
-        sizes_of: Of photographs, which the lenses are for.
-
     Returns:
         Without cameras of photographs that are not there.
 
@@ -99,11 +96,7 @@ def read_world_mats(
 
 
 def numbered_matrices(path: Path, key: str, count: int) -> Float[Tensor, "view 4 4"]:
-    """Read ``key_0`` and so on, and refuse more or fewer than there are images.
-
-    Raises:
-        InputError: So.
-    """
+    """Read ``key_0`` and so on, and refuse more or fewer than there are images."""
     arrays = _read(path, lambda name: name.startswith(f"{key}_") and "inv" not in name)
     wanted = [f"{key}_{index}" for index in range(count)]
     expect(

@@ -26,7 +26,6 @@ def far_better(given: float, scores: Sequence[float], left: float, margin: float
 
     Args:
         given: Score of the data as given, up to 1.
-        scores: Those of the candidates.
         left: Fraction that the best may leave unexplained of what the given data leave.
         margin: By which its score must be higher, too.
     """
@@ -43,9 +42,7 @@ class CameraMistake:
 
     Attributes:
         name: Short, for programs.
-        meaning: What was done.
         remedy: What the user does about it.
-        undo: Corrects the cameras.
     """
 
     name: str

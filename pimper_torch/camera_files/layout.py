@@ -24,9 +24,6 @@ def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = Non
         kind: The data set, as its users call it.
         needed: What should be there.
         found: What is there instead; by default what the folder holds.
-
-    Raises:
-        InputError: Not ``ok``.
     """
     if ok:
         return
@@ -155,8 +152,6 @@ def numbers(
 
     Args:
         value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
-        count: How many are needed.
-        what: Their name in the file.
         kind: The data set, as its users call it.
 
     Raises:

@@ -85,10 +85,6 @@ def frame_camera(
     Args:
         frame: Of :func:`read_frames`.
         name: Of its photograph, for messages too.
-        size_px: That the lens is for.
-
-    Raises:
-        InputError: It is no camera.
     """
     matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
     rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []

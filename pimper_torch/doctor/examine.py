@@ -23,7 +23,6 @@ def examine_folder(
 
     Args:
         encoding: As of :func:`pimper_torch.io.photographs.load_views`.
-        max_size_px: As of a run.
 
     Returns:
         In the order of the checks: files, samples, number, blur, saturation, exposure, lenses,

@@ -11,10 +11,8 @@ class Finding:
     """What one check found.
 
     Attributes:
-        check: Its name.
         severity: ok; a note, which may be meant; a warning, where the result will suffer; or an
             error, with which a run is refused.
-        found: What there is.
         needed: What there should be; empty where all is well.
         advice: What to do; empty where all is well.
     """

@@ -28,7 +28,6 @@ class Photograph(Record):
     """What is known of a photograph without its neighbours.
 
     Attributes:
-        name: Of the file.
         width: Pixels, as a run would take them.
         height: Pixels.
         focal_px: By EXIF; NaN where it does not say.
@@ -86,7 +85,6 @@ def read_all(
     Args:
         encoding: As of :func:`pimper_torch.io.photographs.load_views`; saturation that is to be
             found is taken for full scale, as one photograph alone cannot tell it.
-        max_size_px: As of a run.
     """
     plain = Encoding(
         response=encoding.response,

@@ -91,11 +91,7 @@ def write_pinholes(
 
     Args:
         cameras: Those of the scene, in the frame of ``scene.offset_world``.
-        files: Of the photographs, one a view.
         folder: Gets the binary files; made if it is not there.
-
-    Raises:
-        OutputError: The model cannot be written.
     """
     pixels = torch.empty_like(scene.observation_pixels, dtype=torch.float64)
     for view, (lens, K) in enumerate(zip(scene.lenses, cameras.intrinsics.double(), strict=True)):

@@ -105,6 +105,7 @@ def read_header(path: Path | str) -> Header:
         if orientation >= 5 and layout is None:  # Pillow has turned a TIFF's size
             width, height = height, width
         deep = layout.deep if layout else png is not None and _is_deep_png(path)
+        cmyk = image.mode == "CMYK" and layout is None
         sixteen = deep or image.mode.startswith("I;16")
         return Header(
             width=width,
@@ -117,7 +118,7 @@ def read_header(path: Path | str) -> Header:
             significant=_significant(png),
             transparent=_transparent(png) if sixteen else (),
             colour=_colour(image, exif, png),
-            cautions=(*cautions, *_mode_cautions(image), *(layout.cautions if layout else ())),
+            cautions=(*cautions, *[CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
             layout=layout,
         )
 
@@ -268,12 +269,6 @@ def _colour(image: Image.Image, exif: Image.Exif, png: PngHead | None) -> Colour
     return colour_of_exif(exif) if said is SILENT else said
 
 
-def _mode_cautions(image: Image.Image) -> list[str]:
-    if image.mode != "CMYK" or isinstance(image, TiffImagePlugin.TiffImageFile):
-        return []
-    return [CMYK_CAUTION]
-
-
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
     """Refuse, by its header, an image that memory should not be taken for."""
     pixels, held = width * height, path.stat().st_size
@@ -293,7 +288,6 @@ def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool
     """Open a file with Pillow.
 
     Args:
-        use: What to do with it.
         whole: Read all of it at once; not needed for its header.
     """
 

@@ -76,11 +76,7 @@ def read_estimate(path: Path | str) -> Estimate:
 
 
 def read_cameras(folder: Path | str) -> tuple[tuple[str, ...], Cameras]:
-    """Read the views of a COLMAP model as pinholes; a lens's distortion is left out.
-
-    Raises:
-        InputError: The folder holds no model that can be read.
-    """
+    """Read the views of a COLMAP model as pinholes; a lens's distortion is left out."""
     folder = Path(folder)
     model = read_model(folder)
     intrinsics = [pinhole_of(lens) for lens in model.lenses]
@@ -98,9 +94,6 @@ def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view
 
     Returns:
         ``None`` where there is no such file, no view, or no light.
-
-    Raises:
-        InputError: The file cannot be read.
     """
     path = Path(path)
     if not path.is_file() or not names:
@@ -119,11 +112,7 @@ def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view
 
 
 def read_reference(path: Path | str) -> str | None:
-    """Read the name of the reference view; ``None`` where there is no such file.
-
-    Raises:
-        InputError: The file cannot be read.
-    """
+    """Read the name of the reference view; ``None`` where there is no such file."""
     path = Path(path)
     if not path.is_file():
         return None

@@ -23,7 +23,6 @@ class Header(Record):
         full_told: The file itself says what its full scale is.
         significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
         transparent: Levels of the one colour of 16 bits that a PNG calls transparent.
-        colour: What the file says about its samples.
         cautions: What it says and is not followed, each a sentence without its subject.
         layout: Of a TIFF; ``None`` for other files.
     """

@@ -142,11 +142,7 @@ def _power(exponent: float) -> Response:
 
 
 def table(radiance: Float[Tensor, " entry"]) -> Curve:
-    """Make a response of the radiance that belongs to levels evenly spaced from 0 to 1.
-
-    Raises:
-        InputError: It falls, or hardly rises.
-    """
+    """Make a response of the radiance that belongs to levels evenly spaced from 0 to 1."""
     highest = radiance.clamp_min(0).cummax(dim=0).values
     sound = bool(radiance.isfinite().all()) and float((highest - radiance).max()) < _MAX_FALL
     if not sound or float(highest[-1] - highest[0]) < _MIN_RISE:

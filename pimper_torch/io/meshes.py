@@ -296,13 +296,14 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
     if encoded is not None:
         kind = np.asarray(colors).dtype
         encoded = encoded[:, :3] / (np.iinfo(kind).max if kind.kind in "ui" else 1)
+    vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     written = getattr(getattr(raw, "dtype", None), "names", None) or raw
     known = {name: _rows(raw[name]) if name in written else None for name in _ERRORS}
     if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
         normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
     return Mesh(
-        vertices_world=transform(scene_from_part, _some_rows(part.vertices)),
+        vertices_world=transform(scene_from_part, torch.tensor(vertices)),
         faces=faces,
         normals_world=None
         if normals is None
@@ -317,10 +318,6 @@ def _rows(values: Any) -> Tensor | None:  # noqa: ANN401 - untyped
         return None
     # A column of a file's records has a stride that torch does not know.
     return torch.from_numpy(np.array(values, dtype=np.float64))
-
-
-def _some_rows(values: Any) -> Float[Tensor, "row 3"]:  # noqa: ANN401 - untyped
-    return torch.tensor(np.asarray(values, dtype=np.float64).reshape(-1, 3))
 
 
 def _joined(parts: Sequence[Mesh]) -> Mesh:

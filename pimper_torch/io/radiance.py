@@ -182,10 +182,8 @@ def _fill(
     """Write the radiance of each file into the images; count its levels if that is asked for.
 
     Args:
-        images: Written to.
         given: Response of all; ``None`` for that of each file.
         whites: Levels of saturation that were found.
-        tally: Count levels.
     """
     opaque: list[Tensor | None] = []
     tallies: dict[_Kind, _Tally] = {}

@@ -92,6 +92,7 @@ def read_raw(path: Path | str) -> np.ndarray:
     rawpy = load_extra("raw", path)
     with _opened(path) as raw:
         white = _white(raw)
+        black = min((int(level) for level in raw.black_level_per_channel), default=0)
         saturated = _saturated(raw, white)
         array = raw.postprocess(
             demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
@@ -100,7 +101,7 @@ def read_raw(path: Path | str) -> np.ndarray:
             user_wb=[1.0, 1.0, 1.0, 1.0],
             user_flip=0,
             # Counted from black, by LibRaw; the file's own if it tells no lower one.
-            user_sat=white - _black(raw) if white < raw.white_level else None,
+            user_sat=white - black if white < raw.white_level else None,
             gamma=(1, 1),
             no_auto_bright=True,
             adjust_maximum_thr=0.0,
@@ -153,10 +154,6 @@ def _white(raw: Any) -> int:  # noqa: ANN401 - as above
     """Return the level of saturation: the lowest that the file tells."""
     told = [int(level) for level in raw.camera_white_level_per_channel or () if level]
     return min([int(raw.white_level), *told])
-
-
-def _black(raw: Any) -> int:  # noqa: ANN401 - as above
-    return min((int(level) for level in raw.black_level_per_channel), default=0)
 
 
 def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as above

@@ -25,9 +25,6 @@ def response_of(encoding: Encoding) -> Response:
     """Return the response that was chosen, reading its file if it is a measured one.
 
     ``auto``, where no file says another, is sRGB.
-
-    Raises:
-        InputError: As :func:`read_curve`.
     """
     choice = encoding.response
     if choice in ("auto", "srgb"):

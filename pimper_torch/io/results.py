@@ -118,7 +118,6 @@ def write_result(
     Args:
         config: The dataclass of settings that it ran with.
         folder: New or empty; its parents are made.
-        overwrite: Replace a former result.
         about: More for ``summary.json``.
         files: How many faces the mesh has, and in which formats.
         report: Whether ``report.html`` is written.
@@ -139,7 +138,9 @@ def write_result(
             _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
         with part(3, _PARTS):
             asset = textured(found.mesh, few, relighting.materials.at_vertices())
-            _write_asset(asset, files or MeshFiles(), whole.scene.offset_world, staging)
+            write_asset(asset, staging / "asset.glb", whole.scene.offset_world)
+            if "obj" in (files or MeshFiles()).formats:
+                write_asset_obj(asset, staging / "asset.obj", whole.scene.offset_world)
             relighting = _with_textures(relighting, asset, whole)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
@@ -185,12 +186,6 @@ def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Pat
         write_stl(mesh, folder / "mesh.stl", offset)
     if "obj" in files.formats:
         write_obj(mesh, folder / "mesh.obj", offset, measured)
-
-
-def _write_asset(asset: Textured, files: MeshFiles, offset: Offset, folder: Path) -> None:
-    write_asset(asset, folder / "asset.glb", offset)
-    if "obj" in files.formats:
-        write_asset_obj(asset, folder / "asset.obj", offset)
 
 
 def _write_all(result: Reconstruction, config: object, folder: Path) -> None:

@@ -52,7 +52,6 @@ class Layout:
         page: Number of the directory that holds the picture.
         deep: Read by :func:`read_deep_tiff`: colour or opacity of more than 8 bits.
         inverted: 0 is white, and Pillow does not undo it.
-        opacity: What the sample after the colours is.
         full: Level of full scale that the file tells.
         cautions: What cannot be followed, or had to be chosen.
     """
@@ -155,11 +154,7 @@ def _full(tags: Mapping[int, Any], bits: int) -> int:
 
 
 def read_deep_tiff(path: Path | str, layout: Layout) -> np.ndarray:
-    """Read colour of more than 8 bits, ``height width channel``; opacity comes last.
-
-    Raises:
-        Exception: Whatever tifffile and kornia_rs raise of a damaged file.
-    """
+    """Read colour of more than 8 bits, ``height width channel``; opacity comes last."""
     with tifffile.TiffFile(path) as file:
         page = file.pages[layout.page]
         assert isinstance(page, tifffile.TiffPage), "read one by one, pages are whole"

@@ -30,9 +30,6 @@ def mask_ways(
 
     Args:
         drawn: As the mask's file has it, turned by an EXIF of its own.
-
-    Raises:
-        InputError: None is of the photograph's size.
     """
     ways = [drawn]
     if header.orientation != 1 and found.orientation == 1:
@@ -59,8 +56,6 @@ def choose_ways(
 
     Args:
         ways: Of every mask; of two, the first as it is.
-        pictures: The photographs, of the masks' sizes.
-        where: The masks are, for messages.
     """
     open_ones = [
         (masks, picture)

@@ -23,7 +23,6 @@ def with_cloud(
     """Make a coarse mesh of facets and the points of the cloud on them, with covariances.
 
     Args:
-        reliable: Its points on the object.
         reference: The view they were triangulated in.
         source: The point of the cloud at each vertex, -1 for none.
     """

@@ -97,7 +97,6 @@ def integrate_normals(
 
     Args:
         normals: Unit, ``n_z < 0``; anything where not valid.
-        valid: Where the normals are to be followed.
         information: Inverse variance of the normals, one over squared radians. They weigh
             ``1 / (1 + (sigma / 8°)^2)``, if ``iterations`` is not 0.
         spacing: Between samples, in the units of the depth.

@@ -55,7 +55,6 @@ def solve_poisson(
     Args:
         source: ``s``. Without anchor no ``z`` can produce its mean, which is ignored; ``z``
             then has mean zero.
-        weight_right: Of all steps to the right.
         anchor: ``a`` of all samples, not negative.
 
     Differentiable in ``source``.
@@ -99,7 +98,6 @@ def integrate_weighted(
     light part is left near the start.
 
     Args:
-        right: Wanted steps to the right.
         weight_right: Of ``right``, not negative.
         weight_down: Of ``down``.
         iterations: Limit; 0 gives :func:`integrate_steps`.

@@ -119,11 +119,7 @@ class _Trial:
         one: int,
         tried: Float[Tensor, "candidate 3"],
     ) -> Float[Tensor, "cluster 3"]:
-        """Return materials with a better one for one cluster, if the photographs agree on it.
-
-        Args:
-            one: Number of the cluster.
-        """
+        """Return materials with a better one for one cluster, if the photographs agree on it."""
 
         def with_one(rows: Float[Tensor, "candidate 3"]) -> Float[Tensor, "candidate cluster 3"]:
             changed = values.repeat(len(rows), 1, 1)

@@ -23,8 +23,6 @@ class Judged(Record):
 
     Attributes:
         psnr_db: Of sRGB values in [0, 1], over the object's pixels.
-        lights: That it was predicted under.
-        names: Of the photographs.
     """
 
     psnr_db: Float[Tensor, " view"]
@@ -38,7 +36,6 @@ class Relighting(Record):
 
     Attributes:
         lights: Of the photographs that the surface was made from.
-        materials: Of the mesh.
         judged: With materials.
         matte: Without any.
         held_out: Whether these photographs were held out, or the surface was made from them.
@@ -55,11 +52,7 @@ class Relighting(Record):
     def with_textures(
         self, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
     ) -> "Relighting":
-        """Judge the textured surface, too, under the same lights.
-
-        Args:
-            scene: Of the photographs that are judged by.
-        """
+        """Judge the textured surface, too, under the same lights."""
         surface = TexturedSurface(asset)
         observed = observe_all(surface, scene, silhouettes)
         materials = surface.materials(self.materials)
@@ -100,7 +93,6 @@ def relight(
 
     Args:
         mesh: In the scene's frame, with albedo.
-        scene: That the mesh was made from.
         held_out: What is predicted; without, the scene's own photographs.
     """
     surface = LitSurface(mesh)

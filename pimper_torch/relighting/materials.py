@@ -14,7 +14,6 @@ class Materials(Record):
     """Materials for base colours of :func:`~pimper_torch.viz.maps.base_color`.
 
     Attributes:
-        cluster: Of each vertex.
         metallic: In [0, 1].
         roughness: In [0, 1]; its square is GGX's alpha.
         specular: Times what glTF's dielectric mirrors head on; ``KHR_materials_specular``'s

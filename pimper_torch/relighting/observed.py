@@ -28,7 +28,6 @@ class Observed(Record):
     """What a photograph shows of a surface.
 
     Attributes:
-        pixels: Of the photograph as it was shrunk.
         radiance: Linear; 1 is saturated.
         weight: Of a squared error of radiance, so that errors count as sRGB shows them.
         saturated: True where the photograph is, in a part of the pixel at least: it tells no more

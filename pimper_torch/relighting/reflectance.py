@@ -40,7 +40,6 @@ def response(
     """Return the radiance under directed lights of strength 1.
 
     Args:
-        light: One for all materials, or as many.
         material: Metallic, roughness and specular; matte without.
     """
     if material is None:

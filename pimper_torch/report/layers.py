@@ -17,10 +17,7 @@ class Layer:
 
     Attributes:
         attribute: Of the asset's vertices, in small letters.
-        title: On the button.
         about: Longer, shown when the button is pointed at.
-        low_text: Beside the lowest colour.
-        high_text: Beside the highest.
     """
 
     attribute: str

@@ -48,7 +48,6 @@ def write_page(
     Args:
         headline: What went in and what came out, in a line.
         asset: The surface as a binary glTF, in the frame of ``scene``.
-        reference: View that the page begins from.
         layers: Of the asset's attributes; those that it lacks are not shown.
         summary: What ``summary.json`` says.
         settings: Of the run, as YAML.

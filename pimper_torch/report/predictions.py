@@ -25,7 +25,6 @@ class Prediction(Record):
 
     Attributes:
         radiance: Linear, under the photograph's fitted light; zero off the surface.
-        light: Of the photograph.
         figure: What the prediction is worth, in a few words.
     """
 
@@ -39,7 +38,6 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
 
     Args:
         mesh: In the scene's frame, with albedo.
-        relighting: Of the mesh and the scene.
     """
     surface, judged = LitSurface(mesh), relighting.judged
     longest = longest_px(scene.views.num_views) // _COARSER

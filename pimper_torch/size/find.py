@@ -31,7 +31,6 @@ def find_scale(
         bars: Places that are known distances apart.
         markers: Whether markers of ``pimper markers`` are looked for, and the length of their
             sides in millimetres, if it is not what their numbers say.
-        unit: Of lengths that are given, and wanted.
         own_frame: The cameras came with the photographs, in a unit of their own. Markers of which
             nothing was said are then compared alone.
 

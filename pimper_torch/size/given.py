@@ -52,9 +52,6 @@ class Mark:
     def read(cls, text: str) -> "Mark":
         """Read ``NAME,x,y``, or several of them with ``+`` between.
 
-        Raises:
-            InputError: Something else.
-
         >>> Mark.read("a, b.jpg,10,20.5").pointers
         (Pointer(name='a, b.jpg', x=10.0, y=20.5, size_px=None),)
         >>> str(Mark.read("1+1.jpg,10,20+c,7,8"))
@@ -80,8 +77,6 @@ class ScaleBar:
     """Two places, and how far apart they are.
 
     Attributes:
-        first: One end.
-        second: The other.
         length: Between them, in the unit wanted.
     """
 
@@ -104,7 +99,6 @@ class CameraDistance:
 
     Attributes:
         first: Name of a photograph, with its suffix or without.
-        second: Name of the other.
         length: Between the centres of projection, in the unit wanted.
     """
 
@@ -127,9 +121,6 @@ def number_of(name: str, names: Sequence[str]) -> int:
 
     Args:
         names: Of all photographs, different from one another.
-
-    Raises:
-        InputError: There is none, or several.
 
     >>> number_of("b", ["a.jpg", "b.jpg"])
     1

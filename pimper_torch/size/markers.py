@@ -34,9 +34,7 @@ class Marker(Record):
     """A marker in space.
 
     Attributes:
-        code: Its number.
         corners_world: Clockwise from its top left, as it was printed.
-        num_views: Photographs that agree on it.
     """
 
     code: int
@@ -59,7 +57,6 @@ def scale_of_markers(
     most others.
 
     Args:
-        scene: Photographs and their cameras.
         side_mm: Of the black squares; unless given, as long as their sheet says, see
             :func:`~pimper_torch.size.sheet.side_of`.
 
@@ -86,11 +83,7 @@ def scale_of_markers(
 
 
 def find_markers(scene: SparseScene) -> list[Marker]:
-    """Find printed markers in photographs, and where they are in space.
-
-    Args:
-        scene: Photographs and their cameras.
-    """
+    """Find printed markers in photographs, and where they are in space."""
     sizes, images = scene.views.sizes_px.tolist(), scene.views.images.detach()
 
     def one(view: int) -> list[Square]:

@@ -29,11 +29,8 @@ class Scale(Record):
 
     Attributes:
         factor: Of a result in its own unit.
-        unit: Of the lengths times the factor.
-        source: What tells it.
         residual: Root mean square of what single lengths are off, as a fraction of each; NaN where
             one length alone tells the factor.
-        count: Lengths, or markers, that tell it.
     """
 
     factor: float
@@ -60,7 +57,6 @@ class Length(Record):
     Attributes:
         found: In the result's unit.
         known: In the unit wanted.
-        what: For messages.
     """
 
     found: float
@@ -75,9 +71,6 @@ def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
 
     Args:
         lengths: One at least.
-
-    Raises:
-        InputError: A length is zero.
     """
     for length in lengths:
         if not (length.found > 0 and length.known > 0):

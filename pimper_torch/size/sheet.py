@@ -26,9 +26,7 @@ class PrintedMarker:
     """A marker on a sheet.
 
     Attributes:
-        code: Its number.
         left_mm: Of its black border, from the sheet's left edge.
-        top_mm: From the sheet's top edge.
     """
 
     code: int

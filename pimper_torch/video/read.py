@@ -41,9 +41,6 @@ def frame_pictures(
 
     Args:
         numbers: Of frames, from 0, ascending.
-
-    Raises:
-        InputError: As :func:`luma_frames`.
     """
     wanted = set(numbers)
     with _opened(path) as (container, stream):
@@ -59,9 +56,6 @@ def _whole_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:  # 
 
     The other field is interpolated (Weston 3-field deinterlacing) where a frame is marked as
     interlaced; pixels that are not square are stretched along one side.
-
-    Raises:
-        InputError: The size changes.
     """
     from av.filter import Graph
 

@@ -28,7 +28,6 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
     Where its photographs are gone, a warning says so, and the rest is shown.
 
     Args:
-        path: Of the folder, or of the file.
         photographs: Their folder; by default the one that the result names.
 
     Raises:

@@ -20,7 +20,6 @@ class Frame(Record):
 
     Attributes:
         rotation: Its rows are the viewer's axes: x towards the reference camera, z up.
-        center_world: Origin of the viewer.
         unit: Scene units in one of the viewer.
     """
 
@@ -44,7 +43,6 @@ class Stand(Record):
 
     Attributes:
         rotation: From the camera's axes, x right, y down, z forward.
-        position: Of its centre.
         fov: Across the height of the picture, radians.
     """
 

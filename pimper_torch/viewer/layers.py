@@ -27,7 +27,6 @@ class Layer(Record):
 
     Attributes:
         colors: Linear, in [0, 1].
-        normals_world: That shading sees.
         lit: Whether light changes the colours.
         legend: What they say.
     """

@@ -20,11 +20,7 @@ HOST, PORT = "127.0.0.1", 8080
 
 
 def require_viser() -> None:
-    """Refuse to go on without viser.
-
-    Raises:
-        ConfigError: Names the extra to install.
-    """
+    """Refuse to go on without viser."""
     if find_spec("viser") is None:
         raise ConfigError(
             "the viewer needs viser, which is not installed: pip install 'pimper_torch[view]'."
@@ -66,11 +62,7 @@ def address(server: "ViserServer") -> str:
 
 
 def _require_own(host: str) -> None:
-    """Refuse an address that is not this machine's; viser would try it for ever.
-
-    Raises:
-        ConfigError: The address.
-    """
+    """Refuse an address that is not this machine's; viser would try it for ever."""
     try:
         family, _, _, _, place = socket.getaddrinfo(host or "?", 0, type=socket.SOCK_STREAM)[0]
         socket.create_server((host, 0), family=family).close()

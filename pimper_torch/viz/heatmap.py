@@ -36,7 +36,6 @@ class ErrorScale:
     Attributes:
         clip: Errors from here on have the last colour.
         unit: Of the errors, such as ``% of the diagonal``.
-        what: Is in error.
     """
 
     clip: float
@@ -58,7 +57,6 @@ class MethodPanels:
     """What one method made of a scene.
 
     Attributes:
-        method: Name.
         surface: Picture of it, sRGB, rows first; ``None`` if it gave none.
         error: Picture of its error map; ``None`` if there is none.
         note: Stands where pictures are missing.
@@ -75,10 +73,7 @@ class SceneRow:
     """A scene on the sheet: the truth, then one column a method.
 
     Attributes:
-        scene: Name.
         photograph: sRGB, rows first, as large as the pictures below.
-        truth: Picture of the true normals.
-        methods: Those that were run.
     """
 
     scene: str
@@ -191,9 +186,6 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
     Args:
         rows: At least one; a method that is missing in one leaves its place empty there.
         path: Ends in ``.png``.
-
-    Raises:
-        InputError: There are no rows.
     """
     if not rows:
         raise InputError("there is no scene to draw; needed: one or more.")

@@ -124,7 +124,6 @@ def plot_in_view(
     """Draw a number for each facet where a view shows it.
 
     Args:
-        cameras: That see them.
         values: One a facet, such as residuals or numbers of views; see :func:`by_facet`.
 
     Raises:

@@ -44,9 +44,6 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
 
     Args:
         side_mm: Of the black squares, 10 to 36.
-
-    Raises:
-        ConfigError: A side of which there are no markers.
     """
     # Local, so that importing the package does not load matplotlib; Figure without pyplot leaves no
     # global state behind.

@@ -20,7 +20,6 @@ def thumbnails(
         views: Linear radiance.
         silhouettes: Of the same views. Lines are yellow, and red where a view is not trusted.
         width_px: Of all tiles beside one another.
-        across: Tiles in a row.
 
     Returns:
         sRGB in [0, 1]; tiles that are left over are white.

@@ -25,7 +25,6 @@ class Tile:
     """A picture of a sheet.
 
     Attributes:
-        title: Above it.
         picture: sRGB in [0, 1], rows first; ``None`` where there is none.
         note: Stands in the place of a missing picture.
         wide: Takes a row of its own, as wide as the sheet.
@@ -38,12 +37,7 @@ class Tile:
 
 
 def sheet(rows: Sequence[Sequence[Tile]], tile_px: int, headline: str = "") -> Image.Image:
-    """Lay tiles out in rows as high as their highest.
-
-    Args:
-        tile_px: Width of a tile.
-        headline: Above all rows, if any.
-    """
+    """Lay tiles out in rows as high as their highest."""
     across = max(len(row) for row in rows)
     width = across * (tile_px + _GAP_PX) + _GAP_PX
     placed, top = [], _HEADLINE_PX if headline else _GAP_PX

@@ -50,7 +50,6 @@ def draw_turn(
         cameras: Of the photographs, which tell where up is.
         reference: View whose side of the surface is seen first.
         path: Ends in ``.webp``.
-        side_px: Height of the picture.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
     caster = RayCaster(mesh.vertices_world, mesh.faces)

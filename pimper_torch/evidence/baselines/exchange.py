@@ -51,7 +51,6 @@ def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path
     """Write pinholes, cloud and tracks as a COLMAP model, binary, in the scene's own frame.
 
     Args:
-        names: Of the written photographs, one a view.
         folder: Gets ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
 
     Raises:
@@ -70,9 +69,6 @@ def read_surface(path: Path, program: str, printed: str) -> Mesh:
     """Read the mesh or the points that a program wrote.
 
     Its colours are dropped: they are radiance under this light, no albedo.
-
-    Raises:
-        ReconstructionError: It left no file, none that can be read, or no points in it.
     """
     if not path.is_file():
         raise ReconstructionError(

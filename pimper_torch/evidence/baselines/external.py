@@ -24,7 +24,6 @@ class Program:
     Attributes:
         name: As it is called on the command line.
         variable: Environment variable that may name it, or the folder it lies in.
-        source: Where to get it.
         folders: Folders that its installer uses and that are seldom on the PATH.
     """
 
@@ -39,9 +38,6 @@ class Program:
         Args:
             given: The executable itself, or the folder it lies in. If set, nowhere else is
                 looked.
-
-        Raises:
-            MissingProgramError: Says where it was looked for and where to get it.
         """
         named = given or (Path(os.environ[self.variable]) if self.variable in os.environ else None)
         if named is not None:
@@ -82,7 +78,6 @@ class Deadline:
     """A limit of time that several programs share.
 
     Attributes:
-        minutes: From now on.
         began: Set by itself.
     """
 
@@ -127,14 +122,9 @@ def run_program(
 
     Args:
         folder: Working directory. What the program prints is kept there too.
-        threads: For programs that ask OpenMP.
 
     Returns:
         What it printed.
-
-    Raises:
-        MissingProgramError: It cannot be started at all.
-        ReconstructionError: It failed or took too long; with its last lines.
     """
     name = Path(command[0]).name
     began = time.monotonic()

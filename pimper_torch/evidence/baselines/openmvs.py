@@ -90,11 +90,6 @@ class OpenMvs(Stage):
 
         Returns:
             A mesh in the scene's frame.
-
-        Raises:
-            MissingProgramError: One of its programs is not here.
-            ReconstructionError: One failed, took too long, or found nothing.
-            InputError: The scene has no cloud.
         """
         config = self.config
         wanted = [INTERFACE, DENSIFY, RECONSTRUCT] + [REFINE] * config.refine

@@ -90,10 +90,6 @@ class Pmvs(Stage):
 
         Returns:
             Points with outward normals, without faces, in the scene's frame.
-
-        Raises:
-            MissingProgramError: There is no pmvs2 here.
-            ReconstructionError: It failed, took too long, or found no point.
         """
         config = self.config
         program = PMVS2.find(config.program)

@@ -73,11 +73,7 @@ class Smoothed(Stage):
 
     @torch.no_grad()
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
-        """Smooth the mesh; its vertices carry its own normals.
-
-        Raises:
-            ReconstructionError: A mesh without facets, or without a vertex that holds it.
-        """
+        """Smooth the mesh; its vertices carry its own normals."""
         mesh = coarse.mesh
         used = torch.unique(mesh.faces)
         fixed = coarse.is_point[used].any() or self.config.filled_fidelity > 0
@@ -111,11 +107,7 @@ def thin_plate(
     """Return the positions of the subdivided mesh's vertices on the surface of least bending.
 
     Args:
-        subdivision: Of the coarse mesh.
         weights: ``w`` of its vertices; one at least, in every piece, above 0.
-
-    Raises:
-        SingularSystemError: A piece of the mesh is fixed by too few vertices.
     """
     points = subdivision.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]

@@ -30,7 +30,6 @@ class Inputs(Record):
         scene: Cameras and cloud, found or true, and the photographs.
         coarse: Facets for the baselines that start from some; of the default preset.
         capture: The truth, without photographs and maps.
-        surface: Its surface, prepared for the comparison with all methods.
         maps: Of the methods' reference view alone, for those of all fill the memory.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
@@ -48,10 +47,6 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
 
     Args:
         name: Of a rendered scene, or a folder with ``truth`` in it.
-        workspace: Where a rendering goes.
-
-    Raises:
-        InputError: No scene, mesh or folder has that name.
     """
     if (Path(name) / "truth").is_dir():
         return Path(name)
@@ -65,9 +60,6 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
     Args:
         cache: Folder where models are kept; the seconds of one from there are those that it
             took to find.
-
-    Raises:
-        PimperError: Not such a folder, or structure from motion fails.
     """
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
     if config.cameras == "true":

@@ -18,12 +18,7 @@ class Machine(Record):
     """A machine and what runs on it.
 
     Attributes:
-        cpu: Name of the processor.
-        cores: That this process may use.
-        memory_gb: Of the machine.
         gpu: Name of the first, or nothing.
-        system: Operating system.
-        python: Version.
         versions: Of the packages that the figures depend on, as ``name version``.
     """
 

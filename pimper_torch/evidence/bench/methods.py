@@ -28,9 +28,7 @@ class Outcome(Record):
         estimate: Surface, cameras, lights.
         seconds: Wall clock without structure from motion.
         mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
-        triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
-        missing_fraction: Of the samples.
         external: A program of its own did the work, whose memory is not this process's.
     """
 
@@ -53,11 +51,7 @@ _BASELINES: dict[str, Callable[[], nn.Module]] = {
 
 
 def method_named(name: str) -> Method:
-    """Find a baseline by name, or a preset, or a YAML file of settings.
-
-    Raises:
-        ConfigError: Nothing has that name.
-    """
+    """Find a baseline by name, or a preset, or a YAML file of settings."""
     if name in _BASELINES:
         return _baseline(_BASELINES[name]())
     try:

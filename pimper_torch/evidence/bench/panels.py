@@ -69,10 +69,6 @@ def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> 
 def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
     """Return the distance of a surface from the truth along the rays of a view.
 
-    Args:
-        met: The surface and the truth.
-        capture: With the true mesh.
-
     Returns:
         Per cent of the diagonal of the true bounding box; infinite on the object where the
         surface is missed, NaN off the object.

@@ -111,7 +111,6 @@ class Table(Record):
 
     Attributes:
         rows: In the order they are shown.
-        machine: That they were measured on.
         date: ISO 8601.
         scale: ``quick`` or ``full``.
         settings: Whatever else decides the figures, as JSON can hold it.
@@ -165,11 +164,7 @@ def with_published(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def write_json(table: Table, path: Path) -> None:
-    """Write a table with all its digits; figures that are not finite become ``null``.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a table with all its digits; figures that are not finite become ``null``."""
     report = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -189,11 +184,7 @@ def write_json(table: Table, path: Path) -> None:
 
 
 def read_json(path: Path | str) -> Table:
-    """Read a table that :func:`write_json` wrote.
-
-    Raises:
-        InputError: No such file, no such table, or a value of another type.
-    """
+    """Read a table that :func:`write_json` wrote."""
     try:
         report = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -39,8 +39,6 @@ class Measured(Record):
     """One cell of the bench: a method on a scene.
 
     Attributes:
-        row: Its figures.
-        panels: Its pictures.
         covered: True where rays of the reference view meet truth and surface; ``None`` if it
             has no surface.
     """
@@ -75,13 +73,7 @@ def run_bench(
 
     Args:
         folder: New or empty.
-        observer: Hears of every scene and method.
         cache: Folder where the models of structure from motion are kept from run to run.
-
-    Raises:
-        ConfigError: No such method.
-        InputError: No such scene.
-        OutputError: The folder holds something else, or cannot be written.
     """
     observer = observer or Silent()
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
@@ -205,29 +197,24 @@ def row_of(
     """Take a row's figures from an outcome and its evaluation."""
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
-    seen = surface.seen if surface else None
+    seen, missing = surface.seen if surface else None, outcome.missing_fraction
+    normals, shape = (view.transferred_normals, view.shape_normals) if view else (None, None)
     return Row(
         scene=scene,
         method=method,
         mesh_points=outcome.mesh_points,
         triangles=outcome.triangles,
         samples=outcome.samples,
-        missing_percent=_percent(outcome.missing_fraction),
+        missing_percent=None if missing is None else 100 * missing,
         minutes=outcome.seconds / 60,
         sfm_minutes=sfm_minutes,
         relative_error=view.relative_error if view else None,
         coverage_percent=100 * view.coverage if view else None,
-        mean_normal_deg=view.transferred_normals.mean_deg
-        if view and view.transferred_normals
-        else None,
-        median_normal_deg=(
-            view.transferred_normals.median_deg if view and view.transferred_normals else None
-        ),
-        mean_shape_normal_deg=view.shape_normals.mean_deg if view and view.shape_normals else None,
-        median_shape_normal_deg=(
-            view.shape_normals.median_deg if view and view.shape_normals else None
-        ),
-        pitted_percent=view.shape_normals.pitted_percent if view and view.shape_normals else None,
+        mean_normal_deg=normals.mean_deg if normals else None,
+        median_normal_deg=normals.median_deg if normals else None,
+        mean_shape_normal_deg=shape.mean_deg if shape else None,
+        median_shape_normal_deg=shape.median_deg if shape else None,
+        pitted_percent=shape.pitted_percent if shape else None,
         chamfer=seen.chamfer_mean_percent if seen else None,
         accuracy=surface.accuracy.mean_percent if surface and surface.accuracy else None,
         completeness=surface.whole.completeness.mean_percent if surface and surface.whole else None,
@@ -237,10 +224,6 @@ def row_of(
         else (),
         peak_memory_mb=memory,
     )
-
-
-def _percent(fraction: float | None) -> float | None:
-    return None if fraction is None else 100 * fraction
 
 
 @contextmanager

@@ -31,14 +31,10 @@ class Column:
     decimals: int
 
 
-def _millions(samples: int | None) -> float | None:
-    return None if samples is None else samples / 1e6
-
-
 _COST = (
     Column(heading="points", value=lambda row: row.mesh_points, decimals=0),
     Column(heading="triangles", value=lambda row: row.triangles, decimals=0),
-    Column(heading="samples, M", value=lambda row: _millions(row.samples), decimals=2),
+    Column(heading="samples, M", value=lambda row: row.samples and row.samples / 1e6, decimals=2),
     Column(heading="missing, %", value=lambda row: row.missing_percent, decimals=1),
     Column(heading="minutes", value=lambda row: row.minutes, decimals=1),
     Column(heading="SfM, min", value=lambda row: row.sfm_minutes, decimals=1),

@@ -20,11 +20,7 @@ _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``bench``.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``bench``."""
     job = checked(command, arguments)
     with output.observer() as observer:
         table = run_bench(
@@ -45,12 +41,7 @@ class _Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is taken.
-
-    Raises:
-        PimperError: An impossible setting, or the folder holds something else.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and refuse a folder that is taken."""
     kept = user_cache()
 
     def bench(
@@ -63,7 +54,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
         Args:
             out: Folder for the table, its figures and all surfaces; new or empty.
-            config: Scenes and methods.
             cache: Folder where structure from motion is kept from run to run, so that a change
                 of a later stage costs only the later stages.
             overwrite: Replace a former result in OUT.

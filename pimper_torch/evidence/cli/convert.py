@@ -120,11 +120,7 @@ class Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``convert``: read, write whole or not at all, and say what came.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``convert``: read, write whole or not at all, and say what came."""
     job = checked(command, arguments)
     with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
         with output.observer(), stage("read") as told:
@@ -136,11 +132,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and check what can be checked without reading DATA.
-
-    Raises:
-        PimperError: The folder for the result is taken, or there is no data.
-    """
+    """Read the arguments, and check what can be checked without reading DATA."""
     job = parse(arguments)
     inputs = {
         "DATA": job.data,
@@ -156,11 +148,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
 
 
 def parse(arguments: Sequence[str]) -> Job:
-    """Read the arguments of ``convert``.
-
-    Raises:
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments of ``convert``."""
     return read_arguments(Job, "convert", arguments, levels=True)
 
 
@@ -182,11 +170,7 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
 
 
 def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
-    """Read a rendered scene without its maps, which no layout has a place for.
-
-    Raises:
-        InputError: As :func:`pimper_torch.evidence.datasets.read_rendered`.
-    """
+    """Read a rendered scene without its maps, which no layout has a place for."""
     if max_size_px < 0:
         raise InputError(f"--max-size-px is {max_size_px}; needed: 0, or the longest side.")
     capture = read_rendered(folder, maps=False)
@@ -209,12 +193,7 @@ def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
 
 
 def read(job: Job) -> Capture:
-    """Read the data set with the options that were given.
-
-    Raises:
-        InputError: An option that the reader does not know, or none where it needs one; and
-            whatever the reader refuses.
-    """
+    """Read the data set with the options that were given."""
     reader = readers()[job.source]
     known = dict(inspect.signature(reader).parameters)
     if "options" in known:
@@ -246,11 +225,7 @@ def read(job: Job) -> Capture:
 
 
 def write(capture: Capture, target: Target, folder: Path) -> None:
-    """Write a capture's photographs and cameras in a layout.
-
-    Raises:
-        InputError: Its cameras are not known, or are none that the layout can hold.
-    """
+    """Write a capture's photographs and cameras in a layout."""
     if capture.cameras is None:
         raise InputError(
             "this data set says nothing about its cameras; needed: cameras to export. Use its "

@@ -85,11 +85,7 @@ class EvaluateOptions:
     icp_distance: Literal["plane", "point"] = "plane"
 
     def config(self) -> EvaluateConfig:
-        """Return the settings of the evaluation.
-
-        Raises:
-            ConfigError: An impossible value.
-        """
+        """Return the settings of the evaluation."""
         return EvaluateConfig(
             alignment=self.alignment,
             views=self.views,
@@ -127,11 +123,7 @@ class Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``evaluate``.
-
-    Raises:
-        PimperError: Nothing is written then.
-    """
+    """Carry out ``evaluate``."""
     job = checked(command, arguments)
     config = job.options.config()
     estimate = read_estimate(job.result)
@@ -162,12 +154,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and check what can be checked without reading RESULT and TRUTH.
-
-    Raises:
-        PimperError: An impossible setting, nothing to measure, or files that cannot be written.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments, and check what can be checked without reading RESULT and TRUTH."""
     job = read_arguments(Job, command, arguments)
     job.options.config()
     for path in (job.result, job.truth):
@@ -184,7 +171,6 @@ class TruthRead:
     Attributes:
         capture: All its views, perhaps without maps.
         maps: The views to compare in, with maps; ``None`` where ``capture`` has them.
-        protocol: Of the DTU set.
     """
 
     capture: Capture
@@ -197,9 +183,6 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
 
     Of a rendered scene no more maps are read than will be compared, so that memory does not
     grow with the number of its views.
-
-    Raises:
-        InputError: TRUTH is not laid out as `--truth-layout` says, or ``--scan`` is missing.
     """
     layout, truth = job.options.truth_layout, job.truth
     if layout == "auto":
@@ -305,11 +288,7 @@ def show(
 def write_report(
     evaluation: Evaluation, job: Job, relighting: dict[str, Any] | None = None
 ) -> None:
-    """Write all figures and the settings they were made with as JSON, whole or not at all.
-
-    Raises:
-        OutputError: The disk refuses.
-    """
+    """Write all figures and the settings they were made with as JSON, whole or not at all."""
     assert job.out is not None
     content = {
         "format": FORMAT,
@@ -356,11 +335,7 @@ def _write_page(evaluation: Evaluation, truth: Truth, result: Path, path: Path) 
 
 
 def _prepare_files(job: Job) -> None:
-    """Refuse, before the work and before writing, files that are not ours to replace.
-
-    Raises:
-        OutputError: As :func:`pimper_torch.outputs.files.prepare_file`.
-    """
+    """Refuse, before the work and before writing, files that are not ours to replace."""
     if job.out is not None:
         prepare_file(job.out, job.overwrite, f'"format": "{FORMAT}"')
     if job.calibration is not None:

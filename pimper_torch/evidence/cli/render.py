@@ -63,11 +63,7 @@ class _Job:
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``render``.
-
-    Raises:
-        PimperError: Before anything is written.
-    """
+    """Carry out ``render``."""
     job = checked(command, arguments)
     with output.observer(), stage("render") as told:
         render_scene(
@@ -83,10 +79,5 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments of ``render``.
-
-    Raises:
-        ConfigError: An impossible setting.
-        SystemExit: ``--help`` was answered.
-    """
+    """Read the arguments of ``render``."""
     return read_arguments(_Job, command, arguments, rare=_RARE)

@@ -2,11 +2,11 @@
 
 from pimper_torch.evidence.datasets.check import check_capture
 from pimper_torch.evidence.datasets.colmap import read_colmap
-from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
+from pimper_torch.evidence.datasets.diligent import read_diligent
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
-from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, write_idr
+from pimper_torch.evidence.datasets.idr import read_idr, write_idr
 from pimper_torch.evidence.datasets.llff import read_llff
 from pimper_torch.evidence.datasets.programs import read_meshroom, read_metashape, read_transforms
 from pimper_torch.evidence.datasets.rendered import read_rendered
@@ -27,9 +27,7 @@ __all__ = [
     "read_llff",
     "read_meshroom",
     "read_metashape",
-    "read_normal_map",
     "read_rendered",
-    "read_scale_mats",
     "read_transforms",
     "write_colmap",
     "write_idr",

@@ -48,7 +48,6 @@ class Finding(Record):
 
     Attributes:
         name: Short, for programs.
-        meaning: What is wrong.
         remedy: What to do about it.
         evidence: Scores, 1 is perfect.
         alternatives: Other mistakes with about the same scores.

@@ -1,4 +1,4 @@
-"""DiLiGenT: objects under 96 lights from one viewpoint; and its normal maps with depth."""
+"""DiLiGenT: objects under 96 lights from one viewpoint."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,24 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.camera_files.layout import contents, expect, inside, read_text
+from pimper_torch.camera_files.layout import expect, inside, read_text
 from pimper_torch.camera_files.layout import numbers as numbers_of
-from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.matlab import read_matlab
-from pimper_torch.evidence.datasets.raster import (
-    intrinsics_from_indices,
-    nearest,
-    read_photographs,
-    there,
-)
+from pimper_torch.evidence.datasets.raster import nearest, read_photographs
 from pimper_torch.evidence.datasets.sampling import choose_photographs
 from pimper_torch.io.decode import decode
-from pimper_torch.io.photographs import read_mask
-from pimper_torch.numpy_files import read_npz
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Capture, Record, Truth
 
@@ -38,7 +30,6 @@ class PointLightFiles(Record):
     """The photographs of one viewpoint and their lights, in the files' own axes.
 
     Attributes:
-        paths: One photograph a light.
         directions: Unit, from the object to the point light; x right, y up, z to the viewer.
         intensities: Red, green, blue.
     """
@@ -46,24 +37,6 @@ class PointLightFiles(Record):
     paths: tuple[Path, ...]
     directions: Float[Tensor, "light 3"]
     intensities: Float[Tensor, "light 3"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class NormalMap(Record):
-    """A normal map to integrate, with what is known about the surface behind it.
-
-    Attributes:
-        normals: Unit, facing the viewer (``n_z < 0``), camera frame; zero off the mask.
-        mask: True on the object.
-        intrinsics: ``K`` in our pixels; ``None`` for an orthographic map.
-        depth: True depth along the camera's z, millimetres; infinite where unknown;
-            ``None`` if the set has none.
-    """
-
-    normals: Float[Tensor, "height width 3"]
-    mask: Bool[Tensor, "height width"]
-    intrinsics: Float[Tensor, "3 3"] | None
-    depth: Float[Tensor, "height width"] | None
 
 
 def read_diligent(
@@ -141,45 +114,8 @@ def read_diligent(
     )
 
 
-def read_normal_map(folder: Path | str) -> NormalMap:
-    """Read a normal map as the bilateral-integration set distributes it.
-
-    ``normal_map.png`` (8 or 16 bits a channel) holds ``(n + 1) / 2`` with y up and z towards
-    the viewer, ``mask.png`` the object; ``K.txt`` and ``depth_gt.npz`` (``depth_gt``, NaN where
-    unknown) are optional. On the five DiLiGenT objects the turned normals agree with those of
-    the true depth to 0.8 to 3.9 degrees in the mean, and with no other choice of signs to
-    better than 38. ``K`` counts pixel centres from 0.
-
-    Raises:
-        InputError: Another layout; names what was expected and what was found.
-
-    Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
-    """
-    root, kind = Path(folder), "a normal map to integrate"
-    for name in ("normal_map.png", "mask.png"):
-        expect((root / name).is_file(), root, kind, name)
-    mask = read_mask(there(root / "mask.png"))
-    normals = decoded_normals(root / "normal_map.png", kind)
-    _same_shape(normals.shape[:2], mask.shape, root, kind, "normal_map.png")
-    K_path, depth_path = root / "K.txt", root / "depth_gt.npz"
-    K = None
-    if K_path.is_file():
-        K = numbers_of(read_text(K_path, kind), 9, "K", K_path, kind).reshape(3, 3)
-        K = intrinsics_from_indices(K)
-    depth = _read_depth(depth_path, kind) if depth_path.is_file() else None
-    if depth is not None:
-        _same_shape(depth.shape, mask.shape, root, kind, "depth_gt.npz")
-    return NormalMap(
-        normals=torch.where(mask[..., None], normals, 0), mask=mask, intrinsics=K, depth=depth
-    )
-
-
 def point_light_files(folder: Path, kind: str) -> PointLightFiles:
-    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``.
-
-    Raises:
-        InputError: Texts are missing, or photographs and lights differ in number.
-    """
+    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
     for name in ("light_directions.txt", "light_intensities.txt"):
         expect((folder / name).is_file(), folder, kind, name)
     directions = _rows_of_three(folder / "light_directions.txt", kind)
@@ -250,27 +186,3 @@ def _rows_of_three(path: Path, kind: str) -> Float[Tensor, "row 3"]:
         len(words) % 3 == 0 and bool(words), path, kind, "rows of three numbers", f"{len(words)}"
     )
     return numbers_of(words, len(words), "rows of three", path, kind).reshape(-1, 3)
-
-
-def _read_depth(path: Path, kind: str) -> Float[Tensor, "height width"]:
-    try:
-        array = read_npz(path, lambda name: name == "depth_gt")["depth_gt"].astype(np.float32)
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); needed: an array depth_gt. Copy the file again."
-        ) from error
-    expect(array.ndim == 2, path, kind, "depth_gt of height x width", f"{array.ndim} axes")
-    depth = torch.from_numpy(array)
-    return torch.where(depth.isfinite() & (depth > 0), depth, torch.inf)
-
-
-def _same_shape(
-    shape: Sequence[int], expected: Sequence[int], root: Path, kind: str, name: str
-) -> None:
-    expect(
-        tuple(shape) == tuple(expected),
-        root,
-        kind,
-        f"{name} of the mask's {expected[1]} x {expected[0]}",
-        f"{shape[1]} x {shape[0]}; the folder holds {contents(root)}",
-    )

@@ -37,18 +37,12 @@ def dtu_capture(
     """Choose and read photographs, and give each the camera of its position.
 
     Args:
-        photographs: Their folder, for messages.
         named: Position, light and file of each photograph there is.
         kind: The set's name, for messages.
         cameras: Reads intrinsics, whose pixels count from the centre of the first one, and poses
             of positions in ascending order.
-        truth: Of the scene.
 
     Other arguments are those of the readers.
-
-    Raises:
-        InputError: A position or light that is not there, or a photograph that cannot be read or
-            has another size.
     """
     table = [position for position, _, _ in named], [light for _, light, _ in named]
     chosen = choose_photographs(

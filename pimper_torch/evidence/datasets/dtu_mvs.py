@@ -51,7 +51,6 @@ def read_dtu_mvs(
 
     Args:
         folder: With ``Rectified``.
-        scan: Number of the scan.
         positions: Read these positions only, from 1.
         lights: Read these lights only, 0 to 6, or :data:`ALL_LIGHTS` for ``max``; ``None``
             reads 0 to 6.
@@ -99,7 +98,6 @@ def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
 
     Args:
         folder: With ``ObsMask``, as for :func:`read_dtu_mvs`.
-        scan: Number of the scan.
 
     Raises:
         InputError: Files or variables are missing or have another shape.

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.camera_files.camera_arrays import IDR, numbered_matrices, read_world_mats
+from pimper_torch.camera_files.camera_arrays import IDR, read_world_mats
 from pimper_torch.camera_files.layout import expect, file_in
 from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
@@ -38,8 +38,8 @@ def read_idr(
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
 
     ``world_mat_i`` is ``K [R t]`` as a 4x4 matrix, from the world to pixels, with our camera
-    axes; ``scale_mat_i``, from the unit sphere round the object to the world, is left out
-    here (:func:`read_scale_mats` gives it): cameras and truth are in the world's units.
+    axes; ``scale_mat_i``, from the unit sphere round the object to the world, is left out:
+    cameras and truth are in the world's units.
     Arrays belong to the images in plain order of their names. IDR and NeuS cast rays through
     whole numbers (``uv`` of ``mgrid``, ``pixels_x`` of ``arange``): they count centres from
     0, so half a pixel is added.
@@ -71,21 +71,6 @@ def read_idr(
         for one in zip(files, masks, *read_world_mats(path, len(files)), strict=True)
     ]
     return assemble(photographs, folder, IDR, **options)
-
-
-def read_scale_mats(
-    folder: Path | str, *, camera_file: str | None = None
-) -> Float[Tensor, "view 4 4"]:
-    """Read ``scale_mat_i``: ``world_from_unit``, from the unit sphere to the world.
-
-    Args:
-        camera_file: As for :func:`read_idr`.
-
-    Raises:
-        InputError: The file is not there or has none.
-    """
-    path = _camera_file(Path(folder), camera_file)
-    return numbered_matrices(path, "scale_mat", len(image_files(Path(folder) / "image", IDR)))
 
 
 def write_idr(

@@ -17,7 +17,6 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
     """Read numeric arrays of a MATLAB file (up to version 7).
 
     Args:
-        names: Of the variables wanted.
         kind: The data set, for messages.
 
     Raises:
@@ -43,11 +42,7 @@ def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.nda
 
 
 def variables(path: Path, kind: str) -> set[str]:
-    """Name the variables of a MATLAB file.
-
-    Raises:
-        InputError: No such file, or not a MATLAB file.
-    """
+    """Name the variables of a MATLAB file."""
     return set(_variables(path, kind, ()))
 
 
@@ -79,9 +74,6 @@ def read_toolbox_projections(
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         taken as it stands: in published files it is not exactly orthogonal, which
         :func:`~pimper_torch.camera_files.projections.decompose_projections` settles.
-
-    Raises:
-        InputError: As :func:`read_matlab`, or arrays of other shapes.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in variables(path, kind) else ["fc", "cc"]

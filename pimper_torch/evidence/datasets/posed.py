@@ -81,7 +81,6 @@ def assemble(
     Args:
         photographs: All that the data set has.
         path: Its file or folder, for messages.
-        kind: Its name, for messages.
         names: Keep these, in this order; ``None`` for all.
         mesh: File of the true surface, in the data set's frame.
         encoding: Response, saturation and black level of the files.
@@ -181,9 +180,6 @@ def image_files(folder: Path, kind: str) -> list[Path]:
 
     Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
     are followed wherever they lie.
-
-    Raises:
-        InputError: No such folder, or no images in it.
     """
     expect(folder.is_dir(), folder, kind, "a folder of images")
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]

@@ -36,7 +36,6 @@ def read_rendered(
     A view of 1600 x 1200 takes 23 MB of memory for its photograph and 60 MB for its maps.
 
     Args:
-        folder: That was rendered to.
         views: Numbers of those wanted, in the order wanted; ``None`` is all.
         maps: Read depth, normals, albedo and masks too; without, they are ``None``.
         photographs: Read these and the object's masks too; without, the images are zeros

@@ -25,7 +25,6 @@ def one_light_per_position(
     than once oftener than another.
 
     Args:
-        position: Of every photograph there is.
         light: Of every photograph there is; unique among those of one position.
         generator: Decides; the same seed gives the same choice.
 
@@ -66,8 +65,6 @@ def choose_photographs(
     """Decide which photographs of a set are read, before any is decoded.
 
     Args:
-        position: Of every photograph there is.
-        light: Of every photograph there is.
         positions: Keep these only; ``None`` keeps all.
         lights: Keep these only; ``None`` keeps all.
         light_seed: Keep one light a position, chosen by this seed; ``None`` keeps all.
@@ -76,9 +73,6 @@ def choose_photographs(
 
     Returns:
         Indices of photographs, by position and then light.
-
-    Raises:
-        InputError: A position or light that does not exist.
     """
     _refuse_absent(position, positions, "positions", path, kind)
     _refuse_absent(light, lights, "lights", path, kind)

@@ -22,7 +22,6 @@ class CalibrationBin(Record):
 
     Attributes:
         expected: Root mean square of the expected errors.
-        root_mean_square: Of the true errors.
         robust: Median of the true errors over 0.6745, the standard deviation that Gaussian
             noise of this median has: blind to outliers.
     """
@@ -44,7 +43,6 @@ class Calibration(Record):
         rank_correlation: Spearman's, between expected and true errors; NaN if all expected ones
             are the same.
         bins: Of equal fractions of the surface, by rising expected error.
-        samples: Compared.
     """
 
     ratio: float

@@ -63,7 +63,6 @@ class TwoSided(Record):
         chamfer_sum: Their sum, which other papers call Chamfer distance.
         chamfer_mean_percent: Of the diagonal.
         chamfer_sum_percent: Of the diagonal.
-        thresholds: One entry a threshold.
     """
 
     completeness: DistanceFigures
@@ -84,7 +83,6 @@ class SurfaceComparison(Record):
             surroundings.
         surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
             surroundings than to the object, and is left out of the accuracy.
-        whole: With the completeness of the whole truth.
         seen: With that of the truth seen from at least ``seen_from`` positions; ``None`` if
             it is unknown, or none is.
         seen_from: How many positions of the camera.
@@ -179,11 +177,7 @@ class TrueSurface:
 
 
 def true_surface(capture: Capture) -> Mesh:
-    """Return the true mesh of the object, or its points as a mesh without faces.
-
-    Raises:
-        InputError: There is neither.
-    """
+    """Return the true mesh of the object, or its points as a mesh without faces."""
     truth = capture.truth
     if truth.mesh is not None:
         return truth.mesh

@@ -122,9 +122,6 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     The subdivided mesh is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
     ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
     half steps. A face too small for a step has its vertices only.
-
-    Raises:
-        InputError: There would be more points than memory holds.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()

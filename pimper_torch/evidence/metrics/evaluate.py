@@ -75,9 +75,7 @@ class Evaluation(Record):
 
     Attributes:
         alignment: That everything but the cameras was measured after.
-        surface: Distances between the surfaces.
         views: Along the rays of chosen views.
-        lights: Directions of the lights.
         cameras: After the similarity on cameras, whatever ``alignment`` is.
         dtu: By the protocol of the DTU set.
     """

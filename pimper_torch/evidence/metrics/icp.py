@@ -55,7 +55,6 @@ class IcpResult(Record):
         truth_from_world: Similarity.
         distance: What was measured: ``plane`` or ``point``.
         residual: Root mean square distance of the samples that were kept, scene units.
-        iterations: Taken.
         converged: False where the limit of iterations stopped it.
     """
 
@@ -111,7 +110,8 @@ def trimmed_icp(
             step = similarity_between_points(source, aim)
         found = step @ found
         taken += 1
-        converged = _length_of_move(step, moved) < config.tolerance * spread
+        length = (transform(step, moved) - moved).square().sum(dim=1).mean().sqrt()
+        converged = float(length) < config.tolerance * spread
     rest: Nearest = target.query(transform(found, samples))
     near = rest.distance.topk(kept, largest=False).values
     return IcpResult(
@@ -153,7 +153,3 @@ def _step_to_planes(
 
 def _spread(points: Float[Tensor, "point 3"]) -> float:
     return float((points - points.mean(dim=0)).square().sum(dim=1).mean().sqrt())
-
-
-def _length_of_move(step: Float[Tensor, "4 4"], points: Float[Tensor, "point 3"]) -> float:
-    return float((transform(step, points) - points).square().sum(dim=1).mean().sqrt())

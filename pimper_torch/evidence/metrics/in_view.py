@@ -24,8 +24,6 @@ class AngleFigures(Record):
     """Angles between normals over the rays that meet both, in degrees.
 
     Attributes:
-        mean_deg: Over the rays.
-        median_deg: Over the rays.
         pitted_percent: See :func:`pimper_torch.evidence.metrics.pits.pitted_percent`.
     """
 
@@ -39,11 +37,9 @@ class ViewFigures(Record):
     """How a mesh compares with the truth along the rays of one true camera.
 
     Attributes:
-        name: Of the view.
         relative_error: :func:`pimper_torch.evidence.metrics.relative.relative_error`, per cent.
         coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
             the surroundings; the other figures are over these.
-        pixels: Rays that meet the truth.
         transferred_normals: Of the normals that the mesh carries at its vertices; ``None`` if it
             carries none or the true ones are unknown.
         shape_normals: Of the normals of its shape: its faces', averaged at the vertices by
@@ -104,9 +100,6 @@ def meet_truth(
 
     Returns:
         ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
-
-    Raises:
-        InputError: No ray meets both.
     """
     cameras, maps = capture.cameras, true_maps(capture, view)
     if cameras is None or maps is None or len(mesh.faces) == 0:

@@ -30,10 +30,8 @@ def write_compared_page(
     """Write the page of a result with layers of its errors.
 
     Args:
-        folder: Of the result.
         truth: A mesh, or points without faces, which tell no normals.
         truth_from_world: Similarity.
-        path: Of the page.
 
     Raises:
         InputError: The folder is no result, or its photographs are gone.
@@ -77,7 +75,6 @@ def errors_of(
     """Return the distance of every vertex to the truth, and the angle between normals in degrees.
 
     Args:
-        mesh: With normals.
         truth: Its normals are those of its faces; without faces, angles are left out.
     """
     moved = transfer(mesh, truth_from_world)

@@ -20,7 +20,6 @@ class AlbedoFigures(Record):
         one_scale_median_percent: Median of ``100 |s a - t| / t``, with ``s`` the median of
             ``t / a``: blind to outliers.
         channels: Compared; 1 if either side is grey, whose other side is then averaged.
-        samples: Compared.
     """
 
     one_scale_percent: float

@@ -43,8 +43,6 @@ class Meeting(Record):
         points: Of the mesh, from the camera's centre, frame of the truth.
         points_true: The same.
         center_world: Of the camera, frame of the truth.
-        hits: On the mesh, for every pixel.
-        faces: Of the mesh.
     """
 
     valid: Bool[Tensor, "height width"]

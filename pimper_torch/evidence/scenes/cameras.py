@@ -71,7 +71,6 @@ def arc_cameras(
         span_deg: From the first camera to the last, about ``up``.
         elevation_deg: Mean height of the arc over the plane across ``up``.
         sway_deg: How far the elevation goes up and down on the way.
-        target: What the cameras look at.
         front: Towards the centre of the arc; must be across ``up``.
         up: Axis of the arc, and up in the photographs.
     """

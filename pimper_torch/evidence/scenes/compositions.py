@@ -9,7 +9,6 @@ from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.render import render_objects
 from pimper_torch.evidence.scenes.rendered import RenderedScene
 from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.sensor import SensorConfig
 
 
 def potato_on_table(
@@ -18,11 +17,6 @@ def potato_on_table(
     num_views: int = 12,
     width: int = 640,
     height: int = 480,
-    span_deg: float = 50.0,
-    flash: float = 0.0,
-    gloss: float = 0.0,
-    contrast: float = 1.5,
-    sensor: SensorConfig | None = None,
 ) -> RenderedScene:
     """Photograph a bumpy, textured potato under a point light that moves between photographs.
 
@@ -32,21 +26,18 @@ def potato_on_table(
     Args:
         seed: Decides form, texture, lights and noise.
         num_views: On an arc at about 35 degrees over the table.
-        flash: Irradiance of a point light on the camera itself.
-        gloss: Fraction of light that the potato mirrors; 0.04 is varnish.
     """
     generator = torch.Generator().manual_seed(seed)
     objects = (
         SceneObject(
             mesh=potato(generator),
-            texture=random_speckle(generator, contrast=contrast),
-            specular=gloss,
+            texture=random_speckle(generator, contrast=1.5),
             roughness=0.35,
         ),
         SceneObject(
             mesh=table(),
             texture=random_speckle(
-                generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=contrast
+                generator, cells=(0.53, 0.23, 0.097, 0.043, 0.019), contrast=1.5
             ),
             surroundings=True,
         ),
@@ -58,7 +49,7 @@ def potato_on_table(
         height=height,
         focal_px=1.25 * width,
         distance=4.6,
-        span_deg=span_deg,
+        span_deg=50.0,
         elevation_deg=35.0,
         target=centre,
         front=(0.0, -1.0, 0.0),
@@ -68,8 +59,7 @@ def potato_on_table(
         num_views,
         generator,
         distance=6.0,
-        flash=flash,
         target=centre,
         toward=(0.0, -0.6, 0.8),
     )
-    return render_objects(objects, cameras, lights, generator, sensor)
+    return render_objects(objects, cameras, lights, generator)

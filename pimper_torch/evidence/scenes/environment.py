@@ -23,7 +23,6 @@ class Environment:
         walls: Radiance in unit directions of its own frame.
         windows: In its own frame; rows of each: the unit direction of its centre, and two
             vectors across it, one over the tangents of half its width and height long.
-        window_radiance: Of all windows.
         own_from_world: Rotation.
         scale: Multiplies all radiance.
     """

@@ -84,11 +84,7 @@ def rounded_cylinder(
     high: float,
     rounding: float,
 ) -> Float[Tensor, " point"]:
-    """Return the signed distance to an upright cylinder about the z axis with round edges.
-
-    Args:
-        rounding: Radius of its edges.
-    """
+    """Return the signed distance to an upright cylinder about the z axis with round edges."""
     # Kept off the axis, where the root has no gradient.
     across = (points[:, 0] ** 2 + points[:, 1] ** 2 + 1e-12).sqrt() - (radius - rounding)
     along = (points[:, 2] - (low + high) / 2).abs() - ((high - low) / 2 - rounding)

@@ -47,7 +47,6 @@ class PointLight(Record):
 
         Args:
             points: World.
-            irradiance: Of the light at the target.
         """
         toward = position - points
         distance = toward.norm(dim=-1)
@@ -64,8 +63,6 @@ class Lights(Record):
     distance. A light placed very far away is a directional one.
 
     Attributes:
-        positions_world: Of the point lights.
-        irradiance: Of the point lights at the target.
         ambient: Radiance of a white point in shadow.
         target_world: Where irradiance is stated.
         flash: Irradiance at the target of a second light in the camera's own position, one a
@@ -74,7 +71,6 @@ class Lights(Record):
             get its mean; mirrors and the background show it.
         window: Direction to the middle of soft light times the irradiance ``w`` of what faces it;
             what is turned by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
-        colour: Of the point lights.
     """
 
     positions_world: Float[Tensor, "view 3"]

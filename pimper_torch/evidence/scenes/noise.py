@@ -74,9 +74,6 @@ class Speckle:
     Attributes:
         subdivisions: One an octave, periodic: along each axis the last value repeats the first.
         cells: Scene units between subdivided mesh points, one an octave.
-        weights: One an octave.
-        darkest: Lowest albedo.
-        brightest: Highest albedo.
         contrast: Steepness of the push; the smaller, the less texture.
         offset: Added before the push: far from 0, most is light (or dark) and only rare
             spots are not.

@@ -18,7 +18,6 @@ class OneView(Record):
 
     Attributes:
         images: Linear radiance, never negative.
-        mask: Where the surface is.
         normals: Unit, of the pixels inside the mask in raster order.
         albedo: Of the same pixels.
         lights: Direction times strength.
@@ -49,7 +48,6 @@ def photograph(
     Args:
         normals: Unit.
         albedo: Linear, not negative.
-        mask: Outside it the images are black.
         lights: Direction times strength.
         generator: On the CPU; for the noise.
         noise: Standard deviation of what is added to each value before negative ones are cut

@@ -16,7 +16,6 @@ class RenderedScene(Record):
 
     Attributes:
         views: The photographs, linear radiance.
-        cameras: That took them.
         lights_world: First-order light ``l`` at the object: radiance is
             albedo * l . (1, n). Exact for closed-form scenes; for ray-traced ones the
             light at the target, without fall-off, shadows and highlights.

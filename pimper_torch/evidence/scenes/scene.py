@@ -62,10 +62,8 @@ class Scene:
 
     Attributes:
         name: Of the object, or the path of its mesh.
-        config: How it is photographed.
         objects: At rest in the world: the object's first, then its table, if that turns along.
         cameras: One a photograph; float64.
-        lights: One a photograph.
         fixed: Objects that are at rest while the object turns or is turned over, in the frame of
             :mod:`pimper_torch.evidence.scenes.room`.
         world_from_room: Where that frame is in each photograph.

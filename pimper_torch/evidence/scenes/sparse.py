@@ -32,7 +32,6 @@ def sparse_scene(
     Args:
         num_points: Wanted; fewer come out if too few are seen in ``min_views`` views.
         generator: Decides which points, and the noise.
-        min_views: Shortest track.
         noise_px: Standard deviation of every observation.
         outlier_fraction: Fraction of the points that are moved along their first ray by up to
             half their depth, keeping their short, wrong tracks.

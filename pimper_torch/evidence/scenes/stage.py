@@ -30,11 +30,9 @@ class Spots(Record):
     """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss.
 
     Attributes:
-        hits: Faces and positions in them.
         points: World.
         normals: Unit, interpolated over the face.
         albedo: Linear.
-        object_index: Of the object.
     """
 
     hits: Hits

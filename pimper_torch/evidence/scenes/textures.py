@@ -60,7 +60,6 @@ class Painted:
     Attributes:
         base: Underneath.
         paint: On top.
-        where: Of the paint.
     """
 
     base: Texture

@@ -17,7 +17,6 @@ class Anchors(Record):
     """Points that height fields are to pass through, any number a facet.
 
     Attributes:
-        facet: Whose height field.
         samples: ``(x, y, z)`` of the height field, before any transform, over the point; patch
             frame.
         heights: z of the point itself.

@@ -58,8 +58,6 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
 
     Args:
         patches: The facets and their frames.
-        rows: Lines of rays parallel to each edge.
-        columns: Rays along each line.
         reach_samples: Distance of the outermost lines from the edge, in template samples.
     """
     frames, spacing = _by_facet(patches)

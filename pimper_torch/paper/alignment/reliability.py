@@ -61,7 +61,6 @@ def judge_patches(
     """Assign every patch its :class:`~pimper_torch.records.AlignStatus`.
 
     Args:
-        facets: The two patches of each seam.
         overlapping: Whether their height fields lie over each other.
     """
     status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)

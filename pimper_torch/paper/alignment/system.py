@@ -20,10 +20,8 @@ class PointPulls(Record):
     """Points that height fields are to pass through.
 
     Attributes:
-        facet: Whose height field.
         samples: ``S`` of that height field over the point.
         heights: Where along the facet's normal the point lies.
-        weight: How strongly it pulls.
         spread: How far height field and point may well be apart.
     """
 
@@ -39,7 +37,6 @@ class Pulls(Record):
     """What asks the transforms to change.
 
     Attributes:
-        facets: The two facets of every seam.
         normals: Their inward unit normals, world.
         samples: ``S`` of both height fields where a ray meets them.
         gap: Foot point of the first sample minus that of the second, world.
@@ -184,8 +181,6 @@ def scatter_blocks(
     """Spread small dense blocks into the entries of a sparse matrix.
 
     Args:
-        block_rows: Which block row each block stands in.
-        block_cols: Which block column.
         blocks: Square, all of one size.
 
     Returns:

@@ -21,11 +21,7 @@ _AS_GOOD = 1.05
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
-    """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`.
-
-    Raises:
-        PimperError: Photographs that cannot be read, or too few under too few lights.
-    """
+    """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`."""
     job = checked(command, arguments)
     with output.observer(), stage("read"), held() as messages:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
@@ -56,12 +52,7 @@ class _Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Parse the arguments, and refuse photographs and a mask that do not exist.
-
-    Raises:
-        InputError: The folder of photographs, or the mask.
-        SystemExit: ``--help`` was answered.
-    """
+    """Parse the arguments, and refuse photographs and a mask that do not exist."""
     job = read_arguments(_Job, command, arguments)
     list_images(job.photos)
     if job.mask is not None and not job.mask.is_file():

@@ -31,11 +31,8 @@ class EncodedMatrix(Record):
     """Encoded values of the same samples in several views.
 
     Attributes:
-        encoded: All samples.
         seen: False where missing.
-        used: Entries that are fitted.
         scale: Of Cauchy's loss; 0 is least squares.
-        rank: Of radiance.
     """
 
     encoded: Float[Tensor, "view sample"]
@@ -50,7 +47,6 @@ class EncodedFit(Record):
     """The fit under one response.
 
     Attributes:
-        predicted: Encoded values.
         loss: Of each entry; 0 where not used.
         weight: Of each entry, less for outliers.
         left: Left factor, the initial value for the next response.
@@ -77,7 +73,6 @@ def fit_encoded(
     Args:
         response: Through which they are seen; ``f``.
         start: Fit of a similar response; ``None`` starts from the values.
-        iterations: After the first.
     """
     mask = problem.used.double()
     about, weight = torch.where(problem.used, problem.encoded, 0.5), mask

@@ -81,7 +81,6 @@ class GammaEstimate(Record):
         residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
         residual_linear: The same for a linear response.
         residual_srgb: The same for sRGB.
-        entries: Of the matrix, that were fitted.
     """
 
     gamma: float
@@ -223,9 +222,6 @@ class _Minimum(Record):
     """The minimum of the loss over gamma, and its standard error.
 
     Attributes:
-        problem: The entries.
-        gamma: Where the loss is minimal.
-        fit: At the minimum.
         inner: Whether it is not at an end of the range.
         error: Standard error of gamma.
     """

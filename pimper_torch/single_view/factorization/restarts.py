@@ -14,6 +14,9 @@ from pimper_torch.single_view.factorization.low_rank import low_rank_problem, ra
 
 # Residuals below this fraction of the data are zero but for rounding.
 _ROUNDING = 1e-6
+# Choices: the steps of a start, its tolerance, and the fraction by which residuals of the same
+# minimum differ.
+_STEPS, _TOLERANCE, _CLOSENESS = 300, 1e-9, 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -40,9 +43,6 @@ def factorize_from_many(
     *,
     repeats: int = 2,
     max_starts: int = 50,
-    closeness: float = 1e-6,
-    max_iterations: int = 300,
-    tolerance: float = 1e-9,
 ) -> Restarted:
     """Factorize a matrix with missing entries from random starts until the best repeats.
 
@@ -51,9 +51,6 @@ def factorize_from_many(
         weight: 0 where missing.
         generator: On the CPU.
         repeats: How many starts must end in the best minimum.
-        closeness: Residuals that differ by less than this fraction are of the same minimum.
-        tolerance: See
-            :func:`~pimper_torch.photometry.variable_projection.solve_variable_projection`.
 
     Raises:
         InputError: ``max_starts`` below ``repeats``, or an invalid matrix, weight or rank.
@@ -70,12 +67,12 @@ def factorize_from_many(
     while len(residuals) < max_starts:
         start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
         problem = low_rank_problem(matrix[None], weight[None], start)
-        found = solve_variable_projection(problem, max_iterations, tolerance)
+        found = solve_variable_projection(problem, _STEPS, _TOLERANCE)
         residuals.append(float(found.convergence.residual))
         if best is None or residuals[-1] < float(best.convergence.residual):
             best = found
         # On exact data the residuals are rounding, and all differ.
-        same = max(min(residuals) * (1 + closeness), _ROUNDING * level)
+        same = max(min(residuals) * (1 + _CLOSENESS), _ROUNDING * level)
         repeated = sum(one <= same for one in residuals) >= repeats
         if repeated:
             break

@@ -15,7 +15,6 @@ class FreeComponents:
 
     Attributes:
         pixel: Indices of the pixels of all free components, row by row.
-        component: Of each of these.
         root: One pixel of each component.
         size: Pixels of each component.
     """

@@ -134,7 +134,9 @@ def _integrated(
         part = _integrated(
             normals[box],
             mask[box],
-            None if intrinsics is None else _from_corner(intrinsics, box),
+            None
+            if intrinsics is None
+            else crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start)),
             spacing,
             None if weight is None else weight[box],
             None if known_depth is None else known_depth[box],
@@ -169,10 +171,6 @@ def _box(mask: Bool[Tensor, "height width"]) -> Box:
     """Return the bounding rows and columns of the mask, to save time and memory."""
     rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _from_corner(intrinsics: Float[Tensor, "3 3"], box: Box) -> Float[Tensor, "3 3"]:
-    return crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
 
 
 def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:

@@ -17,7 +17,6 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
-from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.single_view.integration.free_components import FreeComponents, free_components
 from pimper_torch.single_view.integration.stencil import (
@@ -45,16 +44,12 @@ class RasterSystem:
         method: ``"cholesky"``: exact, on the CPU; ``"multigrid"``: conjugate gradients, memory
             and time grow with the pixels only; ``"cosine"``: one division, for full rectangles
             with equal weights. ``"auto"`` takes the quickest that can.
-        free: Of connected components without anchor, whose height has a free constant:
-            ``"mean_zero"`` gives each the mean 0, and ignores the mean of its right-hand side;
-            ``"refuse"`` raises.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
-        what: Names the system in errors.
 
     Raises:
         InputError: Weights that are negative or not finite; ``"cosine"`` where they differ.
-        SingularSystemError: Free components, with ``"refuse"``.
 
+    A connected component without anchor has mean 0; the mean of its right-hand side is ignored.
     Weights may vary over ten orders, with holes, islands and single pixels. Heights are computed
     in float64, and returned in the device and dtype of the right-hand side.
 
@@ -71,12 +66,10 @@ class RasterSystem:
         anchor: Float[Tensor, "height width"] | None = None,
         *,
         method: Method = "auto",
-        free: Literal["mean_zero", "refuse"] = "mean_zero",
         tolerance: float = DEFAULT_TOLERANCE,
         what: str = "the raster",
     ) -> None:
-        self._requested, self._refuses = method, free == "refuse"
-        self._tolerance, self._what = tolerance, what
+        self._requested, self._tolerance, self._what = method, tolerance, what
         self._take(weight_right, weight_down, anchor, None)
 
     @property
@@ -166,7 +159,7 @@ class RasterSystem:
                 take many more cycles.
         """
         other = object.__new__(RasterSystem)
-        other._requested, other._refuses = self._requested, self._refuses
+        other._requested = self._requested
         other._tolerance, other._what = self._tolerance, self._what
         other._take(weight_right, weight_down, anchor, self, keep)
         return other
@@ -188,7 +181,6 @@ class RasterSystem:
             row_sum = _row_sums(right, down) + anchors
             self._inside = row_sum > 0
             self._components = _components(right, down, anchors, former)
-            self._refuse_free()
             diagonal = torch.where(self._inside, row_sum, 1).reshape(-1)
             diagonal = self._components.pinned(diagonal).view(row_sum.shape)
             self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
@@ -214,15 +206,6 @@ class RasterSystem:
                     f"finite (the first at row {first[0]}, column {first[1]}); each must be 0 or "
                     "more. Give unknown steps weight 0."
                 )
-
-    def _refuse_free(self) -> None:
-        count = len(self._components.root)
-        if self._refuses and count:
-            raise SingularSystemError(
-                f"{self._what} has {count} components without any anchor "
-                f"({len(self._components.pixel)} of {self._inside.numel()} pixels), whose "
-                "heights have a free constant. Anchor a pixel of each, or ask for mean zero."
-            )
 
     def _prepared(self, anchor: Float[Tensor, "height width"]) -> RasterSolver:
         stencil = self._stencil

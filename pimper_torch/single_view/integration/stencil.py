@@ -110,11 +110,7 @@ class CholeskyRaster:
 
 
 class CosineRaster:
-    """Division by frequencies, for equal weights on a full rectangle.
-
-    Args:
-        anchor: Of every pixel.
-    """
+    """Division by frequencies, for equal weights on a full rectangle."""
 
     method = "cosine"
 

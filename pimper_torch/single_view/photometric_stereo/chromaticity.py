@@ -76,9 +76,6 @@ def chromaticity_groups(
 
     Returns:
         Labels from 0, the largest group's; -1 for pixels in no group.
-
-    Raises:
-        InputError: One channel, which has no colour, or an empty mask.
     """
     if images.shape[1] < 2:
         raise InputError(

@@ -39,9 +39,6 @@ def relief_from_albedo(
         shading: Albedo times normal up to a bas-relief transformation, raster order.
         weight: Not negative.
 
-    Raises:
-        InputError: Fewer than four pixels.
-
     Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
     """
     x, y, z = shading.double()
@@ -73,9 +70,6 @@ def relief_from_strength(
         lights: Of the same factorization as the shading; zero rows are ignored.
         shading: Albedo times normal up to a bas-relief transformation, raster order; it
             distinguishes convex from concave.
-
-    Raises:
-        InputError: Fewer than four point lights.
 
     Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
     """

@@ -13,13 +13,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem, random_left
-from pimper_torch.single_view.photometric_stereo.regression import (
-    Shadows,
-    brightness,
-    regress,
-    reweigh,
-)
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem
+from pimper_torch.single_view.photometric_stereo.regression import brightness, regress, reweigh
 
 # Lights are estimated from so many pixels at most, shading for all: a choice.
 _MAX_PIXELS = 4000
@@ -50,9 +45,6 @@ def factorize_photographs(
     rank: int,
     *,
     robust: bool = True,
-    shadows: Shadows = "attached",
-    starts: int = 0,
-    generator: torch.Generator | None = None,
 ) -> Factored:
     """Factorize photographs with missing samples, shadows and highlights.
 
@@ -63,16 +55,8 @@ def factorize_photographs(
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        rank: 3 for point lights, 4 for harmonics.
         robust: Whether to reweight; see
             :func:`~pimper_torch.single_view.photometric_stereo.regression.regress`.
-        shadows: Of lights from behind, see there. For harmonics, ``none``.
-        starts: Random starts besides the one from the data; the best minimum is taken.
-        generator: Of the random starts; on the CPU.
-
-    Raises:
-        InputError: Fewer views or fewer usable pixels than the rank, or random starts without
-            a generator.
 
     Constant to autograd.
 
@@ -91,40 +75,20 @@ def factorize_photographs(
                 f"{rank}; needed: {rank} views and more than {rank} such pixels. Add photographs "
                 "or widen the mask."
             )
-        if starts > 0 and generator is None:
-            raise InputError("factorization: random starts need a generator; found none.")
         if not robust and bool((given == given[seen].max()).all()):
             left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
             return Factored(lights=left, shading=left.mT @ x, weight=given)
         some = usable[evenly(len(usable), _MAX_PIXELS).to(usable.device)]
         first = given[:, some]
-        if robust and shadows == "attached":
-            first = first * brightness(x[:, some], seen[:, some])
-        left = _best_start(x[:, some], first, rank, starts, generator)
         if robust:
-            left = _settle(x[:, some], given[:, some], first, left, shadows)
-        found = regress(x, given, left, robust=robust, shadows=shadows)
+            first = first * brightness(x[:, some], seen[:, some])
+        begin = _filled(x[:, some], first, rank)
+        problem = low_rank_problem(x[None, :, some], first[None], begin[None])
+        left = solve_variable_projection(problem, _FIRST_STEPS).lights[0]
+        if robust:
+            left = _settle(x[:, some], given[:, some], first, left)
+        found = regress(x, given, left, robust=robust)
         return Factored(lights=left, shading=found.shading, weight=found.weight)
-
-
-def _best_start(
-    x: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    rank: int,
-    starts: int,
-    generator: torch.Generator | None,
-) -> Float[Tensor, "view rank"]:
-    """Solve from the imputed data and from random starts; take the best minimum."""
-    begin = [_filled(x, weight, rank)]
-    for _ in range(starts):
-        assert generator is not None
-        begin.append(random_left(1, len(x), rank, generator)[0].to(x))
-    count = len(begin)
-    problem = low_rank_problem(
-        x.expand(count, -1, -1), weight.expand(count, -1, -1), torch.stack(begin)
-    )
-    solved = solve_variable_projection(problem, _FIRST_STEPS)
-    return solved.lights[int(solved.convergence.residual.argmin())]
 
 
 def _settle(
@@ -132,7 +96,6 @@ def _settle(
     given: Float[Tensor, "view pixel"],
     first: Float[Tensor, "view pixel"],
     left: Float[Tensor, "view rank"],
-    shadows: Shadows,
 ) -> Float[Tensor, "view rank"]:
     """Alternate weights and factors, the scale of the weights falling to its final value."""
     weight = first
@@ -141,7 +104,7 @@ def _settle(
         solved = solve_variable_projection(problem, _NEXT_STEPS)
         left = solved.lights[0]
         widen = max(1.0, _WIDEST * _NARROWING**iteration)
-        reliability, lit = reweigh(x, given, left @ solved.shading[0], widen, shadows)
+        reliability, lit = reweigh(x, given, left @ solved.shading[0], widen)
         weight = reliability * lit
     return left
 

@@ -35,11 +35,7 @@ def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
 
 
 def require_standard(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
-    """Return the transformation to the standard form, in float64.
-
-    Raises:
-        InputError: All vectors are parallel, or there are none.
-    """
+    """Return the transformation to the standard form, in float64."""
     relief = standard_relief(shading)
     if not bool(relief.lam.isfinite()):
         raise InputError(

@@ -43,7 +43,6 @@ class Curls(Record):
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
         down: ``s ^ ds/dy``.
-        weight: Of each equation.
         noise: Covariance of ``across``, and of ``down``, from the noise of the pseudo-normals;
             up to a factor.
     """
@@ -96,9 +95,6 @@ def curls(
         weight: Of the pixels; 0 leaves one out.
         noise: Covariance of ``s``, up to a factor; by default noise is white, as after a singular
             value decomposition.
-
-    Raises:
-        InputError: Fewer equations than unknowns.
     """
     s, w = pseudo.double(), weight.double()
     moment = (w * s) @ s.mT

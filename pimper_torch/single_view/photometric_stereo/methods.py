@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
 from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
@@ -21,7 +20,6 @@ from pimper_torch.single_view.photometric_stereo.perspective import factorize_in
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution, Surfaced
 from pimper_torch.single_view.photometric_stereo.regression import determined
 from pimper_torch.single_view.photometric_stereo.relief import convex, rounded_relief
-from pimper_torch.single_view.photometric_stereo.spherical_harmonics import four_harmonic_stereo
 from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
 
 
@@ -66,9 +64,7 @@ _FACTOR = "a factor between albedo and light"
 
 def _calibrated(given: Problem, resolve: str) -> Solution:
     assert given.lights is not None
-    found = calibrated_stereo(
-        given.radiance, given.weight, given.lights, robust=given.robust, ambient=given.ambient
-    )
+    found = calibrated_stereo(given.radiance, given.weight, given.lights, robust=given.robust)
     return Solution(
         normals=found.normals,
         albedo=found.albedo,
@@ -112,25 +108,6 @@ def _perspective(given: Problem, resolve: str) -> Solution:
     return _lambertian(given, found, None, _FACTOR)
 
 
-def _four_harmonics(given: Problem, resolve: str) -> Solution:
-    found = four_harmonic_stereo(
-        given.gray, given.weight, given.mask, given.generator, robust=given.robust
-    )
-    albedo = found.shading[0]
-    normals = found.shading[1:] / torch.where(albedo > 0, albedo, 1)
-    shade = found.lights @ harmonics(normals.mT).mT
-    return _scaled(
-        Solution(
-            normals=normals,
-            albedo=chromatic_albedo(given.radiance, found.weight, shade),
-            lights=found.lights,
-            weight=found.weight,
-            applied=found.ambiguity,
-            free=f"convex or concave, {_FACTOR}",
-        )
-    )
-
-
 def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
     """Return normals and the albedo of each colour from shading and point lights."""
     size = found.shading.norm(dim=0)
@@ -170,25 +147,19 @@ class Method:
     """A method by its name.
 
     Attributes:
-        solve: From the problem and the name of a resolver.
-        unknowns: Of a pixel, which is the minimum number of views.
         resolvers: Of its ambiguity; the first is the default.
         calibrated: Whether it needs lights.
         perspective: Whether it needs intrinsics.
-        robust: Whether shadows and highlights lose weight by default.
     """
 
     solve: Callable[[Problem, str], Solution]
-    unknowns: int
     resolvers: tuple[str, ...] = ()
     calibrated: bool = False
     perspective: bool = False
-    robust: bool = True
 
 
 METHODS = {
-    "calibrated": Method(solve=_calibrated, unknowns=3, calibrated=True),
-    "integrability": Method(solve=_integrability, unknowns=3, resolvers=tuple(RESOLVERS)),
-    "perspective": Method(solve=_perspective, unknowns=3, perspective=True),
-    "four_harmonics": Method(solve=_four_harmonics, unknowns=4, robust=False),
+    "calibrated": Method(solve=_calibrated, calibrated=True),
+    "integrability": Method(solve=_integrability, resolvers=tuple(RESOLVERS)),
+    "perspective": Method(solve=_perspective, perspective=True),
 }

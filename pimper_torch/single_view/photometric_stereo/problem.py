@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.ambiguity import Ambiguity
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 
@@ -20,11 +18,8 @@ class Problem(Record):
         radiance: Linear; zero where missing.
         weight: 0 where missing.
         mask: True at the pixels.
-        lights: If known.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
-        generator: On the CPU.
         robust: Whether shadows and highlights lose weight.
-        ambient: Whether pixels have ambient radiance.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -33,9 +28,7 @@ class Problem(Record):
     mask: Bool[Tensor, "height width"]
     lights: Float[Tensor, "view 3"] | None
     intrinsics: Float[Tensor, "3 3"] | None
-    generator: torch.Generator
     robust: bool
-    ambient: bool
 
     @property
     def gray(self) -> Float[Tensor, "view pixel"]:
@@ -49,18 +42,15 @@ class Solution(Record):
 
     Attributes:
         normals: Unit or zero.
-        albedo: Of each colour.
-        lights: Of the views that have samples.
-        weight: Final weight of each sample.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
 
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view unknown"]
+    lights: Float[Tensor, "view 3"]
     weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | Ambiguity | None
+    applied: BasRelief | None
     free: str
 
 
@@ -72,7 +62,6 @@ class Surfaced(Record):
         shading: Albedo times normal.
         lights: Of the same factorization.
         reliability: Of each pixel; 0 leaves it out.
-        weight: Of each sample.
     """
 
     shading: Float[Tensor, "3 pixel"]

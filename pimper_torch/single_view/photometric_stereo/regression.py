@@ -6,13 +6,12 @@ invertible matrix.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.quadratics import PackedCholesky, diagonal, outer, unpacked
+from pimper_torch.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
@@ -22,8 +21,6 @@ _WIDEST, _NARROWING = 4.0, 0.7
 # Minimum scale, as a fraction of the brightness: a choice, far below the 4e-3 of 8-bit steps.
 _MIN_SCALE = 1e-4
 
-Shadows = Literal["attached", "none"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Regressed(Record):
@@ -32,12 +29,10 @@ class Regressed(Record):
     Attributes:
         shading: ``b`` of every pixel; zero without samples.
         weight: Final weight of each sample; 0 where it lies in shadow.
-        base: Radiance besides ``l . b`` that is the same in all views; zero without ``base``.
     """
 
     shading: Float[Tensor, "unknown pixel"]
     weight: Float[Tensor, "view pixel"]
-    base: Float[Tensor, " pixel"]
 
 
 def regress(
@@ -46,23 +41,18 @@ def regress(
     lights: Float[Tensor, "view unknown"],
     *,
     robust: bool = True,
-    shadows: Shadows = "attached",
-    base: bool = False,
     iterations: int = 15,
 ) -> Regressed:
     r"""Fit each pixel's shading vector to its radiance.
 
     Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
-    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; with attached
-    shadows, a view whose light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
+    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; a view whose
+    light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
     initial fit weights samples by their brightness, up to the pixel's median: shadows are dark.
 
     Args:
         radiance: Linear, gray. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
-        shadows: Of a light from behind: ``attached``, radiance is 0; ``none``, it is linear in
-            the light, and negative.
-        base: Whether radiance has a part that is the same in all views, such as ambient light.
 
     Returns:
         In float64. An underdetermined pixel has one of its minima; see :func:`determined`.
@@ -77,14 +67,12 @@ def regress(
         given = weight.double()
         rows = lights.double()
         if not robust:
-            return _fit(x, given, torch.zeros_like(given), rows, base)
-        found = _fit(x, given * brightness(x, seen, base), torch.zeros_like(given), rows, base)
+            return _fit(x, given, rows)
+        found = _fit(x, given * brightness(x, seen), rows)
         for iteration in range(iterations):
-            direct = rows @ found.shading
-            reliability, lit = reweigh(
-                x - found.base, given, direct, max(1.0, _WIDEST * _NARROWING**iteration), shadows
-            )
-            found = _fit(x, reliability * lit, reliability * ~lit, rows, base)
+            widen = max(1.0, _WIDEST * _NARROWING**iteration)
+            reliability, lit = reweigh(x, given, rows @ found.shading, widen)
+            found = _fit(x, reliability * lit, rows)
         return found
 
 
@@ -93,20 +81,17 @@ def reweigh(
     weight: Float[Tensor, "view pixel"],
     predicted: Float[Tensor, "view pixel"],
     widen: float,
-    shadows: Shadows,
 ) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
     """Update the samples' weights by their residuals.
 
     Args:
-        radiance: Observed.
         predicted: By a fit; below zero for lights from behind.
         widen: Multiple of the scale.
-        shadows: Of lights from behind; see :func:`regress`.
 
     Returns:
         The weights, and whether a light comes from the front.
     """
-    lit = predicted > 0 if shadows == "attached" else torch.ones_like(weight, dtype=torch.bool)
+    lit = predicted > 0
     residual = torch.where(lit, radiance - predicted, radiance)
     seen = (weight > 0) & lit
     level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
@@ -115,12 +100,10 @@ def reweigh(
 
 
 def brightness(
-    radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"], base: bool = False
+    radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"]
 ) -> Float[Tensor, "view pixel"]:
     """Return weights proportional to brightness, up to the median of the pixel."""
     x = torch.where(seen, radiance, torch.nan)
-    if base:
-        x = x - x.nan_to_num(nan=torch.inf).amin(dim=0)
     centre = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
     centre = torch.where(centre > 0, centre, x.nan_to_num(nan=0.0).amax(dim=0))
     fraction = x.nan_to_num(nan=0.0).clamp_min(0) / torch.where(centre > 0, centre, 1)
@@ -135,7 +118,6 @@ def determined(
     """Find which pixels have as many samples as unknowns, and lights that span them.
 
     Args:
-        weight: Of the samples, after a regression.
         lights: The scale of each column does not matter.
         least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
             1 % in the images is as large as the solution.
@@ -154,20 +136,9 @@ def determined(
 
 def _fit(
     x: Float[Tensor, "view pixel"],
-    lit: Float[Tensor, "view pixel"],
-    dark: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
     rows: Float[Tensor, "view unknown"],
-    base: bool,
 ) -> Regressed:
-    """Solve the normal equations; samples in shadow constrain the base only."""
-    if base:
-        rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
-    packed = outer(rows.mT) @ lit
-    rhs = rows.mT @ (lit * x)
-    if base:
-        packed[diagonal(rows.shape[1])[-1]] += dark.sum(dim=0)
-        rhs[-1] += (dark * x).sum(dim=0)
-    solution = PackedCholesky(packed, rows.shape[1]).solve(rhs)
-    if base:
-        return Regressed(shading=solution[:-1], weight=lit, base=solution[-1])
-    return Regressed(shading=solution, weight=lit, base=torch.zeros_like(solution[0]))
+    """Solve the normal equations."""
+    factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
+    return Regressed(shading=factored.solve(rows.mT @ (weight * x)), weight=weight)

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.ambiguity import Ambiguity
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.methods import METHODS, Method
 from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution
 from pimper_torch.single_view.photometric_stereo.regression import determined
-from pimper_torch.single_view.photometric_stereo.visibility_subspaces import visibility_subspaces
 
 
 class Finding(IntEnum):
@@ -37,23 +35,22 @@ class PhotometricStereo(Record):
             not valid, an estimate or zero.
         albedo: Of each colour, not negative. With unknown lights up to one factor, such that
             lights have the median length 1.
-        lights: One row a view: direction to the point light times its irradiance, or four
-            harmonics; zero for a view without samples.
+        lights: One row a view: direction to the point light times its irradiance; zero for a
+            view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
         finding: A :class:`Finding` for each pixel.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
-        unused_views: Without any sample.
     """
 
     normals: Float[Tensor, "height width 3"]
     albedo: Float[Tensor, "height width channel"]
-    lights: Float[Tensor, "view unknown"]
+    lights: Float[Tensor, "view 3"]
     lit: Bool[Tensor, "view height width"]
     valid: Bool[Tensor, "height width"]
     finding: Int[Tensor, "height width"]
-    applied: BasRelief | Ambiguity | None
+    applied: BasRelief | None
     free: str
     unused_views: tuple[int, ...]
 
@@ -67,10 +64,7 @@ def photometric_stereo(
     lights: Float[Tensor, "light 3"] | None = None,
     intrinsics: Float[Tensor, "3 3"] | None = None,
     weight: Float[Tensor, "..."] | None = None,
-    generator: torch.Generator | None = None,
-    robust: bool | None = None,
-    subspaces: bool = False,
-    ambient: bool = False,
+    robust: bool = True,
 ) -> PhotometricStereo:
     """Recover normals and albedo from photographs of one viewpoint under changing light.
 
@@ -81,12 +75,10 @@ def photometric_stereo(
     ``integrability``   point lights                                bas-relief,
                                                                     by ``resolve``
     ``perspective``     point lights, pinhole (``intrinsics``)      none
-    ``four_harmonics``  any, around the viewer, no cast shadows     convex or concave
     ==================  ==========================================  =================
 
-    Convex is chosen. ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a
-    ball), ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few
-    albedos).
+    ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a ball),
+    ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few albedos).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
@@ -98,12 +90,7 @@ def photometric_stereo(
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
-        generator: On the CPU; for harmonics and subspaces, by default with the seed 0.
-        robust: Whether shadows and highlights lose weight; by default with point lights, but not
-            with harmonics, which explain attached shadows.
-        subspaces: Whether shadows are found first, by :mod:`.visibility_subspaces`, and left out.
-            For point lights whose shadows are black.
-        ambient: For ``calibrated``: whether pixels have ambient radiance.
+        robust: Whether shadows and highlights lose weight.
 
     Raises:
         InputError: Unknown names, shapes that do not match, an empty mask, fewer views with
@@ -122,19 +109,14 @@ def photometric_stereo(
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
     _refuse_shapes(images, mask, lights, weight)
     chosen = METHODS[method]
-    _refuse_settings(method, chosen, resolve, lights, intrinsics, ambient)
+    _refuse_settings(method, chosen, resolve, lights, intrinsics)
     with torch.no_grad():
         given = images.new_ones(len(images), *mask.shape) if weight is None else weight
         samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
-        generator = torch.Generator().manual_seed(0) if generator is None else generator
-        if subspaces:
-            clean = torch.where(images.isfinite(), images, 0)
-            heavy = heavy * visibility_subspaces(clean, mask, generator)
         used = (heavy > 0).any(dim=1)
-        unknowns = chosen.unknowns + int(ambient)
-        _refuse_few(int(used.sum()), unknowns, method)
+        _refuse_few(int(used.sum()), method)
         problem = Problem(
             images=images[used],
             radiance=torch.where((heavy > 0)[:, None], samples, 0).double()[used],
@@ -142,9 +124,7 @@ def photometric_stereo(
             mask=mask,
             lights=None if lights is None else lights[used].double(),
             intrinsics=None if intrinsics is None else intrinsics.double(),
-            generator=generator,
-            robust=chosen.robust if robust is None else robust,
-            ambient=ambient,
+            robust=robust,
         )
         if problem.lights is not None:
             _refuse_plane(problem.lights)
@@ -158,10 +138,7 @@ def _spread_out(
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
     mask = given.mask
-    rows = found.lights
-    if given.ambient:
-        rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
-    enough, spanned = determined(found.weight, rows)
+    enough, spanned = determined(found.weight, found.lights)
     finding = torch.full_like(spanned, int(Finding.FOUND), dtype=torch.long)
     checks = [
         (found.normals[2] >= 0, Finding.AVERTED),
@@ -229,14 +206,11 @@ def _refuse_settings(
     resolve: str | None,
     lights: Tensor | None,
     intrinsics: Tensor | None,
-    ambient: bool,
 ) -> None:
     if method.calibrated and lights is None:
         raise InputError(f"{name}: there are no lights; needed: one direction a photograph.")
     if not method.calibrated and lights is not None:
         raise InputError(f"{name}: finds the lights itself. Leave them out, or use calibrated.")
-    if not method.calibrated and ambient:
-        raise InputError(f"{name}: cannot find ambient light. Leave it out, or use calibrated.")
     if method.perspective and intrinsics is None:
         raise InputError(f"{name}: there are no intrinsics; needed: those of the camera.")
     if not method.perspective and intrinsics is not None:
@@ -247,11 +221,11 @@ def _refuse_settings(
         )
 
 
-def _refuse_few(views: int, unknowns: int, method: str) -> None:
-    if views < unknowns:
+def _refuse_few(views: int, method: str) -> None:
+    if views < 3:
         raise InputError(
-            f"{method}: {views} photographs have samples inside the mask; needed: {unknowns} or "
-            "more, one for each unknown of a pixel. Add photographs, or choose a simpler method."
+            f"{method}: {views} photographs have samples inside the mask; needed: 3 or more, one "
+            "for each unknown of a pixel. Add photographs."
         )
 
 

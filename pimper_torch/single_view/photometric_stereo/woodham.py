@@ -1,7 +1,6 @@
 r"""Calibrated photometric stereo: normals and albedo under known point lights.
 
-:math:`x_{vc} = \rho_c\, l_v^\top n + a_c`: one normal for all colours, an albedo for each, and
-optionally ambient radiance ``a``.
+:math:`x_{vc} = \rho_c\, l_v^\top n`: one normal for all colours, an albedo for each.
 
 Source: Woodham, Photometric method for determining surface orientation from multiple images,
 Optical Engineering 19(1), 1980.
@@ -20,18 +19,16 @@ from pimper_torch.single_view.photometric_stereo.regression import regress
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Calibrated(Record):
-    """Normals, albedo and ambient radiance of pixels.
+    """Normals and albedo of pixels.
 
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
         albedo: Of each colour, not negative.
-        ambient: Radiance in the shadow of the point light; zero without ``ambient``.
         weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
-    ambient: Float[Tensor, "channel pixel"]
     weight: Float[Tensor, "view pixel"]
 
 
@@ -41,7 +38,6 @@ def calibrated_stereo(
     lights: Float[Tensor, "view 3"],
     *,
     robust: bool = True,
-    ambient: bool = False,
 ) -> Calibrated:
     r"""Recover normals and albedos of pixels under known distant point lights.
 
@@ -55,7 +51,6 @@ def calibrated_stereo(
         weight: Not negative; 0 where missing.
         lights: Direction to the point light times its irradiance.
         robust: Whether shadows and highlights lose weight.
-        ambient: Whether pixels have ambient radiance, one more unknown per colour.
 
     Underdetermined, giving one of the minima, where a pixel has fewer lit samples than unknowns
     or lights in one plane; see :func:`.determined`. Constant to autograd.
@@ -63,25 +58,14 @@ def calibrated_stereo(
     with torch.no_grad():
         seen = weight > 0
         x = torch.where(seen[:, None], radiance, 0).double()
-        gray = regress(x.mean(dim=1), weight, lights, robust=robust, base=ambient)
+        gray = regress(x.mean(dim=1), weight, lights, robust=robust)
         rows = lights.double()
-        if ambient:
-            rows = torch.cat([rows, torch.ones_like(rows[:, :1])], dim=1)
         heavy = gray.weight
         packed = outer(rows.mT) @ heavy
-        factored = PackedCholesky(packed, rows.shape[1])
+        factored = PackedCholesky(packed, 3)
         found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
-        full = unpacked(packed, rows.shape[1])
-        inner = full[:, :3, :3]
-        if ambient:
-            total = full[:, 3, 3].clamp_min(torch.finfo(full.dtype).tiny)
-            inner = inner - full[:, :3, 3:] * full[:, 3:, :3] / total[:, None, None]
-        normals, albedo = _shared(inner, found[:, :3])
-        base = torch.zeros_like(albedo)
-        if ambient:
-            left = x - albedo * (rows[:, :3] @ normals)[:, None]
-            base = (heavy[:, None] * left).sum(dim=0) / heavy.sum(dim=0).clamp_min(1e-300)
-        return Calibrated(normals=normals, albedo=albedo, ambient=base, weight=heavy)
+        normals, albedo = _shared(unpacked(packed, 3), found)
+        return Calibrated(normals=normals, albedo=albedo, weight=heavy)
 
 
 def chromatic_albedo(

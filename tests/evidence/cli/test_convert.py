@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.cli import convert
 from pimper_torch.evidence.cli.convert import Source, cloud, read_scene, readers
-from pimper_torch.evidence.datasets import read_colmap, read_idr, read_scale_mats, read_transforms
+from pimper_torch.evidence.datasets import read_colmap, read_idr, read_transforms
 from pimper_torch.geometry.frames import transform
 from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Mesh, Truth
@@ -62,7 +62,9 @@ def test_options_reach_the_reader_and_the_writer(data, tmp_path):
     options = ["--target", "idr", "--max-size-px", "6", "--mesh", str(tmp_path / "true.obj")]
     assert main([*arguments, *options]) == 0
     assert read_idr(out).views.sizes_px.tolist() == [[6, 4]] * 3
-    unit_from_world = torch.linalg.inv(read_scale_mats(out)[0])
+    unit_from_world = torch.linalg.inv(
+        torch.from_numpy(np.load(out / "cameras.npz")["scale_mat_0"])
+    )
     corner = transform(unit_from_world, torch.tensor([[2.0, 2, 0]]).double())
     assert_close(float(corner.norm()), 0.9)
 

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 import scipy.io
 import torch
-from one_viewpoint import read_uw_ps, read_yale_b
+from one_viewpoint import read_normal_map, read_uw_ps, read_yale_b
 from PIL import Image
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.diligent import read_diligent, read_normal_map
+from pimper_torch.evidence.datasets.diligent import read_diligent
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.geometry.projection import project
 

@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.idr import read_idr, read_scale_mats, unit_sphere, write_idr
+from pimper_torch.evidence.datasets.idr import read_idr, unit_sphere, write_idr
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import transform
 
@@ -41,10 +41,6 @@ def test_the_matrix_goes_from_the_world_to_pixels_counted_from_0(folder, sees, h
 def test_a_matrix_known_up_to_a_negative_factor_gives_the_same_camera(folder, sees):
     save(folder, world_mat_1=-3 * np.array(WORLD))
     assert sees(read_idr(folder), 1) == pytest.approx([10, 11])
-
-
-def test_the_scale_is_read_beside(folder):
-    assert read_scale_mats(folder).tolist() == [SCALE, SCALE]
 
 
 def test_other_camera_files_are_found(folder, sees):
@@ -121,7 +117,8 @@ def test_views_without_masks_get_white_ones(capture, tmp_path):
 def test_the_unit_sphere_holds_the_points(capture, tmp_path, generator):
     points = torch.tensor([3.0, -2, 7]) + torch.rand(50, 3, generator=generator)
     write_idr(capture.views, capture.cameras, tmp_path, points_world=points)
-    unit_from_world = torch.linalg.inv(read_scale_mats(tmp_path)[1])
+    scale_mat = np.load(tmp_path / "cameras.npz")["scale_mat_1"]
+    unit_from_world = torch.linalg.inv(torch.from_numpy(scale_mat))
     radius = transform(unit_from_world, points.double()).norm(dim=-1).max()
     assert_close(float(radius), 0.9)
     # One factor for all axes, no rotation.

@@ -163,7 +163,7 @@ def test_with_anchors_the_solution_is_that_of_the_dense_matrix(weighted, method,
     inside = matrix.diagonal() > 0
     joined = (component_means(held, (anchor > 0).double()) > 0).flatten()
     source = random(generator, *weighted.shape)
-    found = system(held, method=method, free="mean_zero").solve(source).flatten()
+    found = system(held, method=method).solve(source).flatten()
     dense = matrix[joined][:, joined]
     scale = dense.diagonal().rsqrt()
     dense = scale[:, None] * dense * scale
@@ -369,8 +369,6 @@ def test_refusals_say_what_is_wrong():
         RasterSystem(bad, down, what="the moon")
     with pytest.raises(InputError, match="anchors are negative"):
         RasterSystem(right, down, torch.full((3, 4), -1.0))
-    with pytest.raises(SingularSystemError, match=r"1 components without any anchor \(12 of 12"):
-        RasterSystem(right, down, free="refuse")
     with pytest.raises(InputError, match=r"make no raster"):
         RasterSystem(torch.ones(3, 2), down)
     with pytest.raises(InputError, match="the same everywhere"):

@@ -17,7 +17,6 @@ def test_colours_share_their_normal(bumpy, point_lights, patchwork, angles_deg, 
     found = calibrated_stereo(radiance, torch.ones_like(shade), lights, robust=robust)
     assert angles_deg(found.normals, bumpy.columns)[lit].max() < 1e-4
     assert_close(found.albedo[:, lit], albedo[:, lit])
-    assert (found.ambient == 0).all()
 
 
 def test_the_colour_that_says_most_counts_most(bumpy, point_lights, generator, angles_deg):
@@ -31,20 +30,6 @@ def test_the_colour_that_says_most_counts_most(bumpy, point_lights, generator, a
     of_gray = calibrated_stereo(radiance.mean(dim=1, keepdim=True), weight, lights, robust=False)
     off = angles_deg(together.normals, bumpy.columns).mean()
     assert off < 0.7 * angles_deg(of_gray.normals, bumpy.columns).mean()
-
-
-def test_ambient_light_is_told_from_the_point_light(bumpy, point_lights, patchwork, angles_deg):
-    lights = point_lights(12, spread=0.3)
-    albedo = COLOURS[:, None] * patchwork(bumpy)
-    shade = lights @ bumpy.columns
-    lit = (shade > 0).all(dim=0)
-    radiance = (shade + 0.4)[:, None] * albedo
-    weight = torch.ones_like(shade)
-    found = calibrated_stereo(radiance, weight, lights, robust=False, ambient=True)
-    assert angles_deg(found.normals, bumpy.columns)[lit].max() < 1e-4
-    assert_close(found.ambient[:, lit], 0.4 * albedo[:, lit])
-    without = calibrated_stereo(radiance, weight, lights, robust=False)
-    assert angles_deg(without.normals, bumpy.columns)[lit].mean() > 2
 
 
 def test_a_black_pixel_has_no_normal(point_lights):
