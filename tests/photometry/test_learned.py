@@ -1,0 +1,98 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.frames import rotate
+from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.priors import PatchSamples
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(5)
+
+
+@pytest.fixture
+def prior():
+    torch.manual_seed(2)
+    return LearnedPrior().double()
+
+
+@pytest.fixture
+def samples(generator):
+    """Two patches of noisy radiance, 6 views and 9 samples, some of them missing."""
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    normals = normalize(torch.cat([rand(2, 9, 2) - 0.5, -1 - rand(2, 9, 1)], dim=-1), dim=-1)
+    soft, toward = (
+        0.3 + rand(2, 6, 1),
+        normalize(rand(2, 6, 3) - torch.tensor([0.5, 0.5, 1.5]), dim=-1),
+    )
+    lights, albedo = torch.cat([soft, toward], dim=-1), 0.2 + rand(2, 9)
+    seen = rand(2, 6, 9) < 0.8
+    radiance = albedo[:, None] * (lights @ harmonics(normals).mT) * (1 + 0.3 * rand(2, 6, 9))
+    return PatchSamples(
+        radiance=radiance * seen, seen=seen, normals=normals, albedo=albedo, lights=lights
+    )
+
+
+def test_the_order_of_views_does_not_matter(prior, samples, generator):
+    order = torch.randperm(6, generator=generator)
+    shuffled = samples.replace(
+        radiance=samples.radiance[:, order],
+        seen=samples.seen[:, order],
+        lights=samples.lights[:, order],
+    )
+    one, other = prior(samples), prior(shuffled)
+    assert torch.allclose(one.normals, other.normals, atol=1e-12)
+    assert torch.allclose(one.normal_weight, other.normal_weight, atol=1e-12)
+    assert torch.allclose(one.inlier[:, order], other.inlier, atol=1e-12)
+
+
+def test_normals_rotate_with_patch_and_lights(prior, samples):
+    angle = torch.tensor(0.7, dtype=torch.float64)
+    about_z = torch.eye(4, dtype=torch.float64)
+    about_z[:2, :2] = torch.stack(
+        [torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])]
+    )
+    rotated = samples.replace(
+        normals=rotate(about_z, samples.normals), lights=rotate_lights(about_z, samples.lights)
+    )
+    one, other = prior(samples), prior(rotated)
+    assert torch.allclose(rotate(about_z, one.normals), other.normals, atol=1e-12)
+    assert torch.allclose(one.inlier, other.inlier, atol=1e-12)
+
+
+def test_units_of_albedo_and_lights_do_not_matter(prior, samples):
+    other = samples.replace(lights=samples.lights * 3, albedo=samples.albedo / 3)
+    brighter = other.replace(radiance=samples.radiance * 5, albedo=other.albedo * 5)
+    one, two = prior(samples), prior(brighter)
+    assert torch.allclose(one.normals, two.normals, atol=1e-12)
+    assert torch.allclose(one.inlier, two.inlier, atol=1e-12)
+
+
+def test_what_is_not_seen_does_not_matter(prior, samples):
+    junk = torch.where(samples.seen, samples.radiance, 7.0)
+    one, other = prior(samples), prior(samples.replace(radiance=junk))
+    assert torch.equal(one.normals, other.normals)
+    assert torch.equal(one.normal_weight, other.normal_weight)
+
+
+def test_guesses_are_unit_normals_and_factors(prior, samples):
+    found = prior(samples)
+    assert torch.allclose(found.normals.norm(dim=-1), torch.ones(2, 9, dtype=torch.float64))
+    assert ((found.inlier > 0) & (found.inlier <= 1)).all()
+    assert (found.normal_weight > 0).all()
+
+
+def test_missing_or_foreign_weights_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"there is no such file; needed: the weights"):
+        LearnedPrior.trained(tmp_path / "none.safetensors")
+    foreign = tmp_path / "foreign.safetensors"
+    foreign.write_bytes(b"no weights")
+    with pytest.raises(InputError, match=r"cannot be read .* needed: the weights"):
+        LearnedPrior.trained(foreign)
