@@ -381,7 +381,7 @@ class Factorize(Stage):
         at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
-        problem = self._problem(rows, anchor, refused, raster, bucket.registered.priors, variance)
+        problem = self._problem(rows, anchor, refused, raster, bucket.registered, variance)
         return _Prepared(rows=rows, status=status, problem=problem)
 
     def _photometry(self, bucket: _Bucket, prepared: _Prepared, factors: Factors) -> Photometry:
@@ -430,14 +430,14 @@ class Factorize(Stage):
         field: Float[Tensor, "patch view 4"],
         refused: Bool[Tensor, " patch"],
         raster: int,
-        guessed: PatchPriors | None,
+        registered: Observations,
         variance: float,
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
         shading = initial_shading(gray, rows.seen, field, harmonics(rows.normals).mT)
-        samples = _samples(rows, gray, field, shading[:, 0], guessed, variance)
+        samples = _samples(rows, gray, field, shading[:, 0], registered, variance)
         known = [cast("Known", prior(samples)) for prior in self.priors]
         for each in known:
             if each.inlier is not None:
@@ -537,12 +537,18 @@ def _samples(
     gray: Float[Tensor, "patch view sample"],
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
-    guessed: PatchPriors | None,
+    registered: Observations,
     variance: float,
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
+    guessed = registered.priors
     samples = PatchSamples(
-        radiance=gray, seen=rows.seen, normals=rows.normals, albedo=albedo, lights=field
+        radiance=gray,
+        seen=rows.seen,
+        normals=rows.normals,
+        albedo=albedo,
+        lights=field,
+        viewers=registered.viewers,
     )
     if guessed is None:
         return samples

@@ -25,20 +25,25 @@ _BOUND = 3.0
 # Ridge of the tilt's equations, in squares of relative radiance: a choice.
 _RIDGE = 0.01
 
-_FEATURES = 6
+# Width of highlights, in cosines between normal and halfway vector: a choice, 18 degrees.
+_LOBE = 0.05
+
+_FEATURES = 9
 
 
 class LearnedPrior(FactorPrior):
     r"""A small network that guesses normals, and which entries show diffuse reflection.
 
     An entry is a view of a sample. Its features are radiance and prediction relative to the
-    sample's mean prediction, their difference, the light's cosine and its tilt, and the difference
-    along the tilt that fits all views best. A layer that all entries share follows, then mean and
+    sample's mean prediction, their difference, the light's cosine and its tilt, the cosines of the
+    viewer and of the halfway vector, and the difference along the tilt that fits all views best. A
+    layer that all entries share follows, then mean and
     maximum over the views that see the sample, then a layer of both. So the order of views does not
     matter, and normals rotate with patch and lights.
 
     The guessed normal is the surface's, tilted by the sum of two parts: the least-squares tilt of
-    what the network takes as diffuse, and the lights' tangents weighed by the network.
+    what the network takes as diffuse, and the tangents of lights and halfway vectors, weighed by
+    the network.
 
     Args:
         width: Of the layers.
@@ -53,7 +58,7 @@ class LearnedPrior(FactorPrior):
         )
         self.pooled = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU())
         self.own, self.shared = nn.Linear(width, width), nn.Linear(width, width)
-        self.of_entry, self.of_sample = nn.Linear(width, 2), nn.Linear(width, 2)
+        self.of_entry, self.of_sample = nn.Linear(width, 3), nn.Linear(width, 2)
 
     @classmethod
     def trained(cls, path: Path = WEIGHTS) -> "LearnedPrior":
@@ -87,12 +92,20 @@ class LearnedPrior(FactorPrior):
         bound = (1 + (along[0].square() + along[1].square()) / _BOUND**2).rsqrt()
         along = [part * bound for part in along]
         direction = normalize(samples.lights[..., 1:], dim=-1)
+        viewers = samples.viewers
+        if viewers is None:
+            viewers = direction.new_tensor([0.0, 0.0, -1.0]).expand_as(direction)
+        halfway = normalize(direction + viewers, dim=-1)
+        mirror = halfway @ normals.mT
         fit = _tilt(along, residual, predicted, seen.to(residual.dtype))
         features = torch.stack(
             [
                 residual,
                 predicted,
                 direction @ normals.mT,
+                viewers @ normals.mT,
+                mirror,
+                ((mirror - 1) / _LOBE).exp(),
                 _length(along),
                 along[0] * fit[0][:, None] + along[1] * fit[1][:, None],
                 _length(fit)[:, None].expand_as(residual),
@@ -105,14 +118,15 @@ class LearnedPrior(FactorPrior):
         largest = inner.masked_fill(~shown, -1).amax(dim=1)
         pooled = self.pooled(torch.cat([average, largest], dim=-1))
         joined = nn.functional.silu(self.own(inner) + self.shared(pooled)[:, None])
-        logit, push = self.of_entry(joined).to(residual).unbind(dim=-1)
+        logit, push, glare = self.of_entry(joined).to(residual).unbind(dim=-1)
         pull, gate = self.of_sample(pooled).to(residual).unbind(dim=-1)
         inlier = torch.sigmoid(logit)
         fit = _tilt(along, residual, predicted, inlier * seen)
         tilt = torch.stack(
             [
-                torch.sigmoid(gate) * own + (push * part * seen).sum(dim=1) / count[:, 0]
-                for own, part in zip(fit, along, strict=True)
+                torch.sigmoid(gate) * own
+                + ((push * part + glare * (halfway @ tangent.mT)) * seen).sum(dim=1) / count[:, 0]
+                for own, part, tangent in zip(fit, along, tangents(normals), strict=True)
             ]
         )
         tilt = tilt * (1 + tilt.square().sum(dim=0) / _MAX_TILT**2).rsqrt()

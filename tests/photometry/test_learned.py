@@ -35,8 +35,14 @@ def samples(generator):
     lights, albedo = torch.cat([soft, toward], dim=-1), 0.2 + rand(2, 9)
     seen = rand(2, 6, 9) < 0.8
     radiance = albedo[:, None] * (lights @ harmonics(normals).mT) * (1 + 0.3 * rand(2, 6, 9))
+    viewers = normalize(rand(2, 6, 3) - torch.tensor([0.5, 0.5, 1.5]), dim=-1)
     return PatchSamples(
-        radiance=radiance * seen, seen=seen, normals=normals, albedo=albedo, lights=lights
+        radiance=radiance * seen,
+        seen=seen,
+        normals=normals,
+        albedo=albedo,
+        lights=lights,
+        viewers=viewers,
     )
 
 
@@ -46,6 +52,7 @@ def test_the_order_of_views_does_not_matter(prior, samples, generator):
         radiance=samples.radiance[:, order],
         seen=samples.seen[:, order],
         lights=samples.lights[:, order],
+        viewers=samples.viewers[:, order],
     )
     one, other = prior(samples), prior(shuffled)
     assert torch.allclose(one.normals, other.normals, atol=1e-12)
@@ -60,7 +67,9 @@ def test_normals_rotate_with_patch_and_lights(prior, samples):
         [torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])]
     )
     rotated = samples.replace(
-        normals=rotate(about_z, samples.normals), lights=rotate_lights(about_z, samples.lights)
+        normals=rotate(about_z, samples.normals),
+        lights=rotate_lights(about_z, samples.lights),
+        viewers=rotate(about_z, samples.viewers),
     )
     one, other = prior(samples), prior(rotated)
     assert torch.allclose(rotate(about_z, one.normals), other.normals, atol=1e-12)
