@@ -148,7 +148,7 @@ def test_every_preset_of_the_package_is_found_and_read():
 
 
 def test_a_misspelt_preset_names_the_nearest():
-    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper"):
+    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, learned, paper"):
         find_config("papre")
 
 

@@ -6,6 +6,9 @@ from probes import probes, small_scene
 
 import pimper_torch as pt
 from pimper_torch.evidence.metrics.derivatives import check_derivatives
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.records import Silhouettes
+from pimper_torch.stage import Given
 
 # What is promised of the chain whole; single stages do far better. Kinks that are too small to tell
 # from slopes, at borders of pixels, are left.
@@ -80,6 +83,34 @@ def test_the_chain_whole_agrees_with_finite_differences(generator):
     few = small_scene(num_views=5, width=32, num_points=6)
     found = probes(in_iterations(), *few)["chain"].check(generator, directions=2, weights=4)
     assert_agree("chain", found, WHOLE)
+
+
+@pytest.mark.slow
+def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
+    scene, coarse = small_scene(num_views=5, width=32, num_points=6)
+    chain = chain_of("default", scales=[1.0])
+    chain.silhouettes = Given(Silhouettes.everything(scene.views))
+    chain.coarse_surface = Given(coarse)
+    prior = LearnedPrior.trained().double()
+    chain.factorize.priors.append(prior)
+    where = f"factorize.priors.{len(chain.factorize.priors) - 1}."
+    parameters = {name: value for name, value in prior.named_parameters() if "weight" in name}
+    parts = [value.numel() for value in parameters.values()]
+
+    def found(x):
+        values = torch.split(x["parameters"], parts)
+        moved = {
+            where + name: value.reshape(own.shape)
+            for (name, own), value in zip(parameters.items(), values, strict=True)
+        }
+        swept = torch.func.functional_call(chain, moved, (scene,)).patches
+        normals = [bucket.normals_patch.flatten() for bucket in swept.photometric.buckets]
+        offsets = [bucket.offset.flatten() for bucket in swept.buckets]
+        return {"normals": torch.cat(normals), "offset": torch.cat(offsets)}
+
+    flat = torch.cat([value.flatten() for value in parameters.values()])
+    pairs = check_derivatives(found, {"parameters": flat}, generator, directions=1)
+    assert_agree("prior", pairs, STAGE)
 
 
 def test_a_part_that_autograd_does_not_see_is_noticed(generator):

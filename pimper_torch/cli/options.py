@@ -35,7 +35,7 @@ class CommonOptions:
     """Options that every command has.
 
     Attributes:
-        preset: Settings to start from: default, fast, paper, or a YAML file of your own.
+        preset: Settings to start from: default, fast, learned, paper, or a YAML file of your own.
         reference: Photograph that facets and pictures are seen from; chosen unless given.
         device: Of all after structure from motion; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.

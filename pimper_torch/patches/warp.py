@@ -127,7 +127,11 @@ class Warp(Stage):
         )
         total = int(templates.inside.sum()) * cameras.num_views
         leave_out("warp", total - int(found.valid.count_nonzero()), total=total)
-        return found
+        centers = cameras.centers_world.to(templates.patch_from_world)
+        viewers = transform(
+            templates.patch_from_world, centers.expand(len(templates.facet), -1, -1)
+        )
+        return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
 
     def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
         found = self._resampled(cameras, sources, templates, self.config.dark_level)

@@ -22,6 +22,7 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.learned import LearnedPrior
 from pimper_torch.photometry.light_field import LightField, faces_light, is_strong
 from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.manifolds import Cone
@@ -140,6 +141,7 @@ class FactorizeConfig:
             and the lights take their share.
         min_light_variation: Minimum third singular value of a patch's lights, over the first;
             about the smaller extent, in radians, of the light's directions.
+        learned: Whether a small trained network guesses normals, and which entries are diffuse.
         max_iterations: Of the solver.
         tolerance: Relative change at which a patch has converged: of its objective with variable
             projection, of its shading vectors with BALM.
@@ -157,6 +159,7 @@ class FactorizeConfig:
     shadows: bool = True
     min_views: Annotated[int, Range(least=3, most=100_000)] = 4
     min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
+    learned: bool = False
     max_iterations: Annotated[int, Range(least=1, most=100_000)] = 60
     tolerance: Annotated[float, Range(above=0, most=1)] = 1e-3
 
@@ -241,7 +244,8 @@ class Factorize(Stage):
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
             guesses = GuessedNormals(), GuessedAlbedo(), GuessedInliers(), GuessedLights()
-            priors = [*own, *guesses]
+            learned = [LearnedPrior.trained()] if config.learned else []
+            priors = [*own, *guesses, *learned]
         for prior in priors:
             needed = "modules derived from FactorPrior"
             require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)
@@ -381,7 +385,7 @@ class Factorize(Stage):
         at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
-        problem = self._problem(rows, anchor, refused, raster, bucket.registered.priors, variance)
+        problem = self._problem(rows, anchor, refused, raster, bucket.registered, variance)
         return _Prepared(rows=rows, status=status, problem=problem)
 
     def _photometry(self, bucket: _Bucket, prepared: _Prepared, factors: Factors) -> Photometry:
@@ -430,14 +434,14 @@ class Factorize(Stage):
         field: Float[Tensor, "patch view 4"],
         refused: Bool[Tensor, " patch"],
         raster: int,
-        guessed: PatchPriors | None,
+        registered: Observations,
         variance: float,
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
         shading = initial_shading(gray, rows.seen, field, harmonics(rows.normals).mT)
-        samples = _samples(rows, gray, field, shading[:, 0], guessed, variance)
+        samples = _samples(rows, gray, field, shading[:, 0], registered, variance)
         known = [cast("Known", prior(samples)) for prior in self.priors]
         for each in known:
             if each.inlier is not None:
@@ -537,12 +541,18 @@ def _samples(
     gray: Float[Tensor, "patch view sample"],
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
-    guessed: PatchPriors | None,
+    registered: Observations,
     variance: float,
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
+    guessed = registered.priors
     samples = PatchSamples(
-        radiance=gray, seen=rows.seen, normals=rows.normals, albedo=albedo, lights=field
+        radiance=gray,
+        seen=rows.seen,
+        normals=rows.normals,
+        albedo=albedo,
+        lights=field,
+        viewers=registered.viewers,
     )
     if guessed is None:
         return samples

@@ -34,6 +34,7 @@ class PatchSamples(Record):
         normals: Of the surface so far, unit, patch frame.
         albedo: Gray, that suits these and the lights best.
         lights: Of the field, first-order harmonics in the patch frame.
+        viewers: Direction to each camera, unit, patch frame; ``None`` where unknown.
         guessed_normals: That views carry, unit, patch frame.
         guessed_information: Inverse variance of these, one over squared radians; 0 where unknown.
         guessed_albedo: That views carry, gray, up to a factor; 0 where unknown.
@@ -48,6 +49,7 @@ class PatchSamples(Record):
     normals: Float[Tensor, "patch sample 3"]
     albedo: Float[Tensor, "patch sample"]
     lights: Float[Tensor, "patch view 4"]
+    viewers: Float[Tensor, "patch view 3"] | None = None
     guessed_normals: Float[Tensor, "patch sample 3"] | None = None
     guessed_information: Float[Tensor, "patch sample"] | None = None
     guessed_albedo: Float[Tensor, "patch sample"] | None = None

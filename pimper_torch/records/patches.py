@@ -198,11 +198,13 @@ class Observations(Record):
         radiance: ``J`` before its samples are put in a row; zero where missing.
         valid: ``D``: true where a view has the sample.
         priors: What was guessed of the photographs, if anything.
+        viewers: Direction to each camera, unit, patch frame; ``None`` where unknown.
     """
 
     radiance: Float[Tensor, "patch view channel height width"]
     valid: Bool[Tensor, "patch view height width"]
     priors: PatchPriors | None = None
+    viewers: Float[Tensor, "patch view 3"] | None = None
 
     @property
     def raster(self) -> tuple[int, ...]:

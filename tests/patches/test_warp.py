@@ -39,6 +39,14 @@ def test_missing_samples_are_zero(registered):
     assert 0 <= missing_fraction(registered) < 0.2
 
 
+def test_viewers_are_the_directions_to_the_cameras(registered, plane_scene):
+    for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
+        world_from_patch = invert_rigid(templates.patch_from_world)
+        toward = plane_scene.cameras.centers_world - world_from_patch[:, None, :3, 3]
+        found = seen.viewers.to(toward) @ world_from_patch[:, :3, :3].mT
+        assert_close(found, toward / toward.norm(dim=-1, keepdim=True), atol=1e-6, rtol=0)
+
+
 def test_saturated_dark_masked_and_outside_samples_are_missing(plane_scene, plane_mesh):
     patches = Decompose()(plane_mesh, plane_scene.cameras)
     images = plane_scene.views.images.clone()
