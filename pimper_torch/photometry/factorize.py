@@ -184,7 +184,7 @@ class Illumination(Record):
 
     field: LightField
     caster: RayCaster | None
-    guess_variance: float = 0.0
+    guess_variance: float | Float[Tensor, ""] = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -268,7 +268,8 @@ class Factorize(Stage):
                 :func:`~pimper_torch.photometry.lights.thinned` are enough.
         """
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        field, variance = self._field(seen, coarse), 0.0
+        field = self._field(seen, coarse)
+        variance: float | Float[Tensor, ""] = 0.0
         guesses = [bucket.priors for bucket in seen.buckets]
         if any(each is not None and bool(each.normal_information.any()) for each in guesses):
             led = [_beside_guesses(*pair) for pair in zip(coarse, guesses, strict=True)]
@@ -435,7 +436,7 @@ class Factorize(Stage):
         refused: Bool[Tensor, " patch"],
         raster: int,
         registered: Observations,
-        variance: float,
+        variance: float | Float[Tensor, ""],
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
@@ -508,10 +509,9 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
     return float(torch.cat(found).median()) if sum(map(len, found)) else math.inf
 
 
-@torch.no_grad()
 def _excess_variance(
     normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
-) -> float:
+) -> Float[Tensor, ""]:
     """Return the variance of guessed normals about the surface's, beyond what both claim."""
     square, claimed = [], []
     for own, guess in zip(normals, guesses, strict=True):
@@ -522,7 +522,7 @@ def _excess_variance(
     # Half of the squares of two Gaussian components lie below 2 log 2 times their variance.
     found = torch.cat(square).median() / math.log(2)
     claims = torch.cat(claimed).median() + 1 / _SURFACE_INFORMATION
-    return max(0.0, float(found - claims))
+    return (found - claims).clamp_min(0)
 
 
 def _beside_guesses(
@@ -542,7 +542,7 @@ def _samples(
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
     registered: Observations,
-    variance: float,
+    variance: float | Float[Tensor, ""],
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
     guessed = registered.priors
