@@ -275,7 +275,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument("--last-steps", type=int, default=60)
+    parser.add_argument("--last-steps", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     wanted = parser.parse_args()
     warnings.simplefilter("ignore")

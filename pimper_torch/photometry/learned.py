@@ -1,4 +1,4 @@
-"""A prior of the factorization that was trained through it, on rendered scenes."""
+"""A prior of the factorization that was trained on rendered scenes, lights given."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from pimper_torch.photometry.cone import tangents
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.photometry.priors import FactorPrior, Known, PatchSamples
 
-# That come with the package; `notebooks/09_training.ipynb` made them.
+# That come with the package: 6,000 steps as in `benchmarks/train_prior.py`, see docs/priors.md.
 WEIGHTS = Path(__file__).with_name("learned.safetensors")
 
 # Largest tilt from the surface so far, radians, and largest weight, in views: choices.
