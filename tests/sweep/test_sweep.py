@@ -155,7 +155,11 @@ def copied(lifted, copies):
     views = views.replace(names=tuple(map(str, range(len(copies)))), poses=torch.tensor(copies))
     seen = lifted.seen.replace(
         buckets=tuple(
-            one.replace(radiance=one.radiance[:, copies], valid=one.valid[:, copies])
+            one.replace(
+                radiance=one.radiance[:, copies],
+                valid=one.valid[:, copies],
+                viewers=one.viewers[:, copies],
+            )
             for one in lifted.seen.buckets
         )
     )
