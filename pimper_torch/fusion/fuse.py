@@ -116,7 +116,7 @@ class Fuse(Stage):
     """
 
     def __init__(
-        self, config: FuseConfig | None = None, terms: Sequence[Term] | None = None
+        self, config: FuseConfig | None = None, terms: Sequence[nn.Module] | None = None
     ) -> None:
         super().__init__()
         self.config = config or FuseConfig()

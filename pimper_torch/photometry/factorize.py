@@ -237,7 +237,7 @@ class Factorize(Stage):
     """
 
     def __init__(
-        self, config: FactorizeConfig | None = None, priors: Sequence[FactorPrior] | None = None
+        self, config: FactorizeConfig | None = None, priors: Sequence[nn.Module] | None = None
     ) -> None:
         super().__init__()
         self.config = config = config or FactorizeConfig()

@@ -368,11 +368,10 @@ class PhotometricPatches(OverPatches):
         cls,
         patches: "PatchSet | PatchViews",
         *,
-        normals: Sequence[Float[Tensor, "patch height width 3"]],
-        lights: Float[Tensor, "view 4"] | Sequence[Float[Tensor, "patch view 4"]],
-        albedo: Sequence[Float[Tensor, "patch height width channel"]] | None = None,
-        information: Sequence[Float[Tensor, "patch height width"]] | float = 1
-        / math.radians(8) ** 2,
+        normals: Sequence[Float[Tensor, "_ _ _ 3"]],
+        lights: Float[Tensor, "view 4"] | Sequence[Float[Tensor, "_ _ 4"]],
+        albedo: Sequence[Float[Tensor, "_ _ _ _"]] | None = None,
+        information: Sequence[Float[Tensor, "_ _ _"]] | float = 1 / math.radians(8) ** 2,
     ) -> "PhotometricPatches":
         """Put normals, albedo and lights of one's own on patches.
 

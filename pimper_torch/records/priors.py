@@ -135,7 +135,7 @@ class InlierPrior(MapPrior):
         """List what is no probability."""
         yield from super(InlierPrior, self).faults()
         probability = self.probability
-        if found := once(probability, lambda: outside(probability, 1)):
+        if found := once(probability, lambda: outside(probability, 1.0)):
             yield "probability", found, "probabilities"
 
 
@@ -153,7 +153,7 @@ class SilhouettePrior(MapPrior):
         """List what is no probability."""
         yield from super(SilhouettePrior, self).faults()
         inside = self.inside
-        if found := once(inside, lambda: outside(inside, 1)):
+        if found := once(inside, lambda: outside(inside, 1.0)):
             yield "inside", found, "probabilities"
 
 
