@@ -1,4 +1,4 @@
-"""What guesses of photographs gain, and what wrong ones cost.
+"""Gain of guesses about photographs, and cost of wrong ones.
 
     python benchmarks/priors.py SCENE [SCENE ...] [--kinds none normals:2 normals:2:5 ...]
 

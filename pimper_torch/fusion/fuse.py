@@ -96,7 +96,7 @@ class Fuse(Stage):
     """Solve for the surface that agrees best with all terms, over all facets at once.
 
     Unknown is the height of every vertex of the subdivided mesh along the coarse mesh's smoothed
-    normal. Equations are linear in it: edges are at right angles to photometric normals, the sweep
+    normal. Terms are linear in it: edges are at right angles to photometric normals, the sweep
     knows heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and
     where there is no photometric normal the surface keeps its slopes, or continues those of lit
     surface that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds,

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, cast
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
@@ -600,8 +600,7 @@ def _with_albedo(
 ) -> Bilinear:
     """Add a view under ambient light of mean strength, which shows albedo itself."""
     strength = level.sqrt()[:, None]
-    light = torch.zeros_like(problem.anchor[:, :1]) + 0
-    light[..., 0] = strength
+    light = pad(strength[..., None], (0, 3))
     fixed = FIXED_LIGHTS * problem.regularization.amax(dim=1, keepdim=True)
     return problem.replace(
         radiance=torch.cat([problem.radiance, (strength * albedo)[:, None]], dim=1),

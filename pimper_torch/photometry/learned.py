@@ -4,6 +4,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import normalize
@@ -73,7 +74,7 @@ class LearnedPrior(FactorPrior):
         prior = cls()
         try:
             prior.load_state_dict(load_file(path))
-        except Exception as error:
+        except (OSError, SafetensorError, RuntimeError) as error:
             raise InputError(f"{path}: cannot be read ({error}); {needed}.") from error
         return prior.requires_grad_(requires_grad=False)
 

@@ -61,7 +61,7 @@ class PatchSamples(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Known(Record):
-    """What a prior knows of a batch of patches; ``None`` of what it does not.
+    """Statement of a prior on a batch of patches; ``None`` where it makes none.
 
     Attributes:
         lights: Patch frame.

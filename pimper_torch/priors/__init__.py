@@ -1,1 +1,1 @@
-"""What guesses from elsewhere mean, and guesses of networks."""
+"""Conventions of guessed maps, found by the scene, and guesses of networks."""

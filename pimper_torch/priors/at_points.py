@@ -1,4 +1,4 @@
-"""What maps say where views observe points of the cloud."""
+"""Values of guessed maps where views observe points of the cloud."""
 
 from dataclasses import dataclass
 

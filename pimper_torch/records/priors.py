@@ -186,7 +186,7 @@ class LightPrior(Record):
 
 
 Prior = NormalPrior | DepthPrior | AlbedoPrior | InlierPrior | SilhouettePrior | LightPrior
-"""What views may carry in ``priors``."""
+"""Kinds of guesses that views carry in ``priors``."""
 
 
 def _no_variance(variance: Float[Tensor, "..."]) -> Iterator[tuple[str, str, str]]:

@@ -26,7 +26,7 @@ _SURE = 1e-3  # probabilities nearer to 0 or 1 than this count no more: 8 bits h
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SoftMasks(Record):
-    """What priors say of the silhouettes, at the working size.
+    """Silhouettes that priors state, at the working size.
 
     Attributes:
         inside: Probability of the object; one half where nothing is said.
