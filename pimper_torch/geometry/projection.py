@@ -69,14 +69,14 @@ def triangulation_angles(
     centers_world: Float[Tensor, "view 3"],
 ) -> Float[Tensor, " point"]:
     """Return each point's widest angle between two rays that saw it, in radians; 0 without two."""
-    if len(centers_world) == 0:
-        return torch.zeros_like(points_world[:, 0])
-    widest = []
-    for points, seen in zip(
-        torch.split(points_world, _POINTS), torch.split(observed, _POINTS), strict=True
-    ):
-        rays = normalize(points[:, None] - centers_world, dim=-1)
-        both = seen[:, :, None] & seen[:, None, :]
+    count = observed.sum(dim=1)
+    widest = torch.zeros_like(points_world[:, 0])
+    for some in torch.split(count.argsort(stable=True), _POINTS):
+        if int(count[some].amax()) < 2:
+            continue
+        seen, views = observed[some].byte().topk(int(count[some].amax()), dim=1)
+        rays = normalize(points_world[some, None] - centers_world[views], dim=-1)
+        both = (seen[:, :, None] * seen[:, None, :]).bool()
         cosines = torch.where(both, rays @ rays.mT, 1).flatten(1).amin(dim=1)
-        widest.append(cosines.clamp(-1, 1).acos())
-    return torch.cat(widest)
+        widest[some] = cosines.clamp(-1, 1).acos()
+    return widest

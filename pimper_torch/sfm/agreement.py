@@ -55,12 +55,17 @@ def judged(
         max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
     """
     view_of = {files.index(name): view for view, name in enumerate(model.names)}
-    agreeing: dict[PhotographPair, tuple[int, float]] = {}
-    for pair in pairs:
-        if all(number in view_of for number in pair.views):
-            first, second = (view_of[number] for number in pair.views)
-            inside = pair.replace(views=(first, second))
-            agreeing[first, second] = pair.num_matches, agreement(model, inside, max_error_px)
+    inside = [
+        pair.replace(views=(view_of[pair.views[0]], view_of[pair.views[1]]))
+        for pair in pairs
+        if all(number in view_of for number in pair.views)
+    ]
+    agrees = match_errors(model, inside) <= max_error_px
+    counts = [pair.num_matches for pair in inside]
+    agreeing = {
+        pair.views: (pair.num_matches, float(some.double().mean()))
+        for pair, some in zip(inside, torch.split(agrees, counts), strict=True)
+    }
     misplaced = {}
     for view, name in enumerate(model.names):
         mine = [agreeing[pair] for pair in agreeing if view in pair]
