@@ -6,7 +6,7 @@ import pytest
 
 from pimper_torch.cli.main import main
 from pimper_torch.cores import usable_cores
-from pimper_torch.sfm.reconstruct import ReconstructConfig
+from pimper_torch.sfm.settings import ReconstructConfig
 
 
 @pytest.mark.parametrize(
@@ -33,8 +33,8 @@ def test_affinity_and_quota_limit_cores(files, cores, monkeypatch, tmp_path):
         (tmp_path / name).write_text(f"{text}\n")
     assert usable_cores() == cores
     config = ReconstructConfig()
-    assert config.features.threads == config.registration.matching.threads == cores
-    assert ReconstructConfig(threads=5).features.threads == 5
+    assert config.num_threads == cores
+    assert ReconstructConfig(threads=5).num_threads == 5
 
 
 def test_a_system_without_affinity_has_all_its_cores(monkeypatch, tmp_path):

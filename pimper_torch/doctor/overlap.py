@@ -10,18 +10,17 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.cores import usable_cores
 from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.errors import some
 from pimper_torch.records import Views
-from pimper_torch.sfm.features import SMALLEST_PX, FeatureSettings, find_features
+from pimper_torch.sfm.features import SMALLEST_PX, find_features
 from pimper_torch.sfm.matching import (
-    MatchSettings,
     VerifiedPair,
     all_pairs,
     match_pairs,
     verified_pairs,
 )
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.workspace import workspace
 
 _MAX_PAIRS = 800  # of 40 photographs all; of more those next in the order of their names
@@ -46,26 +45,15 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Verifi
         masks=None,
         focals_px=torch.full((len(large),), torch.nan),
     )
-    threads = usable_cores()
-    features = FeatureSettings(
-        camera_model="SIMPLE_RADIAL",
-        peak_threshold=0.004,
-        edge_threshold=10.0,
-        max_features=1500,
-        affine_shape=False,
-        threads=threads,
-    )
-    matching = MatchSettings(
-        max_ratio=0.8, max_error_px=2.0, min_inliers=_LINKED, seed=0, threads=threads
-    )
+    settings = ReconstructConfig(peak_threshold=0.004, max_features=1500, affine_shape=False)
     # Those next to one another first: round a turntable the last is by the first.
     count = len(large)
     pairs = sorted(
         all_pairs(count), key=lambda pair: min(pair[1] - pair[0], count - pair[1] + pair[0])
     )
-    with workspace(views, threads) as space:
-        find_features(space, features, [None] * count, range(count))
-        match_pairs(space, pairs[:_MAX_PAIRS], matching)
+    with workspace(views, settings.num_threads) as space:
+        find_features(space, settings, [None] * count, range(count))
+        match_pairs(space, pairs[:_MAX_PAIRS], settings, _LINKED)
         return [
             pair.replace(views=(large[pair.views[0]], large[pair.views[1]]))
             for pair in verified_pairs(space)

@@ -1,7 +1,6 @@
 """SIFT features of photographs, found by COLMAP on the CPU."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from pimper_torch.progress import track
 from pimper_torch.records import Views
 from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs in which a thread finds features between two reports of progress.
@@ -21,22 +21,6 @@ _PER_THREAD = 2
 SMALLEST_PX = 16
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FeatureSettings:
-    """What counts as a feature; the words are those of COLMAP's SIFT.
-
-    Attributes:
-        max_features: In a photograph.
-    """
-
-    camera_model: str
-    peak_threshold: float
-    edge_threshold: float
-    max_features: int
-    affine_shape: bool
-    threads: int
-
-
 def too_small(views: Views) -> list[str]:
     """List photographs in which features cannot be looked for: COLMAP's process ends there."""
     small = (views.sizes_px < SMALLEST_PX).any(dim=1).tolist()
@@ -45,7 +29,7 @@ def too_small(views: Views) -> list[str]:
 
 def find_features(
     space: Workspace,
-    settings: FeatureSettings,
+    settings: ReconstructConfig,
     focals_px: Sequence[float | None],
     lenses: Sequence[int],
 ) -> list[int]:
@@ -62,7 +46,7 @@ def find_features(
 
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
-    options.num_threads = settings.threads
+    options.num_threads = settings.num_threads
     options.sift.peak_threshold = settings.peak_threshold
     options.sift.edge_threshold = settings.edge_threshold
     options.sift.max_num_features = settings.max_features
@@ -78,7 +62,7 @@ def find_features(
         _import(space, reader, lenses)
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
-        step = _PER_THREAD * settings.threads
+        step = _PER_THREAD * settings.num_threads
         starts = range(0, len(space.files), step)
         for start in track(starts):
             pycolmap.extract_features(

@@ -18,7 +18,8 @@ from torch import Tensor
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.matching import MatchSettings, PhotographPair, photograph_numbers
+from pimper_torch.sfm.matching import PhotographPair, photograph_numbers
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Length of COLMAP's SIFT descriptors, in units of their bytes.
@@ -65,7 +66,7 @@ class Near:
 
 
 def match_guided(
-    space: Workspace, pairs: Sequence[PhotographPair], settings: MatchSettings
+    space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
 ) -> None:
     """Replace the matches of verified pairs by those near their epipolar lines.
 
@@ -92,7 +93,7 @@ def match_guided(
             return guided_matches(first, second, nears[ends], settings.max_ratio)
 
         for ends, found in zip(geometries, side_by_side(matches, list(geometries)), strict=True):
-            if len(found) >= settings.min_inliers:
+            if len(found) >= MIN_MATCHES:
                 geometries[ends].inlier_matches = found.numpy().astype(np.uint32)
                 stored.update_two_view_geometry(*ends, geometries[ends])
 

@@ -20,7 +20,7 @@ from pimper_torch.sfm.camera_in_place import (
     shift_px,
     still_length_px,
 )
-from pimper_torch.sfm.matching import MatchSettings
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.static_background import (
     Keypoints,
     Pair,
@@ -40,7 +40,7 @@ _SHIFTED_PX = 2.0
 _TRIALS = 1000
 
 
-def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
+def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackground:
     """Find what is at rest while something else moves, and keep features and matches of the latter.
 
     Where the room shifts from photograph to photograph, because the camera was turned in its place
@@ -64,8 +64,8 @@ def leave_out_room(database: Path, settings: MatchSettings) -> StaticBackground:
         if found.rest.room:
             geometries = read_geometries(stored) | verifier.found
             _drop_features(stored, matched, found.rest)
-            _drop_matches(stored, matched, found, geometries, settings.min_inliers)
-            return found.rest.replace(maps=_maps(found, settings.min_inliers))
+            _drop_matches(stored, matched, found, geometries)
+            return found.rest.replace(maps=_maps(found))
     return found.rest
 
 
@@ -77,11 +77,11 @@ def enter_room(rest: StaticBackground) -> tuple[int, int]:
     return resting, total
 
 
-def _maps(found: "_Found", fewest: int) -> tuple[Float[Tensor, "3 3"], ...]:
+def _maps(found: "_Found") -> tuple[Float[Tensor, "3 3"], ...]:
     """Return the maps of photographs that show enough features of the room."""
     pairs = zip(found.maps, found.rest.features, strict=True)
     return tuple(
-        one if int(resting.sum()) >= fewest else torch.full_like(one, torch.nan)
+        one if int(resting.sum()) >= MIN_MATCHES else torch.full_like(one, torch.nan)
         for one, resting in pairs
     )
 
@@ -110,18 +110,18 @@ class _Found:
     still_px: float
 
 
-def _at_rest(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found:
+def _at_rest(matched: Matched, verifier: "_Verifier", settings: ReconstructConfig) -> _Found:
     maps = tuple(torch.eye(3, dtype=torch.float64) for _ in matched.keypoints)
     return _find(matched.keypoints, maps, verifier, settings, STILL_PX)
 
 
-def _shifted(matched: Matched, verifier: "_Verifier", settings: MatchSettings) -> _Found | None:
+def _shifted(matched: Matched, verifier: "_Verifier", settings: ReconstructConfig) -> _Found | None:
     """Find a room that shifts before a camera that stays in its place, if there is one."""
     maps = reference_from_photographs(
         matched.keypoints,
         matched.pairs,
         max_error_px=_SHIFTED_PX,
-        fewest=settings.min_inliers,
+        fewest=MIN_MATCHES,
         generator=torch.Generator().manual_seed(settings.seed),
     )
     if maps is None:
@@ -139,7 +139,7 @@ def _find(
     keypoints: Keypoints,
     maps: tuple[Float[Tensor, "3 3"], ...],
     verifier: "_Verifier",
-    settings: MatchSettings,
+    settings: ReconstructConfig,
     still_px: float,
 ) -> _Found:
     rest = find_static_background(
@@ -148,7 +148,7 @@ def _find(
         verifier,
         still_px=still_px,
         max_error_px=settings.max_error_px,
-        fewest=settings.min_inliers,
+        fewest=MIN_MATCHES,
     )
     return _Found(rest=rest, maps=maps, keypoints=keypoints, still_px=still_px)
 
@@ -180,7 +180,7 @@ class _Verifier:
     """COLMAP's verification of matches; keeps the geometries."""
 
     matched: Matched
-    settings: MatchSettings
+    settings: ReconstructConfig
     found: dict[tuple[int, int], Any] = field(default_factory=dict)
 
     def __call__(self, pairs: Sequence[Pair]) -> list[Int[Tensor, "match 2"]]:
@@ -190,7 +190,9 @@ class _Verifier:
         return [indices(geometry.inlier_matches) for geometry in found]
 
 
-def verified_again(matched: Matched, pairs: Sequence[Pair], settings: MatchSettings) -> list[Any]:
+def verified_again(
+    matched: Matched, pairs: Sequence[Pair], settings: ReconstructConfig
+) -> list[Any]:
     """Find COLMAP's geometries of some of the matches of pairs, side by side.
 
     In a database of their own: COLMAP's function for one pair would hold Python's lock.
@@ -199,12 +201,12 @@ def verified_again(matched: Matched, pairs: Sequence[Pair], settings: MatchSetti
 
     ids = [(matched.ids[pair.first], matched.ids[pair.second]) for pair in pairs]
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = settings.min_inliers
+    options.min_num_inliers = MIN_MATCHES
     options.ransac.max_error = settings.max_error_px
     options.ransac.random_seed = settings.seed
     options.ransac.max_num_trials = _TRIALS
     verifying = pycolmap.GeometricVerifierOptions()
-    verifying.num_threads = settings.threads
+    verifying.num_threads = settings.num_threads
     with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
         path = Path(folder) / "pairs.db"
         with pycolmap.Database.open(path) as stored:
@@ -250,7 +252,6 @@ def _drop_matches(
     matched: Matched,
     found: _Found,
     geometries: dict[tuple[int, int], Any],
-    fewest: int,
 ) -> None:
     number = [torch.cumsum(~resting, dim=0) - 1 for resting in found.rest.features]
     stored.clear_matches()
@@ -268,7 +269,7 @@ def _drop_matches(
         if ids in geometries:
             geometry = geometries[ids]
             inliers = kept(pair.replace(matches=indices(geometry.inlier_matches)))
-            if len(inliers) >= fewest:
+            if len(inliers) >= MIN_MATCHES:
                 geometry.inlier_matches = inliers
                 stored.write_two_view_geometry(*ids, geometry)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from pimper_torch.progress import track
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;
@@ -22,25 +23,12 @@ from pimper_torch.sfm.workspace import Workspace
 # tiles of 8 prepare 648.
 _TILE = 16
 
+# Photographs up to which a set is small: every pair is matched, and every point is looked for in
+# every view. Beyond, work grows with their number, not its square; see docs/decisions.md.
+MOST_PAIRED = 66
+
 PhotographPair = tuple[int, int]
 """Numbers of two photographs, the lower one first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchSettings:
-    """What counts as a match of two photographs.
-
-    Attributes:
-        max_ratio: Of the distances to the best and the second best descriptor.
-        max_error_px: Distance from the epipolar line.
-        min_inliers: Verified matches below which a pair does not count.
-    """
-
-    max_ratio: float
-    max_error_px: float
-    min_inliers: int
-    seed: int
-    threads: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -57,20 +45,25 @@ class VerifiedPair(Record):
         return len(self.first)
 
 
-def match_pairs(space: Workspace, pairs: Sequence[PhotographPair], settings: MatchSettings) -> None:
-    """Match pairs of photographs and verify the matches.
+def match_pairs(
+    space: Workspace,
+    pairs: Sequence[PhotographPair],
+    settings: ReconstructConfig,
+    fewest: int = MIN_MATCHES,
+) -> None:
+    """Match pairs of photographs that are not matched yet, and verify the matches.
 
     Args:
-        pairs: Not matched before.
+        fewest: Verified matches below which a pair does not count.
     """
     pycolmap = loaded()
 
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
-    options.num_threads = settings.threads
+    options.num_threads = settings.num_threads
     options.sift.max_ratio = settings.max_ratio
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = settings.min_inliers
+    verification.min_num_inliers = fewest
     verification.ransac.max_error = settings.max_error_px
     verification.ransac.random_seed = settings.seed
     pairing = pycolmap.ImportedPairingOptions()

@@ -2,14 +2,11 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import torch
 
-from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.cores import usable_cores
 from pimper_torch.errors import (
     InputError,
     OutputError,
@@ -21,142 +18,29 @@ from pimper_torch.errors import (
 from pimper_torch.ledger import kept_entries, leave_out, noted_entries, repeat_entries
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.colmap import CAMERA_MODELS
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
 from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
-from pimper_torch.sfm.features import SMALLEST_PX, FeatureSettings, find_features, too_small
+from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small
 from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
-from pimper_torch.sfm.mapping import MapSettings
-from pimper_torch.sfm.matching import MatchSettings
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.one_lens import doubt_one_lens
 from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
 from pimper_torch.sfm.quarter_turns import turned_views
-from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
-from pimper_torch.sfm.registration import Registration, RegistrationSettings, register
+from pimper_torch.sfm.refine_tracks import refine_tracks
+from pimper_torch.sfm.registration import Registration, register
 from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
 from pimper_torch.sfm.series import series_in, with_series
-from pimper_torch.sfm.triangulation import TriangulationSettings, lacks_points, triangulate
+from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, opened, settled
 from pimper_torch.store.code import code
 
-# Verified matches below which a pair of photographs does not count; points of the model that a view
-# must see to be added, and to stay in it (COLMAP's own); fraction of the photographs that the
-# largest component must hold when the model splits.
-_MIN_MATCHES, _MIN_POINTS, _MIN_FRACTION = 15, 30, 0.6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReconstructConfig:
-    """Settings of structure from motion.
-
-    Attributes:
-        camera_model: COLMAP's name of the lens model.
-        shared_camera: One camera took all photographs, with one lens at one focal length, whatever
-            EXIF says. By default lenses are told apart by EXIF's focal length and by size; a
-            camera that was held upright is the same.
-        own_cameras: Each photograph has a lens of its own.
-        peak_threshold: Contrast below which a feature is dropped; in COLMAP's units, where
-            its own default is 0.0067. Lower finds the faint marks of smooth surfaces.
-        edge_threshold: Ratio of curvatures above which a feature counts as an edge.
-        max_features: In a photograph; those at coarse scales are kept, whole scales at a time, so
-            that up to twice as many are left.
-        affine_shape: Adapt features to slanted surfaces.
-        max_ratio: Of the distances to the best and the second best match.
-        guided_pairs: Of each photograph, those with most matches, in which more are looked for
-            along the epipolar lines.
-        max_error_px: Distance from the epipolar line up to which a match is verified.
-        starts: Most runs of the mapper after guided matching of more pairs, where photographs
-            stayed unregistered or contradict their matches; each has other random numbers, and
-            the last also counts points that only two views see. 0 is content with the first
-            model.
-        track_iterations: Of finding the points again in every view, by aligning what photographs
-            show round them, and adjusting cameras to that; 0 leaves the features' places.
-        threads: Of features and matches; 0 for all cores. The model grows and is adjusted on one
-            thread: on several, Ceres adds in another order in every run.
-        seed: Of everything random.
-    """
-
-    camera_model: str = "SIMPLE_RADIAL"
-    shared_camera: bool = False
-    own_cameras: bool = False
-    peak_threshold: Annotated[float, Range(above=0, most=1)] = 0.002
-    edge_threshold: Annotated[float, Range(above=0, most=1e6)] = 10.0
-    max_features: Annotated[int, Range(least=8, most=65_536)] = 4096
-    affine_shape: bool = True
-    max_ratio: Annotated[float, Range(above=0, most=1)] = 0.8
-    guided_pairs: Annotated[int, Range(least=0, most=100_000)] = 10
-    max_error_px: Annotated[float, Range(above=0, most=1e6)] = 2.0
-    starts: Annotated[int, Range(least=0, most=1000)] = 3
-    track_iterations: Annotated[int, Range(least=0, most=1000)] = 2
-    threads: Annotated[int, Range(least=0, most=1024)] = 0
-    seed: Annotated[int, Range(least=0, most=2**31 - 1)] = 0
-
-    def __post_init__(self) -> None:
-        known = "one of " + ", ".join(CAMERA_MODELS)
-        require(self.camera_model in CAMERA_MODELS, "camera_model", self.camera_model, known)
-        both = self.shared_camera and self.own_cameras
-        require(not both, "own_cameras", self.own_cameras, "false where shared_camera is true")
-        require_ranges(self)
-
-    @property
-    def num_threads(self) -> int:
-        """Threads of features and matches, at least 1."""
-        return self.threads or usable_cores()
-
-    @property
-    def features(self) -> FeatureSettings:
-        """What counts as a feature."""
-        return FeatureSettings(
-            camera_model=self.camera_model,
-            peak_threshold=self.peak_threshold,
-            edge_threshold=self.edge_threshold,
-            max_features=self.max_features,
-            affine_shape=self.affine_shape,
-            threads=self.num_threads,
-        )
-
-    @property
-    def registration(self) -> RegistrationSettings:
-        """How photographs are registered."""
-        return RegistrationSettings(
-            matching=MatchSettings(
-                max_ratio=self.max_ratio,
-                max_error_px=self.max_error_px,
-                min_inliers=_MIN_MATCHES,
-                seed=self.seed,
-                threads=self.num_threads,
-            ),
-            mapping=MapSettings(
-                min_inliers=_MIN_POINTS,
-                pairs_count=False,
-                seed=self.seed,
-            ),
-            guided_pairs=self.guided_pairs,
-            starts=self.starts,
-        )
-
-    @property
-    def triangulation(self) -> TriangulationSettings:
-        """How points of given cameras are found."""
-        return TriangulationSettings(
-            features=self.features,
-            matching=self.registration.matching,
-            guided_pairs=self.guided_pairs,
-            tracks=self.tracks,
-        )
-
-    @property
-    def tracks(self) -> TrackSettings:
-        """How tracks are refined."""
-        return TrackSettings(
-            iterations=self.track_iterations,
-            fewest_points=_MIN_POINTS,
-        )
+# Fraction of the photographs that the largest component must hold when the model splits.
+_MIN_FRACTION = 0.6
 
 
 class Reconstruct(Stage):
@@ -234,14 +118,12 @@ class Reconstruct(Stage):
         crops: Sequence[SparseModel] = (),
     ) -> SparseModel:
         """Take points that were kept, or triangulate them and keep them."""
-        settings = self.config.triangulation
-        alone = replace(settings, features=replace(settings.features, threads=0))
-        alone = replace(alone, matching=replace(alone.matching, threads=0))
+        alone = replace(self.config, threads=0)
         hashed = digest(code(), views, ways, crops, alone) if self.store else None
         found, _ = kept_model(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
-            lambda: triangulate(views, ways, settings, where, crops),
+            lambda: triangulate(views, ways, self.config, where, crops),
         )
         return found
 
@@ -333,10 +215,10 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
     with workspace(lying, config.num_threads) as space:
-        counts = find_features(space, config.features, _known_focals(views), lenses)
+        counts = find_features(space, config, _known_focals(views), lenses)
         _require_features(counts, views.names)
         release_memory()
-        found = register(space, config.registration)
+        found = register(space, config)
     release_memory()
     names = dict(zip(space.files, views.names, strict=True))
     model = _chosen(found, names, 0.0 if found.around else _MIN_FRACTION)
@@ -344,7 +226,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
         model = with_series(model, series_in(model, views.names, found.around), views.names)
     series = dict(zip(model.names, model.series.tolist(), strict=False))
     numbers = [views.names.index(name) for name in model.names]
-    model = refine_tracks(lying.take(numbers), model, config.tracks)
+    model = refine_tracks(lying.take(numbers), model, config.track_iterations)
     release_memory()
     reason = doubt_one_lens(model)
     leave_out("sfm.one_lens", bool(reason))

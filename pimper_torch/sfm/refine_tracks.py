@@ -1,7 +1,5 @@
 """Tracks found again in the photographs, and cameras adjusted to them."""
 
-from dataclasses import dataclass, field
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -13,6 +11,7 @@ from pimper_torch.sfm import colmap
 from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.settings import MIN_POINTS
 from pimper_torch.sfm.tangents import tangents
 from pimper_torch.sfm.track_observations import (
     SightingSettings,
@@ -45,22 +44,17 @@ _PILOTS = 256
 # Scales beyond which an observation is an outlier, and pixels in which features are none.
 _OUTLIER_SCALES, _FEATURE_PX = 10.0, 2.0
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrackSettings:
-    """How tracks are refined.
-
-    Attributes:
-        fewest_points: A view that shows fewer of the points that were found keeps its features.
-    """
-
-    iterations: int
-    fewest_points: int
-    track_observations: SightingSettings = field(default_factory=SightingSettings)
+# A view that shows fewer of the points that were found keeps its features: MIN_POINTS.
+SIGHTING = SightingSettings()
 
 
 def refine_tracks(
-    views: Views, model: SparseModel, settings: TrackSettings, *, cameras: bool = True
+    views: Views,
+    model: SparseModel,
+    iterations: int,
+    *,
+    cameras: bool = True,
+    settings: SightingSettings = SIGHTING,
 ) -> SparseModel:
     """Find the points again in every view, and adjust cameras, lenses and points to that.
 
@@ -70,19 +64,20 @@ def refine_tracks(
     Rounds before the last find a part of the points, for cameras alone.
 
     Args:
+        iterations: Rounds.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:
         The same views. Points that nothing agrees about are left out.
     """
-    rounds = settings.iterations if cameras else min(settings.iterations, 1)
+    rounds = iterations if cameras else min(iterations, 1)
     for left in reversed(range(rounds)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, pinholes = _sighted(views, some, settings.track_observations)
-        renewed, aligned = _renewed(some, found, pinholes, settings.fewest_points)
+        found, pinholes = _sighted(views, some, settings)
+        renewed, aligned = _renewed(some, found, pinholes)
         if not bool(aligned.any()):
             return model
-        tied, leading, scale = _adjusted(renewed, aligned, settings, cameras=cameras)
+        tied, leading, scale = _adjusted(renewed, aligned, cameras=cameras)
         if left:
             model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
             model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
@@ -113,7 +108,7 @@ def _sighted(
 
 
 def _renewed(
-    model: SparseModel, found: TrackObservations, cameras: Cameras, fewest_points: int
+    model: SparseModel, found: TrackObservations, cameras: Cameras
 ) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
     """Replace features by track observations; tell which observations are track observations."""
     often = (
@@ -122,7 +117,7 @@ def _renewed(
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]
     pixels = _photographed(found.pixels[kept], view, cameras, model)
-    poor = torch.bincount(view, minlength=model.num_views) < fewest_points
+    poor = torch.bincount(view, minlength=model.num_views) < MIN_POINTS
     seen = pairs_table(point, view, (len(often), model.num_views))
     theirs = model.observation_point, model.observation_view
     feature = (~often[theirs[0]] | poor[theirs[1]]) & ~seen[theirs]
@@ -157,7 +152,6 @@ def _photographed(
 def _adjusted(
     model: SparseModel,
     aligned: Bool[Tensor, " observation"],
-    settings: TrackSettings,
     *,
     cameras: bool,
 ) -> tuple[SparseModel, Bool[Tensor, " point"], float]:
@@ -166,7 +160,7 @@ def _adjusted(
     Returns:
         The model of the leading points, which points these are, and the scale of the residuals.
     """
-    points = _leading(model, aligned, settings.fewest_points)
+    points = _leading(model, aligned)
     leading = points[model.observation_point]
     tied = model.without(~leading)
     tied = bundle(tied, _FIRST_SCALE_PX, cameras=cameras, tolerance=_FIRST_TOLERANCE)
@@ -190,12 +184,10 @@ def _with_others(
     return model.replace(points_world=points)
 
 
-def _leading(
-    model: SparseModel, aligned: Bool[Tensor, " observation"], fewest_points: int
-) -> Bool[Tensor, " point"]:
+def _leading(model: SparseModel, aligned: Bool[Tensor, " observation"]) -> Bool[Tensor, " point"]:
     """Find the points that tell cameras: those aligned, and all in views that show few of them."""
     counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
-    leading = aligned | (counts < fewest_points)[model.observation_view]
+    leading = aligned | (counts < MIN_POINTS)[model.observation_view]
     wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
     wanted[model.observation_point[leading]] = True
     return wanted

@@ -19,9 +19,9 @@ from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
 from pimper_torch.sfm.doubt import count_views_with_depth, doubt
 from pimper_torch.sfm.guided import match_guided
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
-from pimper_torch.sfm.mapping import MapSettings, map_views
+from pimper_torch.sfm.mapping import map_views
 from pimper_torch.sfm.matching import (
-    MatchSettings,
+    MOST_PAIRED,
     PhotographPair,
     VerifiedPair,
     all_pairs,
@@ -30,6 +30,8 @@ from pimper_torch.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
+from pimper_torch.sfm.retrieval import pairs_to_match
+from pimper_torch.sfm.settings import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.tie_series import tie_series
 from pimper_torch.sfm.workspace import Workspace
@@ -43,24 +45,6 @@ _EXPLAINED = 0.9
 # What another explanation must explain beyond the plain one's fraction; a mug that was turned over
 # gains 0.25: a choice between.
 _MARGIN = 0.1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegistrationSettings:
-    """How photographs are registered.
-
-    Attributes:
-        mapping: How views are added to a model; ``pairs_count`` and further seeds are set by the
-            pass.
-        guided_pairs: Strongest pairs of each photograph that are matched along epipolar lines,
-            too, before the first model.
-        starts: Most runs of the mapper in the thorough pass; 0 leaves it out.
-    """
-
-    matching: MatchSettings
-    mapping: MapSettings
-    guided_pairs: int
-    starts: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,8 +94,8 @@ class Registration:
         return self.spread[0] >= FEWEST_VIEWS, placed, len(model.points_world)
 
 
-def register(space: Workspace, settings: RegistrationSettings) -> Registration:
-    """Match all pairs and grow a model; look for another explanation only where that fails.
+def register(space: Workspace, settings: ReconstructConfig) -> Registration:
+    """Match pairs and grow a model; look for another explanation only where that fails.
 
     Other explanations are a room at rest, or one that shifts, before which the object turns: its
     features are left out; and an object that was moved between two series of photographs: between
@@ -121,14 +105,18 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     lines: pairs of missing photographs, or all where some are misplaced. Then it starts the mapper
     several times, with other random numbers, and at last lets points count that only two views see.
     The first complete model ends it.
+
+    Of more than :data:`~pimper_torch.sfm.matching.MOST_PAIRED` photographs only pairs of those that
+    look alike are matched, see :mod:`pimper_torch.sfm.retrieval`; and in the thorough pass those
+    of missing or misplaced photographs with all others.
     """
-    match_pairs(space, all_pairs(len(space.files)), settings.matching)
+    match_pairs(space, pairs_to_match(space), settings)
     other = space.with_copied_database("other.db")
     plain = _registered(space, settings)
     if plain.sound:
         return plain
     rest, background = _leave_out_room(other, settings)
-    around = () if background else tie_series(other.database, settings.matching)[1]
+    around = () if background else tie_series(other.database, settings)[1]
     if not background and not around:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)
@@ -145,36 +133,42 @@ def register(space: Workspace, settings: RegistrationSettings) -> Registration:
     return replace(rival, background=background, around=around)
 
 
-def _registered(space: Workspace, settings: RegistrationSettings) -> Registration:
+def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
     """Grow models of the pairs that are matched."""
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}
         some = strongest(counts, len(space.files), settings.guided_pairs)
         verified = _guided(space, some, settings)
-    return _mapped(space, verified, settings, settings.mapping)
+    return _mapped(space, verified, settings, settings.seed)
 
 
-def _thorough(space: Workspace, best: Registration, settings: RegistrationSettings) -> Registration:
+def _thorough(space: Workspace, best: Registration, settings: ReconstructConfig) -> Registration:
     """Match more pairs along epipolar lines and start the mapper again, if a model needs it."""
     if best.complete or not settings.starts:
         return best
-    missing = {space.files.index(file) for file in best.missing}
-    pairs = all_pairs(len(space.files))
-    again = pairs if best.misplaced else [pair for pair in pairs if missing & set(pair)]
+    small = len(space.files) <= MOST_PAIRED
+    apart = {space.files.index(file) for file in (*best.missing, *best.misplaced)}
+    again = all_pairs(len(space.files))
+    if not small or not best.misplaced:
+        again = [pair for pair in again if apart & set(pair)]
+    if not small:
+        match_pairs(space, again, settings)
     verified = _guided(space, again, settings)
-    for mapping in _starts(settings):
-        best = max(best, _mapped(space, verified, settings, mapping), key=lambda one: one.rank)
+    seeds = [settings.seed + start for start in range(settings.starts)]
+    for seed, pairs_count in [*((seed, False) for seed in seeds), (settings.seed, True)]:
+        rival = _mapped(space, verified, settings, seed, pairs_count=pairs_count)
+        best = max(best, rival, key=lambda one: one.rank)
         if best.complete:
             break
     return best
 
 
 def _leave_out_room(
-    space: Workspace, settings: RegistrationSettings
+    space: Workspace, settings: ReconstructConfig
 ) -> tuple[StaticBackground, Mapping[str, Float[Tensor, "3 3"]]]:
     """Leave out the features of a room at rest; return it with each file's map to where it is."""
-    rest = leave_out_room(space.database, settings.matching)
+    rest = leave_out_room(space.database, settings)
     require_motion(rest, len(space.files))
     return rest, dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}
 
@@ -195,39 +189,38 @@ def _tell_room(rest: StaticBackground) -> None:
     )
 
 
-def _starts(settings: RegistrationSettings) -> list[MapSettings]:
-    """Return the mapper other random numbers each time.
-
-    Points of two views make poses less exact where all views register without them (median error
-    0.19 instead of 0.13 degrees on 24 photographs of a skull): they come last.
-    """
-    mapping = settings.mapping
-    seeds = range(mapping.seed, mapping.seed + settings.starts)
-    return [replace(mapping, seed=seed) for seed in seeds] + [replace(mapping, pairs_count=True)]
-
-
 def _guided(
-    space: Workspace, pairs: Sequence[PhotographPair], settings: RegistrationSettings
+    space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
 ) -> list[VerifiedPair]:
     """Match some pairs along their epipolar lines; give all that are verified then."""
-    match_guided(space, pairs, settings.matching)
+    match_guided(space, pairs, settings)
     return verified_pairs(space)
 
 
 def _mapped(
     space: Workspace,
     verified: Sequence[VerifiedPair],
-    settings: RegistrationSettings,
-    mapping: MapSettings,
+    settings: ReconstructConfig,
+    seed: int,
+    *,
+    pairs_count: bool = False,
 ) -> Registration:
-    whole = [drop_weak_views(model, mapping.min_inliers) for model in map_views(space, mapping)]
+    """Grow models, and judge the first.
+
+    Args:
+        pairs_count: Points that two views see make poses less exact where all views register
+            without them (median error 0.19 in place of 0.13 degrees on 24 photographs of a skull):
+            they come last.
+    """
+    grown = map_views(space, seed, pairs_count=pairs_count)
+    whole = [drop_weak_views(model, MIN_POINTS) for model in grown]
     found = [model for model in whole if model.num_views]
-    counts = count_views_with_depth(found, mapping.min_inliers)
+    counts = count_views_with_depth(found, MIN_POINTS)
     counted = list(zip(counts, found, strict=True))
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
     models = tuple(model for _, model in counted)
     registered = models[0].names if models else ()
-    limit = _AGREEING * settings.matching.max_error_px
+    limit = _AGREEING * settings.max_error_px
     judgement = judged(models[0], space.files, verified, limit) if models else None
     doubtful = judgement is None or bool(doubt(models[0], len(space.files)))
     return Registration(

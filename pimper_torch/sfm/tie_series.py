@@ -18,13 +18,14 @@ from pimper_torch.sfm.leave_out import (
     read_matched,
     verified_again,
 )
-from pimper_torch.sfm.matching import MatchSettings, PhotographPair, VerifiedPair
+from pimper_torch.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.sfm.moved_object import MovedObject, Rows, find_moved_object
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.static_background import Pair
 
 
 def tie_series(
-    database: Path, settings: MatchSettings
+    database: Path, settings: ReconstructConfig
 ) -> tuple[MovedObject, tuple[VerifiedPair, ...]]:
     """Find series between which the object was moved, and keep between them what is the object's.
 
@@ -41,7 +42,7 @@ def tie_series(
         geometries = {
             (number[first], number[second]): geometry
             for (first, second), geometry in read_geometries(stored).items()
-            if len(geometry.inlier_matches) >= settings.min_inliers
+            if len(geometry.inlier_matches) >= MIN_MATCHES
         }
         verified = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
         outside = {
@@ -65,7 +66,7 @@ def tie_series(
             {pair: rows for pair, rows in outside.items() if pair in verified},
             verify,
             max_error_px=settings.max_error_px,
-            fewest=settings.min_inliers,
+            fewest=MIN_MATCHES,
         )
         for pair, rows in found.tying.items():
             if not torch.equal(rows, verified[pair]):

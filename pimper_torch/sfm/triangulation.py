@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -23,14 +22,12 @@ from pimper_torch.sfm.agreement import (
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.crops import find_crop
-from pimper_torch.sfm.features import FeatureSettings, find_features, too_small
+from pimper_torch.sfm.features import find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
 from pimper_torch.sfm.matching import (
-    MatchSettings,
     PhotographPair,
     VerifiedPair,
-    all_pairs,
     match_pairs,
     photograph_numbers,
     strongest,
@@ -42,8 +39,10 @@ from pimper_torch.sfm.photograph_agreement import (
     explained_fraction,
     require_agreement,
 )
-from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
+from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.retrieval import pairs_to_match
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace, workspace
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
@@ -51,20 +50,6 @@ from pimper_torch.sfm.workspace import Workspace, workspace
 FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
 # Angle between optical axes from which on photographs have nothing to match. A choice.
 _MAX_ANGLE_DEG = 60.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TriangulationSettings:
-    """How points are found.
-
-    Attributes:
-        guided_pairs: Of each photograph, that are matched along epipolar lines.
-    """
-
-    features: FeatureSettings
-    matching: MatchSettings
-    guided_pairs: int
-    tracks: TrackSettings
 
 
 def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
@@ -77,7 +62,7 @@ def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED
 def triangulate(
     views: Views,
     models: Sequence[SparseModel],
-    settings: TriangulationSettings,
+    settings: ReconstructConfig,
     where: str,
     crops: Sequence[SparseModel] = (),
 ) -> SparseModel:
@@ -104,15 +89,15 @@ def triangulate(
         _tell_nothing(0, where)
         return models[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
-    with workspace(views, settings.matching.threads) as space:
-        counts = find_features(space, settings.features, [None] * views.num_views, lenses)
+    with workspace(views, settings.num_threads) as space:
+        counts = find_features(space, settings, [None] * views.num_views, lenses)
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
-            match_pairs(space, all_pairs(views.num_views), settings.matching)
-            enter_room(leave_out_room(space.database, settings.matching))
+            match_pairs(space, pairs_to_match(space), settings)
+            enter_room(leave_out_room(space.database, settings))
         verified = verified_pairs(space)
         given = _way(models, verified, settings, where) if models else None
-        limit = settings.matching.max_error_px
+        limit = settings.max_error_px
         crop = find_crop(given, crops, verified, limit, where) if crops else None
         given = given if crop is None else crop
         assert given is not None, "a crop is found, or refused, where no resize is possible"
@@ -122,10 +107,10 @@ def triangulate(
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
-        found = _triangulated(space, local, settings.matching.seed)
+        found = _triangulated(space, local, settings.seed)
     release_memory()
     if len(found.points_world):
-        found = refine_tracks(views, found, settings.tracks, cameras=False)
+        found = refine_tracks(views, found, settings.track_iterations, cameras=False)
     points = found.points_world + found.points_world.new_tensor(offset)
     found = _with_cameras_of(given, found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
@@ -138,17 +123,15 @@ def triangulate(
 def _way(
     models: Sequence[SparseModel],
     verified: Sequence[VerifiedPair],
-    settings: TriangulationSettings,
+    settings: ReconstructConfig,
     where: str,
 ) -> SparseModel:
     """Choose between cameras of photographs as they stand, and as their files store them."""
     if len(models) == 1:
         return models[0]
-    scores = [
-        explained_fraction(model, verified, settings.matching.max_error_px) for model in models
-    ]
+    scores = [explained_fraction(model, verified, settings.max_error_px) for model in models]
     best = scores.index(max(scores))
-    if sum(pair.num_matches for pair in verified) < settings.matching.min_inliers:
+    if sum(pair.num_matches for pair in verified) < MIN_MATCHES:
         caution(
             f"{where}: EXIF turns photographs, and neither sizes nor matches tell whether its "
             "cameras are of them before or after that; they are taken as after. If the result is "
@@ -169,10 +152,9 @@ def _match_along_lines(
     space: Workspace,
     model: SparseModel,
     verified: Sequence[VerifiedPair],
-    settings: TriangulationSettings,
+    settings: ReconstructConfig,
 ) -> None:
     """Replace what was verified by matches along the cameras' epipolar lines."""
-    matching = settings.matching
     pairs, cameras = _pairs(model, verified, settings), pinholes_of(model)
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
@@ -186,12 +168,12 @@ def _match_along_lines(
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = Near(epipolar_geometry(cameras, pair), matching.max_error_px, planar=False)
-            found = guided_matches(first, second, near, matching.max_ratio)
+            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px, planar=False)
+            found = guided_matches(first, second, near, settings.max_ratio)
             ends = VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
             )
-            return found[explained(cameras, ends, matching.max_error_px)]
+            return found[explained(cameras, ends, settings.max_error_px)]
 
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
@@ -203,12 +185,12 @@ def _match_along_lines(
 
 
 def _pairs(
-    model: SparseModel, verified: Sequence[VerifiedPair], settings: TriangulationSettings
+    model: SparseModel, verified: Sequence[VerifiedPair], settings: ReconstructConfig
 ) -> list[PhotographPair]:
     """Choose pairs by matches that the cameras explain, then by the angle between their axes."""
     axes = model.cam_from_world[:, 2, :3]
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
-    cameras, limit = pinholes_of(model), settings.matching.max_error_px
+    cameras, limit = pinholes_of(model), settings.max_error_px
     weights = {
         (first, second): 1 - float(angles[first, second]) / _MAX_ANGLE_DEG
         for first, second in combinations(range(model.num_views), 2)

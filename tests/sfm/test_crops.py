@@ -16,7 +16,8 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import pinhole_of, write_binary
 from pimper_torch.sfm.existing import existing_ways
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.settings import ReconstructConfig
 from tests.sfm.ball import (
     FOCAL,
     HEIGHT,

@@ -18,7 +18,7 @@ from pimper_torch.sfm.guided import (
     match_guided,
 )
 from pimper_torch.sfm.matching import match_pairs
-from pimper_torch.sfm.reconstruct import ReconstructConfig
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import workspace
 
 CONFIG = ReconstructConfig(threads=1)
@@ -113,28 +113,27 @@ def matched():
     pycolmap = loaded()
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     views = views.take([views.names.index(name) for name in ("35.jpg", "36.jpg")])
-    matching = CONFIG.registration.matching
 
     def inliers(stored):
         geometry = stored.read_two_view_geometry(1, 2)
         return {tuple(row) for row in np.array(geometry.inlier_matches).tolist()}
 
     with workspace(views, 1) as space:
-        find_features(space, CONFIG.features, [None, None], [0, 0])
-        match_pairs(space, [(0, 1)], matching)
+        find_features(space, CONFIG, [None, None], [0, 0])
+        match_pairs(space, [(0, 1)], CONFIG)
         options = pycolmap.FeatureMatchingOptions()
         options.use_gpu, options.num_threads, options.guided_matching = False, 1, True
-        options.sift.max_ratio = matching.max_ratio
+        options.sift.max_ratio = CONFIG.max_ratio
         with quiet(), pycolmap.Database.open(space.database) as stored:
             plain, geometry = inliers(stored), stored.read_two_view_geometry(1, 2)
-        match_guided(space, [(0, 1)], matching)
+        match_guided(space, [(0, 1)], CONFIG)
         with quiet(), pycolmap.Database.open(space.database) as stored:
             ours = inliers(stored)
             stored.delete_two_view_geometry(1, 2)
         verification = pycolmap.TwoViewGeometryOptions()
-        verification.min_num_inliers = matching.min_inliers
-        verification.ransac.max_error = matching.max_error_px
-        verification.ransac.random_seed = matching.seed
+        verification.min_num_inliers = MIN_MATCHES
+        verification.ransac.max_error = CONFIG.max_error_px
+        verification.ransac.random_seed = CONFIG.seed
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = space.folder / "pairs.txt"
         pairing.match_list_path.write_text(" ".join(space.files) + "\n", encoding="ascii")

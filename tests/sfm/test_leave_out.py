@@ -5,10 +5,10 @@ import torch
 from pimper_torch.sfm.binding import loaded
 from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.leave_out import leave_out_room
-from pimper_torch.sfm.matching import MatchSettings
+from pimper_torch.sfm.settings import ReconstructConfig
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
-SETTINGS = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
+SETTINGS = ReconstructConfig(threads=1)
 
 
 def stored(scene, path):

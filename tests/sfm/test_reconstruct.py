@@ -19,8 +19,9 @@ from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.progress import listening
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig, structure_from_motion
+from pimper_torch.sfm.reconstruct import Reconstruct, structure_from_motion
 from pimper_torch.sfm.scene import write_model
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.store import digest
 

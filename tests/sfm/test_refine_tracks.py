@@ -1,19 +1,12 @@
-import dataclasses
-
 import torch
 
 from pimper_torch.evidence.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.sfm.bundling import bundle
-from pimper_torch.sfm.refine_tracks import TrackSettings, refine_tracks
+from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.track_observations import SightingSettings
 from tests.sfm import ball
-
-SETTINGS = TrackSettings(
-    iterations=1, fewest_points=30, track_observations=SightingSettings(radius_px=8)
-)
 
 
 def shape_error(points, truth):
@@ -45,22 +38,20 @@ def found_by_features(generator, noise_px=0.5, fraction=0.6):
 
 def test_cameras_come_five_times_nearer_to_the_truth_under_changing_light(generator):
     cameras, points, model = found_by_features(generator)
-    better = refine_tracks(ball.photographs(cameras), model, SETTINGS)
+    better = refine_tracks(ball.photographs(cameras), model, 1)
     assert camera_error(better, points) < camera_error(model, points) / 5
 
 
 def test_focal_length_comes_nearer_to_the_truth(generator):
     cameras, _, model = found_by_features(generator, noise_px=0.8)
-    better = refine_tracks(
-        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, iterations=2)
-    )
+    better = refine_tracks(ball.photographs(cameras), model, 2)
     before, after = (abs(one.lenses[0].params[0] / ball.FOCAL - 1) for one in (model, better))
     assert after < before / 2
 
 
 def test_views_that_missed_a_point_are_found_to_show_it(generator):
     cameras, _, model = found_by_features(generator, fraction=0.3)
-    better = refine_tracks(ball.photographs(cameras), model, SETTINGS)
+    better = refine_tracks(ball.photographs(cameras), model, 1)
     assert len(better.observation_point) > 1.3 * len(model.observation_point)
     assert better.names == model.names
     assert observation_errors(better).median() < 0.15
@@ -71,7 +62,7 @@ def test_a_view_that_shows_nothing_of_the_others_keeps_its_features_and_place(ge
     views = ball.photographs(cameras)
     images = views.images.clone()
     images[4] = 0.2  # blank: no patch is found in it
-    better = refine_tracks(views.replace(images=images), model, SETTINGS)
+    better = refine_tracks(views.replace(images=images), model, 1)
     assert (better.observation_view == 4).sum() > 60
     others = [0, 1, 2, 3, 5]
     before, after = (torch.linalg.inv(one.cam_from_world)[:, :3, 3] for one in (model, better))
@@ -83,14 +74,12 @@ def test_without_texture_everything_stays_as_it_was(generator):
     cameras, _, model = found_by_features(generator)
     views = ball.photographs(cameras)
     plain = views.replace(images=torch.full_like(views.images, 0.3))
-    assert refine_tracks(plain, model, SETTINGS) is model
+    assert refine_tracks(plain, model, 1) is model
 
 
 def test_no_rounds_leave_the_model_alone(generator):
     cameras, _, model = found_by_features(generator)
-    same = refine_tracks(
-        ball.photographs(cameras), model, dataclasses.replace(SETTINGS, iterations=0)
-    )
+    same = refine_tracks(ball.photographs(cameras), model, 0)
     assert same is model
 
 

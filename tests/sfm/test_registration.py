@@ -9,16 +9,14 @@ from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm import registration
 from pimper_torch.sfm.agreement import Judgement
 from pimper_torch.sfm.doubt import count_views_with_depth
-from pimper_torch.sfm.mapping import MapSettings
-from pimper_torch.sfm.matching import MatchSettings, VerifiedPair, all_pairs
+from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
-from pimper_torch.sfm.registration import RegistrationSettings, register
+from pimper_torch.sfm.registration import register
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.workspace import Workspace
 
-MATCHING = MatchSettings(max_ratio=0.8, max_error_px=2.0, min_inliers=15, seed=0, threads=1)
-MAPPING = MapSettings(min_inliers=6, pairs_count=False, seed=5)
-SETTINGS = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=1, starts=2)
+SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 
 RIGID = StaticBackground(features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
 ROOM = RIGID.replace(
@@ -45,8 +43,8 @@ class Told:
     def guide(self, space, pairs, settings):
         self.matched.append((True, list(pairs)))
 
-    def map(self, space, settings):
-        self.mapped.append((settings.seed, settings.pairs_count))
+    def map(self, space, seed, *, pairs_count):
+        self.mapped.append((seed, pairs_count))
         self.databases.append(space.database_name)
         return [self.models.pop(0)]
 
@@ -79,10 +77,12 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "match_pairs", answers.match)
         monkeypatch.setattr(registration, "match_guided", answers.guide)
         monkeypatch.setattr(registration, "map_views", answers.map)
+        monkeypatch.setattr(registration, "MIN_POINTS", 6)
         monkeypatch.setattr(registration, "judged", answers.judge)
         monkeypatch.setattr(registration, "doubt", lambda model, count: "")
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
         monkeypatch.setattr(registration, "leave_out_room", leave_out)
+        monkeypatch.setattr(registration, "pairs_to_match", lambda space: all_pairs(5))
         monkeypatch.setattr(registration, "tie_series", lambda *_: (None, around))
         monkeypatch.setattr(
             registration,
@@ -138,7 +138,7 @@ def test_points_of_two_views_count_last_and_the_best_of_all_is_kept(told, space)
 
 def test_without_starts_the_first_model_is_kept_as_it_is(told, space):
     answers = told([[0, 1, 2]])
-    settings = RegistrationSettings(matching=MATCHING, mapping=MAPPING, guided_pairs=0, starts=0)
+    settings = replace(SETTINGS, guided_pairs=0, starts=0)
     assert register(space, settings).missing == ("d.jpg", "ü.tif")
     assert answers.matched == [(False, all_pairs(5))]
 
@@ -146,7 +146,8 @@ def test_without_starts_the_first_model_is_kept_as_it_is(told, space):
 def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeypatch):
     told(4 * [[0, 1]])
     monkeypatch.setattr(registration, "count_views_with_depth", count_views_with_depth)
-    found = register(space, replace(SETTINGS, mapping=replace(MAPPING, min_inliers=1000)))
+    monkeypatch.setattr(registration, "MIN_POINTS", 1000)
+    found = register(space, SETTINGS)
     assert found.models == ()
     assert found.missing == tuple(space.files)
 
@@ -186,3 +187,15 @@ def test_features_of_a_room_are_left_out_where_the_plain_model_is_doubtful(
         found = register(space, SETTINGS)
     assert found.background.keys() == set(space.files)
     assert found.explained == 1
+
+
+def test_of_many_photographs_likely_pairs_are_matched_and_those_of_missing_ones_with_all(
+    told, space, monkeypatch
+):
+    answers = told([[0, 1, 2, 4], EVERY], [{"c 1.png": 0.1}, {}])
+    monkeypatch.setattr(registration, "MOST_PAIRED", 4)
+    monkeypatch.setattr(registration, "pairs_to_match", lambda space: NEIGHBOURS[1])
+    found = register(space, SETTINGS)
+    assert found.complete
+    apart = [pair for pair in all_pairs(5) if {2, 3} & set(pair)]
+    assert answers.matched == [(False, NEIGHBOURS[1]), NEIGHBOURS, (False, apart), (True, apart)]

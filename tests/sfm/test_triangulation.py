@@ -19,12 +19,12 @@ from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.photograph_agreement import explained
-from pimper_torch.sfm.reconstruct import ReconstructConfig
 from pimper_torch.sfm.reprojection import observation_errors
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
 
-SETTINGS = ReconstructConfig(threads=1).triangulation
+SETTINGS = ReconstructConfig(threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_points_lie_on_the_surface_and_cameras_come_back_bit_for_bit(views, bare
 def test_the_number_of_threads_changes_no_bit(views, bare):
     found = []
     for threads in (1, 2):
-        settings = ReconstructConfig(threads=threads).triangulation
+        settings = ReconstructConfig(threads=threads)
         with pytest.warns(PimperWarning, match="were triangulated"):
             found.append(triangulate(views, [bare], settings, "The model"))
     assert torch.equal(found[0].points_world, found[1].points_world)
@@ -187,7 +187,7 @@ def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
 
 
 def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_them(views, bare):
-    settings = replace(SETTINGS, tracks=replace(SETTINGS.tracks, iterations=0))
+    settings = replace(SETTINGS, track_iterations=0)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         found = triangulate(views, [bare], settings, "The model")

@@ -6,7 +6,8 @@ import torch
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.scene import build_scene
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.settings import ReconstructConfig
 from tests.sfm.test_turntable import center_errors, photographs
 
 

@@ -11,7 +11,8 @@ from pimper_torch.evidence.scenes.stage import Stage
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Views
-from pimper_torch.sfm.reconstruct import Reconstruct, ReconstructConfig
+from pimper_torch.sfm.reconstruct import Reconstruct
+from pimper_torch.sfm.settings import ReconstructConfig
 
 QUICK = ReconstructConfig(
     peak_threshold=0.0067,

@@ -15,10 +15,10 @@ from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import Capture, CoarseMesh, Record, SparseScene
 from pimper_torch.sfm.reconstruct import (
     Reconstruct,
-    ReconstructConfig,
     find_model,
     placed_scene,
 )
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.store import opened
 
 
