@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Record
+from pimper_torch.sfm.matching import MOST_PAIRED
 
 # Points round one that tell its normal.
 _NEIGHBOURS = 16
@@ -20,6 +21,12 @@ _MIN_FACING = 0.5
 
 # Cosine between normal and ray down to which a view is worth asking.
 _MIN_COSINE = 0.35
+
+# Views that a point is looked for in, where there are many; see docs/decisions.md.
+_MOST_CANDIDATES = 24
+
+# Pairs of points and views at once: 100 MB of rays.
+_AT_ONCE = 2**22
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -49,12 +56,32 @@ def tangents(
         observed: Which views see which points, every point in one at least.
         cameras: In float64, like the points.
     """
+    at_once = max(1, _AT_ONCE // cameras.num_views)
+    points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
+    towards = [_towards(some, by, cameras) for some, by in zip(points, seen, strict=True)]
+    normals = torch.split(plane_normals(points_world, torch.cat(towards)), at_once)
+    laid = zip(points, seen, normals, strict=True)
+    return Tangents.cat([_laid(some, by, across, cameras) for some, by, across in laid])
+
+
+def _towards(
+    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
+) -> Float[Tensor, "point 3"]:
+    """Return the mean directions to the views that see points."""
+    rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
+    return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
+
+
+def _laid(
+    points_world: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, "point view"],
+    normals: Float[Tensor, "point 3"],
+    cameras: Cameras,
+) -> Tangents:
+    """Lay planes of known normals."""
     rays = cameras.centers_world - points_world[:, None]
     distance = rays.norm(dim=-1)
-    rays = normalize(rays, dim=-1)
-    towards = normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
-    normals = plane_normals(points_world, towards)
-    cosine = (rays * normals[:, None]).sum(dim=-1)
+    cosine = (normalize(rays, dim=-1) * normals[:, None]).sum(dim=-1)
     focals = cameras.intrinsics[:, 0, 0]
     sharpness = torch.where(observed, cosine.clamp_min(1e-3) * focals / distance, 0)
     reference = sharpness.argmax(dim=1)
@@ -65,13 +92,22 @@ def tangents(
     pixels, depth = project(points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px[:, None].to(pixels)
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    candidates = inside.mT & (cosine > _MIN_COSINE)
+    candidates = (inside.mT & (cosine > _MIN_COSINE)).scatter(1, here, value=False)
+    if cameras.num_views > MOST_PAIRED:
+        candidates = evenly(candidates, _MOST_CANDIDATES)
     return Tangents(
         points_world=points_world,
         steps_world=pixel[:, None] * _along(normals),
         reference=reference,
-        candidates=candidates.scatter(1, here, value=False),
+        candidates=candidates,
     )
+
+
+def evenly(candidates: Bool[Tensor, "point view"], most: int) -> Bool[Tensor, "point view"]:
+    """Keep so many views of each point at most, evenly spread among the candidates."""
+    place = candidates.cumsum(dim=1) * most
+    count = candidates.sum(dim=1, keepdim=True).clamp_min(most)
+    return candidates & (place // count > (place - most) // count)
 
 
 def plane_normals(

@@ -1,7 +1,7 @@
 import torch
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.tangents import plane_homographies, plane_normals, tangents
+from pimper_torch.sfm.tangents import evenly, plane_homographies, plane_normals, tangents
 from tests.sfm import ball
 
 
@@ -82,3 +82,14 @@ def test_homographies_carry_steps_of_the_plane_to_pixels(generator):
         cameras.intrinsics[2],
     )
     torch.testing.assert_close(homogeneous[:, :2] / homogeneous[:, 2:], expected)
+
+
+def test_views_are_kept_evenly_and_all_where_they_are_few(generator):
+    candidates = torch.rand(200, 90, generator=generator) < torch.rand(200, 1, generator=generator)
+    kept = evenly(candidates, 24)
+    assert not (kept & ~candidates).any()
+    count = candidates.sum(dim=1)
+    assert torch.equal(kept.sum(dim=1), count.clamp_max(24))
+    assert torch.equal(kept[count <= 24], candidates[count <= 24])
+    many = evenly(torch.ones(1, 96, dtype=torch.bool), 24)
+    assert torch.nonzero(many[0])[:, 0].diff().unique().tolist() == [4]
