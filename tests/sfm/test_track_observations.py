@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.sfm import track_observations
 from pimper_torch.sfm.tangents import tangents
 from pimper_torch.sfm.track_observations import SightingSettings, log_pictures, sight
 from tests.sfm import ball
@@ -39,6 +40,16 @@ def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
     )
     assert len(found.point) > 0.85 * 6 * 150
     assert errors(found, pixels).median() < (0.05 if lit else 0.02)
+
+
+def test_a_part_of_the_points_at_a_time_gives_the_same_bits(scene, monkeypatch):
+    cameras, planes, _ = scene
+    shown = pictures(ball.photographs(cameras, wall=True))
+    at_once = sight(shown, cameras, planes, SETTINGS)
+    monkeypatch.setattr(track_observations, "_TEMPLATES", 64)
+    in_parts = sight(shown, cameras, planes, SETTINGS)
+    for name in ("point", "view", "pixels"):
+        assert torch.equal(getattr(at_once, name), getattr(in_parts, name))
 
 
 def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
