@@ -10,7 +10,7 @@ as its walk is done.
 import argparse
 import resource
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -31,7 +31,7 @@ from pimper_torch.sfm.settings import ReconstructConfig
 # Functions by the part of structure from motion that they are, and the module that calls them.
 PARTS = (
     (reconstruct, "find_features", "features"),
-    (registration, "likely_pairs", "pairs"),
+    (registration, "pairs_to_match", "pairs"),
     (registration, "match_pairs", "matching"),
     (registration, "match_guided", "matching"),
     (registration, "verified_pairs", "matching"),
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--renderings", type=Path, default=Path("walks"))
     parser.add_argument("--seed", type=int, default=0, help="of structure from motion")
     options = parser.parse_args()
-    spent = Counter[str]()
+    spent = defaultdict[str, float](float)
     for module, name, part in PARTS:
         setattr(module, name, timed(getattr(module, name), part, spent))
     say("| photographs | " + " | ".join((*COLUMNS, *FIGURES)) + " |")
@@ -83,7 +83,7 @@ def main() -> None:
         say(" | ".join((f"| {num_views}", *cells, f"{each / first:.2f}", *figures)) + " |")
 
 
-def run(folder: Path, seed: int, spent: Counter[str]) -> list[str]:
+def run(folder: Path, seed: int, spent: defaultdict[str, float]) -> list[str]:
     """Run structure from motion on a rendered walk and return its figures as cells."""
     views = load_views(folder / "photos")
     capture = read_rendered(folder, maps=False, photographs=False)
@@ -107,7 +107,9 @@ def run(folder: Path, seed: int, spent: Counter[str]) -> list[str]:
     ]
 
 
-def timed(function: Callable[..., Any], part: str, spent: Counter[str]) -> Callable[..., Any]:
+def timed(
+    function: Callable[..., Any], part: str, spent: defaultdict[str, float]
+) -> Callable[..., Any]:
     """Add the CPU seconds of every call to a part's."""
 
     @wraps(function)

@@ -44,17 +44,9 @@ _PILOTS = 256
 # Scales beyond which an observation is an outlier, and pixels in which features are none.
 _OUTLIER_SCALES, _FEATURE_PX = 10.0, 2.0
 
-# A view that shows fewer of the points that were found keeps its features: MIN_POINTS.
-SIGHTING = SightingSettings()
-
 
 def refine_tracks(
-    views: Views,
-    model: SparseModel,
-    iterations: int,
-    *,
-    cameras: bool = True,
-    settings: SightingSettings = SIGHTING,
+    views: Views, model: SparseModel, iterations: int, *, cameras: bool = True
 ) -> SparseModel:
     """Find the points again in every view, and adjust cameras, lenses and points to that.
 
@@ -73,7 +65,7 @@ def refine_tracks(
     rounds = iterations if cameras else min(iterations, 1)
     for left in reversed(range(rounds)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, pinholes = _sighted(views, some, settings)
+        found, pinholes = _sighted(views, some)
         renewed, aligned = _renewed(some, found, pinholes)
         if not bool(aligned.any()):
             return model
@@ -92,9 +84,7 @@ def refine_tracks(
     return model
 
 
-def _sighted(
-    views: Views, model: SparseModel, settings: SightingSettings
-) -> tuple[TrackObservations, Cameras]:
+def _sighted(views: Views, model: SparseModel) -> tuple[TrackObservations, Cameras]:
     """Find the points in undistorted photographs, which are held no longer than that."""
     raster = (views.num_views, *views.images.shape[-2:])
     pictures = log_pictures(undistorted(views, model.lenses), raster)
@@ -104,7 +94,7 @@ def _sighted(
         sizes_px=views.sizes_px.cpu(),
     )
     planes = tangents(model.points_world, model.observed, cameras)
-    return sight(pictures, cameras, planes, settings), cameras
+    return sight(pictures, cameras, planes, SightingSettings()), cameras
 
 
 def _renewed(

@@ -32,17 +32,13 @@ Descriptors = Float[Tensor, "feature length"]
 
 
 def pairs_to_match(space: Workspace) -> list[PhotographPair]:
-    """List all pairs of a small set, the likely ones of a larger."""
-    count = len(space.files)
-    return all_pairs(count) if count <= MOST_PAIRED else likely_pairs(space)
-
-
-def likely_pairs(space: Workspace) -> list[PhotographPair]:
-    """List the pairs of each photograph with those most like it.
+    """List all pairs of a small set; of a larger, those of each photograph with those most like it.
 
     Args:
         space: With features. Those of one photograph are in memory at a time.
     """
+    if len(space.files) <= MOST_PAIRED:
+        return all_pairs(len(space.files))
     with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
         image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
 
