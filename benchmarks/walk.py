@@ -26,7 +26,10 @@ from pimper_torch.evidence.scenes.write import render_scene
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh
 from pimper_torch.sfm import reconstruct, registration
+from pimper_torch.sfm.scene import assemble_scene
 from pimper_torch.sfm.settings import ReconstructConfig
+
+Spent = defaultdict[str, float]
 
 # Functions by the part of structure from motion that they are, and the module that calls them.
 PARTS = (
@@ -58,7 +61,7 @@ def main() -> None:
     parser.add_argument("--renderings", type=Path, default=Path("walks"))
     parser.add_argument("--seed", type=int, default=0, help="of structure from motion")
     options = parser.parse_args()
-    spent = defaultdict[str, float](float)
+    spent = Spent(float)
     for module, name, part in PARTS:
         setattr(module, name, timed(getattr(module, name), part, spent))
     say("| photographs | " + " | ".join((*COLUMNS, *FIGURES)) + " |")
@@ -83,7 +86,7 @@ def main() -> None:
         say(" | ".join((f"| {num_views}", *cells, f"{each / first:.2f}", *figures)) + " |")
 
 
-def run(folder: Path, seed: int, spent: defaultdict[str, float]) -> list[str]:
+def run(folder: Path, seed: int, spent: Spent) -> list[str]:
     """Run structure from motion on a rendered walk and return its figures as cells."""
     views = load_views(folder / "photos")
     capture = read_rendered(folder, maps=False, photographs=False)
@@ -92,7 +95,7 @@ def run(folder: Path, seed: int, spent: defaultdict[str, float]) -> list[str]:
         model = timed(reconstruct.structure_from_motion, "all", spent)(views, config)
         megabytes = peak() or float("nan")
     spent["rest"] = spent["all"] - sum(spent[part] for part in COLUMNS[:-3])
-    scene = reconstruct.assemble_scene(views, model)
+    scene = assemble_scene(views, model)
     cloud = Mesh(vertices_world=scene.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
     estimate = Estimate(mesh=cloud, names=scene.views.names, cameras=scene.cameras)
     found = camera_figures(estimate, capture)
@@ -107,9 +110,7 @@ def run(folder: Path, seed: int, spent: defaultdict[str, float]) -> list[str]:
     ]
 
 
-def timed(
-    function: Callable[..., Any], part: str, spent: defaultdict[str, float]
-) -> Callable[..., Any]:
+def timed(function: Callable[..., Any], part: str, spent: Spent) -> Callable[..., Any]:
     """Add the CPU seconds of every call to a part's."""
 
     @wraps(function)
