@@ -1,5 +1,6 @@
 """Features matched between pairs of photographs, and verified by an epipolar geometry."""
 
+import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -83,14 +84,16 @@ def all_pairs(count: int) -> list[PhotographPair]:
 
 
 def tiles(pairs: Sequence[PhotographPair]) -> Iterator[list[PhotographPair]]:
-    """Group pairs so that those of a group share few photographs.
+    """Group pairs so that those of a group share few photographs; larger groups of fewer pairs.
 
     >>> [len(some) for some in tiles(all_pairs(20))]
     [120, 64, 6]
     """
     groups: dict[PhotographPair, list[PhotographPair]] = {}
+    count = 1 + max((second for _, second in pairs), default=0)
+    side = int(_TILE * max(1.0, math.comb(count, 2) / max(len(pairs), 1)) ** 0.5)
     for first, second in pairs:
-        groups.setdefault((first // _TILE, second // _TILE), []).append((first, second))
+        groups.setdefault((first // side, second // side), []).append((first, second))
     yield from (groups[key] for key in sorted(groups))
 
 

@@ -9,6 +9,14 @@ def test_tiles_hold_every_pair_once_and_few_photographs_each():
     assert max(len({view for pair in some for view in pair}) for some in groups) <= 32
 
 
+def test_tiles_of_few_pairs_are_as_full_as_those_of_all():
+    pairs = [pair for pair in all_pairs(300) if pair[1] - pair[0] <= 10]
+    groups = list(tiles(pairs))
+    assert sorted(pair for some in groups for pair in some) == pairs
+    prepared = sum(len({view for pair in some for view in pair}) for some in groups)
+    assert prepared <= 3 * 300
+
+
 def test_the_strongest_pairs_of_every_photograph_are_listed_once():
     counts = {(0, 1): 50, (0, 2): 40, (0, 3): 30, (1, 2): 20, (1, 3): 60, (2, 3): 10}
     assert strongest(counts, 4, 1) == [(0, 1), (0, 2), (1, 3)]
