@@ -22,7 +22,7 @@ _MIN_FACING = 0.5
 # Cosine between normal and ray down to which a view is worth asking.
 _MIN_COSINE = 0.35
 
-# Views that a point is looked for in, where there are many; see docs/decisions.md.
+# Views that a point is looked for in, where there are many, those that see it first; see docs/decisions.md.
 _MOST_CANDIDATES = 24
 
 # Pairs of points and views at once: 100 MB of rays.
@@ -94,7 +94,10 @@ def _laid(
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
     candidates = (inside.mT & (cosine > _MIN_COSINE)).scatter(1, here, value=False)
     if cameras.num_views > MOST_PAIRED:
-        candidates = evenly(candidates, _MOST_CANDIDATES)
+        most = torch.full_like(here, _MOST_CANDIDATES)
+        seen = evenly(candidates & observed, most)
+        left = most - seen.sum(dim=1, keepdim=True)
+        candidates = seen | evenly(candidates & ~observed, left)
     return Tangents(
         points_world=points_world,
         steps_world=pixel[:, None] * _along(normals),
@@ -103,10 +106,12 @@ def _laid(
     )
 
 
-def evenly(candidates: Bool[Tensor, "point view"], most: int) -> Bool[Tensor, "point view"]:
+def evenly(
+    candidates: Bool[Tensor, "point view"], most: Int[Tensor, "point 1"]
+) -> Bool[Tensor, "point view"]:
     """Keep so many views of each point at most, evenly spread among the candidates."""
     place = candidates.cumsum(dim=1) * most
-    count = candidates.sum(dim=1, keepdim=True).clamp_min(most)
+    count = torch.maximum(candidates.sum(dim=1, keepdim=True), most).clamp_min(1)
     return candidates & (place // count > (place - most) // count)
 
 

@@ -86,10 +86,11 @@ def test_homographies_carry_steps_of_the_plane_to_pixels(generator):
 
 def test_views_are_kept_evenly_and_all_where_they_are_few(generator):
     candidates = torch.rand(200, 90, generator=generator) < torch.rand(200, 1, generator=generator)
-    kept = evenly(candidates, 24)
+    kept = evenly(candidates, torch.full((200, 1), 24))
     assert not (kept & ~candidates).any()
     count = candidates.sum(dim=1)
     assert torch.equal(kept.sum(dim=1), count.clamp_max(24))
     assert torch.equal(kept[count <= 24], candidates[count <= 24])
-    many = evenly(torch.ones(1, 96, dtype=torch.bool), 24)
+    many = evenly(torch.ones(1, 96, dtype=torch.bool), torch.tensor([[24]]))
+    assert not evenly(candidates, torch.zeros(200, 1, dtype=torch.long)).any()
     assert torch.nonzero(many[0])[:, 0].diff().unique().tolist() == [4]
