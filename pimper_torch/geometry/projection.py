@@ -72,9 +72,10 @@ def triangulation_angles(
     count = observed.sum(dim=1)
     widest = torch.zeros_like(points_world[:, 0])
     for some in torch.split(count.argsort(stable=True), _POINTS):
-        if int(count[some].amax()) < 2:
+        longest = max(count[some].tolist(), default=0)
+        if longest < 2:
             continue
-        seen, views = observed[some].byte().topk(int(count[some].amax()), dim=1)
+        seen, views = observed[some].byte().topk(longest, dim=1)
         rays = normalize(points_world[some, None] - centers_world[views], dim=-1)
         both = (seen[:, :, None] * seen[:, None, :]).bool()
         cosines = torch.where(both, rays @ rays.mT, 1).flatten(1).amin(dim=1)

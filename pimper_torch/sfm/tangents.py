@@ -22,7 +22,8 @@ _MIN_FACING = 0.5
 # Cosine between normal and ray down to which a view is worth asking.
 _MIN_COSINE = 0.35
 
-# Views that a point is looked for in, where there are many, those that see it first; see docs/decisions.md.
+# Views that a point is looked for in, where there are many, those that see it first; see
+# docs/decisions.md.
 _MOST_CANDIDATES = 24
 
 # Pairs of points and views at once: 100 MB of rays.
