@@ -84,6 +84,8 @@ SOLE_IMPORTERS = {
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
     "onnxruntime": {"priors/network.py"},
+    "distributed": {"batches/on_dask.py"},
+    "submitit": {"batches/on_slurm.py"},
 }
 
 # Where a distribution's module has another name.

@@ -1,6 +1,8 @@
 """``pimper batch``: many objects, on this machine or on an engine."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,10 +11,14 @@ import tyro
 
 from pimper_torch.batches.lines import Events, Lines, totals
 from pimper_torch.batches.objects import CSV, HTML
+from pimper_torch.batches.on_dask import dask_workers, require_dask
+from pimper_torch.batches.on_slurm import SlurmExecutor, require_slurm
 from pimper_torch.batches.run import TRIES, batch
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
+from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.outputs.marker import STAGES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +35,8 @@ class _Job:
         overwrite: Replace results of other settings or photographs.
         jobs: Objects at once; as many as memory and cores allow unless given, 100 on an engine.
         tries: How often an object is begun whose run is killed, hangs or lacks memory.
+        dask: Scheduler of dask.distributed whose workers do it, such as tcp://127.0.0.1:8786.
+        slurm: Partition of Slurm whose nodes do it, a job an object.
         time_limit: Minutes of one try; ten times the estimate unless given, an hour at least.
         mem_gb: Memory of a run; an estimate unless given.
         cpus_per_task: Threads of a run; here the cores shared out, on an engine 1 unless given.
@@ -39,6 +47,8 @@ class _Job:
     overwrite: Flag = False
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     tries: int = TRIES
+    dask: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = ""
+    slurm: Annotated[str, tyro.conf.arg(metavar="PARTITION")] = ""
     time_limit: Annotated[float | None, tyro.conf.arg(aliases=["--timeout-min"], metavar="MIN")] = (
         None
     )
@@ -51,10 +61,11 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     job, settings = checked(command, arguments)
     shown = Events(output.event) if output.as_json else Lines(output.shows("info"))
     try:
-        with shown:
+        with _engine(job) as executor, shown:
             outcomes = batch(
                 job.list,
                 job.out,
+                executor=executor,
                 settings=settings,
                 overwrite=job.overwrite,
                 jobs=job.jobs,
@@ -82,10 +93,29 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 _GOES_ON = "The same command goes on: what stages finished is kept."
 
 
+@contextmanager
+def _engine(job: _Job) -> Iterator[Executor | None]:
+    """Return what carries out the objects; ``None`` is this machine."""
+    if job.dask:
+        with dask_workers(job.dask) as workers:
+            yield workers
+    elif job.slurm:
+        with SlurmExecutor(job.out / STAGES / "slurm", job.slurm) as jobs:
+            yield jobs
+    else:
+        yield None
+
+
 def checked(command: str, arguments: Sequence[str]) -> tuple[_Job, list[str]]:
     """Read the arguments, and those behind ``--`` for every object."""
     own, settings = [*arguments], []
     if "--" in own:
         place = own.index("--")
         own, settings = own[:place], own[place + 1 :]
-    return read_arguments(_Job, command, own), settings
+    job = read_arguments(_Job, command, own)
+    require(not (job.dask and job.slurm), "--slurm", job.slurm, "none beside --dask")
+    if job.dask:
+        require_dask()
+    if job.slurm:
+        require_slurm()
+    return job, settings

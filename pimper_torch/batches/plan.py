@@ -27,18 +27,14 @@ _PATIENCE, _LEAST_S = 10.0, 3600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The tasks of a batch, and what each run takes by estimate.
+    """The tasks of a batch.
 
     Attributes:
         settled: Objects that are not begun: whole already, or refused.
-        seconds: Of each task, on 2 cores.
-        gigabytes: Of each task.
     """
 
     tasks: tuple[Task, ...]
     settled: tuple[Outcome, ...]
-    seconds: tuple[float, ...]
-    gigabytes: tuple[float, ...]
 
 
 def planned_batch(
@@ -48,6 +44,7 @@ def planned_batch(
     *,
     overwrite: bool = False,
     limit_s: float | None = None,
+    mem_gb: float | None = None,
 ) -> Plan:
     """Check every object as ``pimper reconstruct`` would, and estimate what it takes.
 
@@ -55,6 +52,7 @@ def planned_batch(
         out: Folder of the batch.
         settings: Options of ``pimper reconstruct`` for every object; its own come after them.
         limit_s: Seconds that a try may take; by the estimate unless given.
+        mem_gb: Memory that a run takes; the estimate unless given.
 
     Raises:
         ConfigError: A setting that does not exist or has an impossible value; says of which object.
@@ -67,19 +65,20 @@ def planned_batch(
 
         read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
 
-        def one(thing: Object) -> tuple[Task, tuple[float, float]] | Outcome:
+        def one(thing: Object) -> Task | Outcome:
             words = (*settings, *thing.settings)
             words += ("--overwrite",) if overwrite and "--overwrite" not in words else ()
             photos, target = thing.photos.absolute(), out / thing.name
             try:
                 job = replace(read(words), photos=photos, out=target)
-                needs = estimate(*_pixels(photos, job.common.max_size_px))
+                seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))
                 task = Task(
                     name=thing.name,
                     arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
                     out=target,
                     key=_key(words, inputs_of(job).values()),
-                    limit_s=limit_s or max(_LEAST_S, _PATIENCE * needs[0]),
+                    limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
+                    mem_gb=mem_gb or gigabytes,
                     threads=1,
                 )
                 if is_whole(task):
@@ -89,17 +88,14 @@ def planned_batch(
                 raise ConfigError(f"{thing.where or thing.name}: {error}") from error
             except PimperError as error:
                 return Outcome(name=thing.name, status="failed", message=str(error))
-            return task, needs
+            return task
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # each run warns of its own
             found = [one(thing) for thing in objects]
-    begun = [each for each in found if not isinstance(each, Outcome)]
     return Plan(
-        tasks=tuple(task for task, _ in begun),
+        tasks=tuple(each for each in found if isinstance(each, Task)),
         settled=tuple(each for each in found if isinstance(each, Outcome)),
-        seconds=tuple(seconds for _, (seconds, _) in begun),
-        gigabytes=tuple(gigabytes for _, (_, gigabytes) in begun),
     )
 
 

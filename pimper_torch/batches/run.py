@@ -16,6 +16,7 @@ from concurrent.futures import (
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Protocol
 
 from pimper_torch.batches.objects import Object, read_objects
@@ -35,6 +36,8 @@ AT_ONCE = 100
 _LOOK_SECONDS = 0.5
 # A try ends itself at its limit; a worker that has not by then hangs.
 _SILENCE_SECONDS = 60.0
+# Of what engines say, in characters: a choice.
+_LONGEST = 300
 # What engines raise where a worker is gone, by name: none of them need be installed.
 _LOST = ("KilledWorker", "UncompletedJobError", "CommClosedError")
 
@@ -101,11 +104,10 @@ def batch(
     out = Path(out)
     found = read_objects(objects)
     limit_s = None if limit is None else 60 * limit
-    plan = planned_batch(found, out, settings, overwrite=overwrite, limit_s=limit_s)
+    plan = planned_batch(found, out, settings, overwrite=overwrite, limit_s=limit_s, mem_gb=mem_gb)
     threads = cpus_per_task or 1
     if executor is None:
-        needed = [mem_gb or gigabytes for gigabytes in plan.gigabytes]
-        jobs = jobs or runs_at_once(needed)
+        jobs = jobs or runs_at_once([task.mem_gb for task in plan.tasks])
         threads = cpus_per_task or max(1, usable_cores() // jobs)
     tasks = [replace(task, threads=threads) for task in plan.tasks]
     with locked(out.resolve(), out):
@@ -205,7 +207,7 @@ class _Driver:
         read = task.log.stat().st_size if task.log.exists() else 0
         try:
             future = self._executor.submit(carry_out, task)
-        except (RuntimeError, OSError) as error:  # a broken executor, or one that was closed
+        except Exception as error:  # a broken executor, or one that was closed
             told = f"not begun: the engine takes no more work ({_reason(error)})."
             for other, tried in ((task, number), *self._waiting):
                 lost = Outcome(name=other.name, status="waiting", message=told, tries=tried - 1)
@@ -271,5 +273,5 @@ def _on(one: _Try) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    text = " ".join(str(error).split()).rstrip(".")
+    text = shorten(str(error), _LONGEST, placeholder=" ...").rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -5,8 +5,7 @@ import html
 import io
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from urllib.parse import quote
+from pathlib import Path, PurePosixPath
 
 from pimper_torch.batches.objects import CSV, HTML
 from pimper_torch.batches.task import Outcome
@@ -77,7 +76,8 @@ def _picture(row: Mapping[str, object], out: Path) -> str:
     if not picture.exists():
         return "<td></td>"
     target, source = (
-        quote(f"{name}/{path.name}") for path in (report if report.exists() else picture, picture)
+        PurePosixPath("/", name, path.name).as_uri().removeprefix("file:///")
+        for path in (report if report.exists() else picture, picture)
     )
     return f'<td><a href="{target}"><img loading="lazy" src="{source}" alt=""></a></td>'
 

@@ -3,10 +3,9 @@
 A worker starts ``pimper reconstruct`` as a process of its own, so that a run that is killed, hangs
 or takes all memory leaves the worker unharmed. All that driver and workers share is the folder of
 the batch. There, in ``.stages``, an object has a lease with the token of the newest try, which any
-other try ends at; a log with the events of its runs; and a seal, once its result is whole.
+other try ends at; a log with the events of its runs; and the key of what its result is made from.
 """
 
-import hashlib
 import json
 import os
 import subprocess
@@ -23,7 +22,6 @@ from filelock import FileLock, Timeout
 
 import pimper_torch
 from pimper_torch.cli.deaths import what_killed
-from pimper_torch.outputs.files import file_written_whole
 from pimper_torch.outputs.marker import MARKER, STAGES
 from pimper_torch.outputs.stages import HOLDER, LOCK
 
@@ -57,6 +55,7 @@ class Task:
         out: Folder of the object's result.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
+        mem_gb: Memory that a run takes.
         threads: Of a run.
         token: Of this try.
         avoid: Workers on which earlier tries were lost.
@@ -67,6 +66,7 @@ class Task:
     out: Path
     key: str
     limit_s: float
+    mem_gb: float
     threads: int
     token: str = ""
     avoid: tuple[str, ...] = ()
@@ -123,12 +123,15 @@ def carry_out(task: Task, place: str = "") -> Outcome:
 
 
 def is_whole(task: Task) -> bool:
-    """Return whether the object's result is there, of the same arguments and files."""
-    try:
-        sealed = json.loads(task.beside(".seal").read_text(encoding="utf-8"))
-        return bool(sealed == [task.key, _list_of(task.out)])
-    except (OSError, ValueError):
-        return False
+    """Return whether the object's result is there, of the same arguments and files.
+
+    It is newer than the key that was written before its run, whoever saw how that ended.
+    """
+    key = task.beside(".key")
+    with suppress(OSError):
+        written = (task.out / MARKER).stat().st_mtime_ns >= key.stat().st_mtime_ns
+        return written and key.read_text(encoding="utf-8") == task.key
+    return False
 
 
 def events(file: IO[bytes]) -> Iterator[dict[str, Any]]:
@@ -149,6 +152,9 @@ def _result(task: Task, place: str, latest: float) -> tuple[Status, str]:
             return "lost", refused
         if is_whole(task):
             return "kept", ""
+        key = task.beside(".key")
+        if not (key.exists() and key.read_text(encoding="utf-8") == task.key):
+            key.write_text(task.key, encoding="utf-8")
         child = _start(task, log)
         _note(log, event="try", place=place, host=node(), process=child.pid)
         try:
@@ -160,8 +166,6 @@ def _result(task: Task, place: str, latest: float) -> tuple[Status, str]:
         log.seek(begun)
         errors = [one for one in events(log) if one["event"] == "error"]
     if child.returncode == 0:
-        with file_written_whole(task.beside(".seal")) as fresh:
-            fresh.write_text(json.dumps([task.key, _list_of(task.out)]), encoding="utf-8")
         return "ended", ""
     if child.returncode not in (1, 2) or not errors:
         return "lost", what_killed(child.returncode)
@@ -258,7 +262,3 @@ def _is_ours(lock: Path, log: IO[bytes]) -> bool:
 def _note(log: IO[bytes], **event: object) -> None:
     log.write(json.dumps(event).encode() + b"\n")
     log.flush()
-
-
-def _list_of(out: Path) -> str:
-    return hashlib.sha256((out / MARKER).read_bytes()).hexdigest()
