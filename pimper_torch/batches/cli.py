@@ -16,6 +16,7 @@ from pimper_torch.batches.on_slurm import SlurmExecutor, require_slurm
 from pimper_torch.batches.run import TRIES, batch
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
+from pimper_torch.cli.stopping import Stopped, exit_code
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.outputs.marker import STAGES
@@ -76,14 +77,14 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
                 listener=shown,
             )
     except KeyboardInterrupt as error:
-        error.add_note(f"Objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}")
-        raise
+        left = f"objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}"
+        raise Stopped(exit_code(error) - 128, left) from error
     output.remark(f"{totals(outcomes)}; {job.out / HTML} shows them, {job.out / CSV} lists them.")
-    left = [one for one in outcomes if one.status not in ("ended", "kept")]
-    if left:
-        first = left[0]
+    lost = [one for one in outcomes if one.status not in ("ended", "kept")]
+    if lost:
+        first = lost[0]
         raise ReconstructionError(
-            f"{len(left)} of {len(outcomes)} objects have no result, as {first.name}: "
+            f"{len(lost)} of {len(outcomes)} objects have no result, as {first.name}: "
             f"{first.message} {job.out / CSV} lists all with their reasons. {_GOES_ON}"
         )
     paths = {"folder": job.out, CSV: job.out / CSV, HTML: job.out / HTML}

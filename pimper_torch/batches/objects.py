@@ -32,7 +32,7 @@ class Object:
     """
 
     name: str
-    photos: Path
+    photos: Path | str
     settings: tuple[str, ...] = ()
     where: str = ""
 

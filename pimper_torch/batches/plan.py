@@ -68,7 +68,7 @@ def planned_batch(
         def one(thing: Object) -> Task | Outcome:
             words = (*settings, *thing.settings)
             words += ("--overwrite",) if overwrite and "--overwrite" not in words else ()
-            photos, target = thing.photos.absolute(), out / thing.name
+            photos, target = Path(thing.photos).absolute(), out / thing.name
             try:
                 job = replace(read(words), photos=photos, out=target)
                 seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))

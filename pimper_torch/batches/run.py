@@ -119,8 +119,7 @@ def batch(
         try:
             driver.drive(tasks)
         finally:
-            with suppress(OSError):  # as of the next command
-                driver.stop(owned=executor is None)
+            driver.stop(owned=executor is None)
             order = {one.name: place for place, one in enumerate(found)}
             outcomes = sorted(driver.outcomes, key=lambda one: order[one.name])
             write_table(outcomes, out, {one.name: one.photos for one in found})
@@ -152,12 +151,14 @@ class _Driver:
     ) -> None:
         self._executor, self._at_once, self._tries = executor, at_once, tries
         self._listener = listener
+        self._tasks: Sequence[Task] = ()
         self._waiting: deque[tuple[Task, int]] = deque()
         self._running: dict[Future[Outcome], _Try] = {}
         self.outcomes: list[Outcome] = []
 
     def drive(self, tasks: Sequence[Task]) -> None:
         """Carry out tasks until each has ended."""
+        self._tasks = tasks
         self._waiting.extend((task, 1) for task in tasks)
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._at_once:
@@ -190,8 +191,10 @@ class _Driver:
         Args:
             owned: Whether the executor is ours, and ends, too.
         """
-        for future, one in self._running.items():
-            one.task.beside(".lease").unlink(missing_ok=True)
+        for task in self._tasks:  # also of tries that were given up
+            with suppress(OSError):
+                task.beside(".lease").unlink(missing_ok=True)
+        for future in self._running:
             future.cancel()
         if owned:
             self._executor.shutdown(cancel_futures=True)
@@ -233,9 +236,6 @@ class _Driver:
         if again:
             avoid = (*one.task.avoid, outcome.place)
             self._waiting.append((replace(one.task, avoid=avoid), one.number + 1))
-        else:
-            with suppress(OSError):
-                one.task.beside(".lease").unlink(missing_ok=True)
         self.settle(replace(outcome, stage=one.stage, tries=one.number), again)
 
 
@@ -257,6 +257,8 @@ def _outcome(future: Future[Outcome], one: _Try) -> Outcome:
 
 
 def _gone(one: _Try, error: BaseException) -> Outcome:
+    if one.began is None:
+        return _lost(one, f"the engine lost it before it began ({_reason(error)}).")
     during = f" during {one.stage}" if one.stage else ""
     return _lost(one, f"the worker{_on(one)} was lost{during} ({_reason(error)}).")
 

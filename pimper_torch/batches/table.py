@@ -30,7 +30,7 @@ img {{ width: 240px }} .failed, .lost {{ color: #b00 }}
 
 
 def rows_of(
-    outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path]
+    outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]
 ) -> list[dict[str, object]]:
     """Return a row an object, by its columns: how it ended, and figures of its result.
 
@@ -50,7 +50,7 @@ def rows_of(
     return rows
 
 
-def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path]) -> None:
+def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
     """Write ``batch.csv`` and ``batch.html``, with pictures that link to the objects' reports."""
     rows = rows_of(outcomes, out, photos)
     text = io.StringIO(newline="")

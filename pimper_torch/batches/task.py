@@ -20,7 +20,6 @@ from typing import IO, Any, Literal
 
 from filelock import FileLock, Timeout
 
-import pimper_torch
 from pimper_torch.cli.deaths import what_killed
 from pimper_torch.outputs.marker import MARKER, STAGES
 from pimper_torch.outputs.stages import HOLDER, LOCK
@@ -174,7 +173,7 @@ def _result(task: Task, place: str, latest: float) -> tuple[Status, str]:
 
 
 def _start(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
-    path = [str(Path(pimper_torch.__path__[0]).parent), os.environ.get("PYTHONPATH", "")]
+    path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
         [sys.executable, "-c", _CHILD, str(os.getpid()), *task.arguments],
         stdin=subprocess.DEVNULL,

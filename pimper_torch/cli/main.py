@@ -225,8 +225,8 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
     if isinstance(error, KeyboardInterrupt):
-        code = exit_code(error)
-        output.error("Interrupted", f"interrupted; no result was written.{notes}", code)
+        code, left = exit_code(error), getattr(error, "left", "no result was written.")
+        output.error("Interrupted", f"interrupted; {left}{notes}", code)
         return code
     expected = str(error) if isinstance(error, PimperError) else _of_the_world(error)
     if expected is not None:

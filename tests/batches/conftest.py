@@ -5,32 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from stand_ins import CHILD
 
 from pimper_torch.batches import task
 from pimper_torch.batches.run import batch
-
-# Stands for `pimper`: runs the object's own program, which finds `out`, and `tries` before it.
-STAND_IN = """
-import json, os, signal, sys, time
-from pathlib import Path
-photos, out = Path(sys.argv[3]), Path(sys.argv[5])
-begun = out.parent / f"{out.name}.begun"
-tries = len(begun.read_text()) if begun.exists() else 0
-with begun.open("a") as file:
-    file.write("x")
-def event(event, **about):
-    print(json.dumps({"event": event, **about}), flush=True)
-def end():
-    (out / ".stages").mkdir(parents=True, exist_ok=True)
-    (out / "summary.json").write_text(json.dumps({"views": 8, "faces": 99, "seconds": 1.5}))
-    (out / ".pimper.json").write_text(out.name)
-def fail(kind, code, message="it is so."):
-    event("error", kind=kind, message=message, exit_code=code)
-    sys.exit(code)
-event("stage-begin", stage="read", seconds_left=12.0)
-program = photos / "program.txt"
-exec(program.read_text() if program.exists() else "end()")
-"""
 
 
 @dataclass
@@ -76,7 +54,7 @@ class World:
 @pytest.fixture
 def world(tmp_path, monkeypatch):
     assert sys.platform == "linux"
-    monkeypatch.setattr(task, "_CHILD", STAND_IN)
+    monkeypatch.setattr(task, "_CHILD", CHILD)
     monkeypatch.setattr(task, "_LOOK_SECONDS", 0.05)
     monkeypatch.setattr(task, "_PATIENCE_SECONDS", 0.3)
     return World(tmp_path)

@@ -1,11 +1,14 @@
 """Real engines on this machine: workers of Dask, jobs of submitit."""
 
+import os
 import time
 from dataclasses import replace
+from platform import node
 
 import pytest
+from stand_ins import children_stand_in, write_slurm
 
-from pimper_torch.batches import on_dask, on_slurm, task
+from pimper_torch.batches import on_dask, on_slurm
 from pimper_torch.batches.objects import read_objects
 from pimper_torch.batches.on_dask import dask_workers
 from pimper_torch.batches.on_slurm import SlurmExecutor
@@ -60,44 +63,17 @@ def test_an_object_is_not_tried_again_where_it_was_lost(world, cluster):
         assert first != second
 
 
-def test_a_scheduler_that_is_lost_ends_the_batch_with_what_is_to_be_done(world, monkeypatch):
-    import dask
-    from distributed import LocalCluster
-
-    world.add("ball", "time.sleep(600)")
-    world.add("cup", "time.sleep(600)")
-    with (
-        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
-        LocalCluster(
-            n_workers=1, processes=False, dashboard_address=None, protocol="tcp"
-        ) as cluster,
-        dask_workers(cluster.scheduler_address) as executor,
-    ):
-
-        class Hears:
-            def progressed(self, name, event):
-                if event["event"] == "try" and name == "ball":
-                    cluster.close()
-
-            def settled(self, outcome, again):
-                world.settled(outcome, again)
-
-        world.progressed = Hears().progressed
-        found = world.batch(executor=executor, tries=2)
-    assert {one.status for one in found.values()} <= {"lost", "waiting"}
-    assert all("engine" in one.message or "lost" in one.message for one in found.values())
-
-
-def test_objects_end_as_jobs_of_submitit(world, tmp_path, monkeypatch):
+@pytest.mark.parametrize("cluster", [pytest.param("local", marks=pytest.mark.slow), "slurm"])
+def test_objects_end_as_jobs_of_submitit(world, tmp_path, monkeypatch, cluster):
     # Its jobs are Python processes of their own, which know nothing of this one.
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    (tmp_path / "sitecustomize.py").write_text(
-        f"from pimper_torch.batches import task\ntask._CHILD = {task._CHILD!r}\n"
-    )
+    monkeypatch.setenv("PYTHONPATH", children_stand_in(tmp_path))
+    write_slurm(tmp_path / "bin")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
     world.add("ball")
     world.add("bad", "fail('InputError', 2)")
-    world.add("cup", "if tries < 1: os.kill(os.getppid(), signal.SIGKILL)\nend()")
-    with SlurmExecutor(tmp_path / "jobs", "part", cluster="local") as executor:
+    kills = "if tries < 1: os.kill(os.getppid(), signal.SIGKILL); sys.exit(1)\nend()"
+    world.add("cup", kills if cluster == "local" else "if tries < 1: os.abort()\nend()")
+    with SlurmExecutor(tmp_path / "jobs", "part", cluster=cluster) as executor:
         found = world.batch(executor=executor)
     assert {name: one.status for name, one in found.items()} == {
         "bad": "failed",
@@ -106,6 +82,7 @@ def test_objects_end_as_jobs_of_submitit(world, tmp_path, monkeypatch):
     }
     assert found["cup"].tries == 2
     assert world.begun("bad") == 1
+    assert found["ball"].place == ("node7" if cluster == "slurm" else node())
 
 
 def test_jobs_of_submitit_are_cancelled(world, tmp_path):
