@@ -14,6 +14,7 @@ from pimper_torch.batches.objects import CSV, HTML
 from pimper_torch.batches.on_dask import dask_workers, require_dask
 from pimper_torch.batches.on_slurm import SlurmExecutor, require_slurm
 from pimper_torch.batches.run import TRIES, batch
+from pimper_torch.batches.table import terminal
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.stopping import Stopped, exit_code
@@ -79,7 +80,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     except KeyboardInterrupt as error:
         left = f"objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}"
         raise Stopped(exit_code(error) - 128, left) from error
-    output.remark(f"{totals(outcomes)}; {job.out / HTML} shows them, {job.out / CSV} lists them.")
+    output.remark(f"{terminal(job.out)}\n{totals(outcomes)}; {job.out / HTML} shows them.")
     lost = [one for one in outcomes if one.status not in ("ended", "kept")]
     if lost:
         first = lost[0]

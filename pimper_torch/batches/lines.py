@@ -68,8 +68,8 @@ class Lines:
         self._console = Console(stderr=True, quiet=not shown)
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}"),
-            TextColumn("[dim]{task.fields[about]}"),
+            TextColumn("{task.description}", markup=False),  # whose names may have brackets
+            TextColumn("{task.fields[about]}", style="dim", markup=False),
             TimeElapsedColumn(),
             console=self._console,
             disable=not self._console.is_terminal,

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 from pimper_torch.batches.objects import Object, read_objects
 from pimper_torch.batches.plan import planned_batch, runs_at_once
-from pimper_torch.batches.table import SIGNS, write_table
+from pimper_torch.batches.table import SIGNS, rows_of, write_table
 from pimper_torch.batches.task import Outcome, Task, carry_out, events
 from pimper_torch.config import require
 from pimper_torch.cores import usable_cores
@@ -122,7 +122,7 @@ def batch(
             driver.stop(owned=executor is None)
             order = {one.name: place for place, one in enumerate(found)}
             outcomes = sorted(driver.outcomes, key=lambda one: order[one.name])
-            write_table(outcomes, out, {one.name: one.photos for one in found})
+            write_table(rows_of(outcomes, out, {one.name: one.photos for one in found}), out)
     return tuple(outcomes)
 
 

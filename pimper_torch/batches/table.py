@@ -50,18 +50,34 @@ def rows_of(
     return rows
 
 
-def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
+def terminal(out: Path) -> str:
+    """Read a batch's table, and return it without messages and paths, in columns."""
+    with (out / CSV).open(encoding="utf-8", newline="") as file:
+        rows = [*csv.DictReader(file)]
+    names = ("name", "status", "tries", "seconds", "registered", "faces")
+    cells = [names, *([row[name] for name in names] for row in rows)]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
+    lines = (
+        "  ".join(
+            cell.ljust(width) if column < 2 else cell.rjust(width)  # numbers to the right
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in cells
+    )
+    return "\n".join(lines)
+
+
+def write_table(rows: Sequence[Mapping[str, object]], out: Path) -> None:
     """Write ``batch.csv`` and ``batch.html``, with pictures that link to the objects' reports."""
-    rows = rows_of(outcomes, out, photos)
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, _COLUMNS, restval="")
     table.writeheader()
     table.writerows(rows)
-    ended = sum(one.status in ("ended", "kept") for one in outcomes)
+    ended = sum(row["status"] in ("ended", "kept") for row in rows)
     head = "".join(f"<th>{name.replace('_', ' ')}</th>" for name in ("", *_COLUMNS))
     body = "\n".join(f"<tr>{_picture(row, out)}{_cells(row)}</tr>" for row in rows)
     page = _PAGE.format(
-        title=f"{ended} of {len(outcomes)} objects",
+        title=f"{ended} of {len(rows)} objects",
         sign=SIGNS[HTML],
         rows=f"<tr>{head}</tr>\n{body}",
     )
