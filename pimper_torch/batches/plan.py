@@ -16,6 +16,7 @@ from pimper_torch.cli.light import absent
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import ConfigError, PimperError
 
+_REPLACES = "--overwrite"
 # Of photographs that Pillow cannot read, as camera raw: a choice.
 _MEGAPIXELS = 24.0
 # Share of the free memory that runs are given: a choice, for what else runs.
@@ -66,8 +67,9 @@ def planned_batch(
         read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
 
         def one(thing: Object) -> Task | Outcome:
-            words = (*settings, *thing.settings)
-            words += ("--overwrite",) if overwrite and "--overwrite" not in words else ()
+            given = (*settings, *thing.settings)
+            own = tuple(word for word in given if word != _REPLACES)
+            words = (*own, *((_REPLACES,) if overwrite or own != given else ()))
             photos, target = Path(thing.photos).absolute(), out / thing.name
             try:
                 job = replace(read(words), photos=photos, out=target)
@@ -76,7 +78,7 @@ def planned_batch(
                     name=thing.name,
                     arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
                     out=target,
-                    key=_key(words, inputs_of(job).values()),
+                    key=_key(own, inputs_of(job).values()),
                     limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
                     mem_gb=mem_gb or gigabytes,
                     threads=1,

@@ -102,7 +102,11 @@ def batch(
         cpus_per_task is None or cpus_per_task >= 1, "cpus_per_task", cpus_per_task, "1 or more"
     )
     out = Path(out)
-    found = read_objects(objects)
+    # Results of an earlier batch into a folder of the list are none of its objects.
+    own = out.resolve()
+    found = [
+        one for one in read_objects(objects) if not Path(one.photos).resolve().is_relative_to(own)
+    ]
     limit_s = None if limit is None else 60 * limit
     plan = planned_batch(found, out, settings, overwrite=overwrite, limit_s=limit_s, mem_gb=mem_gb)
     threads = cpus_per_task or 1
@@ -110,7 +114,7 @@ def batch(
         jobs = jobs or runs_at_once([task.mem_gb for task in plan.tasks])
         threads = cpus_per_task or max(1, usable_cores() // jobs)
     tasks = [replace(task, threads=threads) for task in plan.tasks]
-    with locked(out.resolve(), out):
+    with locked(own, out):
         for name, sign in SIGNS.items():
             prepare_file(out / name, overwrite=True, sign=sign)
         driver = _Driver(executor or ThreadPoolExecutor(jobs), jobs or AT_ONCE, tries, listener)

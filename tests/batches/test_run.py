@@ -103,11 +103,22 @@ def test_what_is_whole_is_passed_over_and_what_changed_is_refused(world):
     assert world.statuses() == {"ball": "ended", "cup": "failed"}
     assert world.statuses() == {"ball": "kept", "cup": "failed"}
     assert (world.begun("ball"), world.begun("cup")) == (1, 2)
+    assert world.statuses(overwrite=True) == {"ball": "kept", "cup": "failed"}
+    assert world.statuses(settings=["--overwrite"]) == {"ball": "kept", "cup": "ended"}
     (photos / "0.png").write_bytes((photos / "0.png").read_bytes() + b"more")
     found = world.batch()
     assert found["ball"].status == "failed"
     assert "--overwrite" in found["ball"].message
     assert world.begun("ball") == 1
+    assert world.statuses(overwrite=True) == {"ball": "ended", "cup": "kept"}
+
+
+def test_results_inside_the_list_are_no_objects(world):
+    world.add("ball")
+    out = world.folder / "scans" / "results"
+    for status in ("ended", "kept"):
+        (one,) = run.batch(world.folder / "scans", out)
+        assert (one.name, one.status) == ("ball", status)
 
 
 @pytest.mark.parametrize("change", ["settings", "photographs", "result"])
