@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pimper_torch.batches.objects import Object, read_objects
 from pimper_torch.batches.plan import planned_batch, runs_at_once
@@ -42,6 +42,7 @@ _LONGEST = 300
 _LOST = ("KilledWorker", "UncompletedJobError", "CommClosedError")
 
 
+@runtime_checkable
 class Listener(Protocol):
     """Hears how the objects of a batch come on."""
 

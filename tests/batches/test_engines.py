@@ -120,7 +120,9 @@ def test_a_job_asks_for_what_a_task_needs(world, tmp_path):
         executor._executor.submit = lambda *given: None
         executor._executor.update_parameters = lambda **given: asked.append(given)
         for avoid in (("", "node3", "node1", "node3"), ()):
-            executor.submit(carry_out, replace(one, limit_s=90, mem_gb=1.2, threads=3, avoid=avoid))
+            executor.submit(
+                carry_out, replace(one, limit_s=90.0, mem_gb=1.2, threads=3, avoid=avoid)
+            )
         executor._jobs.clear()
     first, second = asked
     assert first["slurm_exclude"] == "node3,node1"

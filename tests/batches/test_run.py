@@ -291,7 +291,8 @@ def test_two_batches_do_not_write_to_one_folder(world):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"jobs": 0}, {"tries": 0}, {"time_limit_min": 0}, {"mem_gb": 0}, {"cpus_per_task": 0}]
+    "wrong",
+    [{"jobs": 0}, {"tries": 0}, {"time_limit_min": 0.0}, {"mem_gb": 0.0}, {"cpus_per_task": 0}],
 )
 def test_impossible_numbers_are_refused(world, wrong):
     world.add("ball")
