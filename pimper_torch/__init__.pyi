@@ -1,5 +1,8 @@
 # Public names, which are imported when they are asked for (`__init__.py`).
 __all__: list[str]
+from .batches.objects import Object as Object
+from .batches.run import batch as batch
+from .batches.task import Outcome as Outcome
 from .chains.chain import Chain as Chain
 from .chains.chain import Step as Step
 from .chains.coarse_to_fine import CoarseToFine as CoarseToFine

@@ -207,7 +207,11 @@ class _OnceLoader(yaml.SafeLoader):
     Aliases are refused, too: nine lines of them can stand for more values than memory holds.
     """
 
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+    def compose_node(  # stubs know of numbers alone, and an index may be a node, or nothing
+        self,
+        parent: yaml.Node | None,
+        index: typing.Any,  # noqa: ANN401
+    ) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.composer.ComposerError(
                 problem="aliases (`*name`) are not read; write the value out",

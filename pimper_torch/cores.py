@@ -11,9 +11,10 @@ _QUOTAS = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))
 
 
 def usable_cores() -> int:
-    """Return the number of cores that affinity and the CPU quota of a container leave, at least 1.
+    """Return the number of cores that a process may use, at least 1.
 
-    A quota of a core and a half is two cores.
+    They are those that affinity, the CPU quota of a container and ``OMP_NUM_THREADS`` leave. A
+    quota of a core and a half is two cores.
     """
     cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):  # Linux
@@ -24,4 +25,6 @@ def usable_cores() -> int:
             quota, period = map(int, words)
             if quota > 0 and period > 0:
                 cores = min(cores, math.ceil(quota / period))
+    with suppress(ValueError):  # several levels, or nothing
+        cores = min(cores, max(1, int(os.environ.get("OMP_NUM_THREADS", ""))))
     return cores

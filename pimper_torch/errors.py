@@ -29,6 +29,10 @@ class ReconstructionError(PimperError):
     """Structure from motion, or a stage after it, found too little to go on."""
 
 
+class OutOfMemoryError(ReconstructionError):
+    """Memory that did not suffice, for the smallest parts either."""
+
+
 class NumericalError(PimperError):
     """Equations that the data leave open or contradict."""
 

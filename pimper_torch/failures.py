@@ -15,7 +15,13 @@ from typing import Literal, TypeVar
 import numpy as np
 import torch
 
-from pimper_torch.errors import InputError, NumericalError, ReconstructionError, caution
+from pimper_torch.errors import (
+    InputError,
+    NumericalError,
+    OutOfMemoryError,
+    ReconstructionError,
+    caution,
+)
 from pimper_torch.ledger import Entry, collected
 from pimper_torch.records.failure import Failure
 from pimper_torch.records.record import Record
@@ -52,7 +58,7 @@ def collecting(
         The entries so far, for :func:`warn_of` at the end.
 
     Raises:
-        ReconstructionError: In place of an error of memory.
+        OutOfMemoryError: In place of an error of memory.
     """
     entries = [] if entries is None else entries
     policy, token = _on_failure.set(on_failure), collected.set(entries)
@@ -62,7 +68,7 @@ def collecting(
         collected.set(None)
         warn_of(entries)
         if out_of_memory(error):
-            raise ReconstructionError(
+            raise OutOfMemoryError(
                 f"Memory did not suffice, for the smallest parts either: {reason_of(error)}. "
                 "Shrink the photographs (`--max-size-px`), take fewer samples "
                 "(`decompose.samples_per_pixel`), or close other programs."

@@ -63,6 +63,7 @@ ROOMS = [
     "doctor",
     "video",
     "cli",
+    "batches",
     "single_view",
     "evidence",
     "__main__",
@@ -79,10 +80,12 @@ SOLE_IMPORTERS = {
     "av": {"video/read.py"},
     "numba": {"kernels/compile.py"},
     "yaml": {"config.py"},
-    "tyro": {"cli/", "evidence/cli/", "single_view/cli/"},
+    "tyro": {"cli/", "batches/", "evidence/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
     "onnxruntime": {"priors/network.py"},
+    "distributed": {"batches/on_dask.py"},
+    "submitit": {"batches/on_slurm.py"},
 }
 
 # Where a distribution's module has another name.

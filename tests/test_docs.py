@@ -14,9 +14,11 @@ import pytest
 import torch
 import tyro
 from photographs import save_photographs
+from stand_ins import CHILD
 from torch.nn.functional import normalize
 
 import pimper_torch
+from pimper_torch.batches import task
 from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
@@ -218,6 +220,14 @@ def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     return {"pt": pimper_torch}
 
 
+def two_objects(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, _ = photographed()
+    for name in ("cup", "jar"):
+        save_photographs(scene.views, Path("scans") / name)
+    monkeypatch.setattr(task, "_CHILD", CHILD)  # tests/cli/test_options.py runs it in earnest
+    return {}
+
+
 # What each block of a page takes for granted, by page and number.
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
@@ -228,6 +238,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,
     ("docs/result.md", 0): a_result,
+    ("docs/many.md", 0): two_objects,
     ("docs/conventions.md", 0): nothing,
     ("docs/priors.md", 0): photographs_and_maps,
     ("docs/priors.md", 1): photographs_and_maps,

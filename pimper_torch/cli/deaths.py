@@ -23,9 +23,8 @@ def tell_death(ended: int, said: str) -> int:
         ended: The exit code of a process that told nothing; less than 0, of which signal it died.
         said: What native libraries said before.
     """
-    code = 128 - ended if ended < 0 else ended
-    name = _name(ended)
-    text = f"{_what(name)}{limit()} {_LESS}{_kept(sys.argv[1:])}"
+    code, name = 128 - ended if ended < 0 else ended, _name(ended)
+    text = f"{what_killed(ended)}{limit()} {_LESS}{_kept(sys.argv[1:])}"
     if name != "SIGKILL":
         report = write_report(f"{name}\n{said}")
         if report is not None:
@@ -41,7 +40,9 @@ def _name(ended: int) -> str:
     return signal.Signals(-ended).name if known else f"signal {-ended}"
 
 
-def _what(name: str) -> str:
+def what_killed(ended: int) -> str:
+    """Report how a process ended that told nothing."""
+    name = _name(ended)
     if name == "SIGKILL":
         return (
             "the run was killed by the system or by somebody (SIGKILL), most likely because memory "

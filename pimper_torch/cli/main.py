@@ -33,6 +33,7 @@ from pimper_torch.outputs.names import require_name
 
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]
+       pimper batch LIST -o OUT [options] [-- options of reconstruct]
        pimper doctor [PHOTOS] [options]
        pimper demo [-o OUT] [options]
        pimper config [NAME] [options]
@@ -52,6 +53,7 @@ Photographs from many viewpoints under many unknown lights, to a dense surface w
 albedo and light.
 
   reconstruct   a folder of photographs
+  batch         many objects, on this machine or on an engine
   doctor        what is installed here, and what photographs are worth, before a run
   demo          the photographs of a skull that come with the package
   config        the settings of a preset and what they mean, or one of them
@@ -75,6 +77,7 @@ Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpect
 # `checked` with SystemExit; it and `run` refuse with PimperError before anything is written.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
+    "batch": "pimper_torch.batches.cli",
     "doctor": "pimper_torch.cli.doctor",
     "demo": "pimper_torch.cli.run",
     "config": "pimper_torch.cli.settings",
@@ -222,11 +225,12 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
     if isinstance(error, KeyboardInterrupt):
-        code = exit_code(error)
-        output.error("Interrupted", f"interrupted; no result was written.{notes}", code)
+        code, left = exit_code(error), getattr(error, "left", "no result was written.")
+        output.error("Interrupted", f"interrupted; {left}{notes}", code)
         return code
     expected = str(error) if isinstance(error, PimperError) else _of_the_world(error)
     if expected is not None:
+        kind = "MemoryError" if "can't allocate memory" in str(error) else kind
         output.error(kind, expected + notes, _BAD_INPUT)
         return _BAD_INPUT
     report = write_report(error)

@@ -13,7 +13,7 @@ from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.lengths import CameraDistances, Markers, Places, ScaleBars
-from pimper_torch.cli.option import options_of
+from pimper_torch.cli.option import Option, options_of
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import presets, require
 from pimper_torch.errors import ConfigError, InputError
@@ -226,6 +226,11 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
     return reconstruct if name == "reconstruct" else demo
 
 
+def every_option(command: str) -> list[Option]:
+    """List the options of a command, of each preset."""
+    return [one for name in presets() for one in options_of(_command(command, load_config(name)))]
+
+
 def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
     """Refuse an option that this preset lacks and others have."""
 
@@ -246,10 +251,14 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments, and check what can be checked without reading photographs."""
-    job = parse(command, arguments)
+    return check(parse(command, arguments))
+
+
+def check(job: Job) -> Job:
+    """Check of a run what can be checked without reading photographs, and return it."""
     if job.common.view:
         require_viser()
-    require_apart(job.out, _inputs(job))
+    require_apart(job.out, inputs_of(job))
     prepare_output(job.out, "result", job.common.overwrite)
     for folder in (job.photos, job.inputs.masks):
         if folder is not None:
@@ -272,7 +281,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     return job
 
 
-def _inputs(job: Job) -> dict[str, Path | None]:
+def inputs_of(job: Job) -> dict[str, Path | None]:
     """Return what a run reads, by what it is called."""
     return {
         "PHOTOS": job.photos,

@@ -24,11 +24,12 @@ class Stopped(KeyboardInterrupt):
 
     Attributes:
         number: Of the signal.
+        left: What is there now, for the message.
     """
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, left: str = "no result was written.") -> None:
         super().__init__(signal.Signals(number).name)
-        self.number = number
+        self.number, self.left = number, left
 
 
 def exit_code(error: BaseException) -> int:

@@ -94,7 +94,7 @@ class _Watch:
 
 def _work(watcher: int, said: int | None, tells: int) -> int:
     """Carry out the command, and end when the watcher does."""
-    _die_with(watcher)
+    die_with(watcher)
     heed(leave_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     if said is not None and "debug" not in sys.argv and "--log-level=debug" not in sys.argv:
@@ -111,7 +111,7 @@ def _work(watcher: int, said: int | None, tells: int) -> int:
     return code
 
 
-def _die_with(watcher: int) -> None:
+def die_with(watcher: int) -> None:
     """End this process when the watcher is killed, so that nobody works unwatched."""
     if sys.platform == "linux":
         import ctypes

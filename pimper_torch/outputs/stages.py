@@ -13,13 +13,12 @@ from platform import node
 from pimper_torch.errors import OutputError, caution
 from pimper_torch.outputs.marker import MARKER, STAGES
 
-LOCK, NEW = "lock", "new"
-"""Names in the folder of kept stages: its lock, and a result that is being written."""
+LOCK, NEW, HOLDER = "lock", "new", "holder.txt"
+"""Names in the folder of kept stages: its lock, a result that is being written, who holds it."""
 PREVIEW = "preview.png"
 """In the folder of kept stages, while a run is under way: its coarse surface."""
 
-_HOLDER = "holder.txt"
-_PASSING = (_HOLDER, PREVIEW, f"{PREVIEW}.new")
+_PASSING = (HOLDER, PREVIEW, f"{PREVIEW}.new")
 _UNLOCKED = "{}: its disk knows no locks; see that no other run writes there."
 _LOCKLESS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP)
 
@@ -29,7 +28,7 @@ def is_ours(stages: Path) -> bool:
     if stages.is_symlink() or not stages.is_dir():
         return False
     names = {path.name for path in stages.iterdir()}
-    return not names or bool(names & {LOCK, _HOLDER})
+    return not names or bool(names & {LOCK, HOLDER})
 
 
 def kept(target: Path) -> list[Path]:
@@ -68,7 +67,7 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
     except (Timeout, RuntimeError) as error:  # a RuntimeError where this thread holds it
         holder = "of which nothing is known"
         with suppress(OSError, ValueError):
-            holder = (stages / _HOLDER).read_text(encoding="utf-8")
+            holder = (stages / HOLDER).read_text(encoding="utf-8")
         raise OutputError(
             f"{shown}: another run writes there: {holder}. Wait until it has ended, or write "
             "elsewhere."
@@ -79,7 +78,7 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
         caution(_UNLOCKED.format(shown))
     try:
         with suppress(OSError):  # the disk is full
-            (stages / _HOLDER).write_text(_myself(), encoding="utf-8")
+            (stages / HOLDER).write_text(_myself(), encoding="utf-8")
         yield
     finally:
         with suppress(OSError):

@@ -2,13 +2,16 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pytest
+from stand_ins import CHILD, children_stand_in, write_slurm
 
+from pimper_torch.batches import task
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import load_config
 from pimper_torch.chains.published import PublishedConfig
@@ -34,6 +37,12 @@ RUNS = {
         "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
         "{photos} --out {out} --sparse {sparse} --max-size-px 48 --scales (0.5,) "
         "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25",
+    ],
+    "batch": [
+        "{table} --out {out} --jobs 1 --tries 2 --time-limit 30 --mem-gb 2 --cpus-per-task 1 "
+        "--overwrite",
+        "{table} -o {out} --timeout-min 30 --dask {scheduler}",
+        "{table} -o {out} --slurm part",
     ],
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
@@ -117,7 +126,12 @@ def world(tmp_path_factory, dtu):
     summary = {"photographs": str(scene / "photos"), "stages": [], "seconds": 1.0}
     summary |= {"peak_memory_mb": None, "left_out": [], "failures": []}
     (result / "summary.json").write_text(json.dumps(summary))
+    (folder / "list.csv").write_text(
+        f"photos,sparse,masks,preset,no-report\n{scene}/photos,{scene}/truth/sparse,{scene}/masks,"
+        "preset.yaml,yes\n"
+    )
     return {
+        "table": folder / "list.csv",
         "result": result,
         "ball": folder / "ball.ply",
         "told": folder / "told.ply",
@@ -134,6 +148,25 @@ def world(tmp_path_factory, dtu):
     }
 
 
+@pytest.fixture
+def engines(request, monkeypatch, tmp_path):
+    """Start engines where a line names one; runs are stand-ins there."""
+    line = request.getfixturevalue("line")
+    if "{scheduler}" in line:
+        from distributed import LocalCluster
+
+        monkeypatch.setattr(task, "_CHILD", CHILD)
+        options = {"processes": False, "dashboard_address": None, "protocol": "tcp"}
+        with LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", **options) as one:
+            yield {"scheduler": one.scheduler_address}
+        return
+    if "--slurm" in line:
+        write_slurm(tmp_path / "bin")
+        monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+        monkeypatch.setenv("PYTHONPATH", children_stand_in(tmp_path))
+    yield {}
+
+
 def run(command, line, world, tmp_path):
     return main([command, *line.format(out=tmp_path / "out", **world).split()])
 
@@ -143,8 +176,8 @@ def run(command, line, world, tmp_path):
     [(command, line) for command in RUNS if command != "demo" for line in RUNS[command]],
 )
 @pytest.mark.usefixtures("small_pictures", "ctrl_c")
-def test_every_option_of_a_command_runs(command, line, world, tmp_path):
-    assert run(command, line, world, tmp_path) == 0
+def test_every_option_of_a_command_runs(command, line, world, engines, tmp_path):
+    assert run(command, line, world | engines, tmp_path) == 0
 
 
 @pytest.mark.usefixtures("ctrl_c")

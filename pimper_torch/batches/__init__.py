@@ -1,0 +1,1 @@
+"""Many objects: whole reconstructions over any ``concurrent.futures.Executor``."""

@@ -1,0 +1,123 @@
+"""``pimper batch``: many objects, on this machine or on an engine."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pimper_torch.batches.lines import Events, Lines, totals
+from pimper_torch.batches.objects import CSV, HTML
+from pimper_torch.batches.on_dask import dask_workers, require_dask
+from pimper_torch.batches.on_slurm import SlurmExecutor, require_slurm
+from pimper_torch.batches.run import TRIES, batch
+from pimper_torch.batches.table import terminal
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.cli.stopping import Stopped, exit_code
+from pimper_torch.config import require
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.outputs.marker import STAGES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    """Reconstruct many objects, each as `pimper reconstruct` does.
+
+    What stands behind `--` are its options, for every object: `-- --preset fast`. An object whose
+    result is whole is passed over, others go on from what their stages kept.
+
+    Attributes:
+        list: Folder of folders of photographs, a pattern in quotes such as 'scans/*/photos', or a
+            CSV file with columns `photos`, `name` and options of `pimper reconstruct`.
+        out: Folder for a folder of each object, batch.csv and batch.html.
+        overwrite: Replace results of other settings or photographs.
+        jobs: Objects at once; as many as memory and cores allow unless given, 100 on an engine.
+        tries: How often an object is begun whose run is killed, hangs or lacks memory.
+        dask: Scheduler of dask.distributed whose workers do it, such as tcp://127.0.0.1:8786.
+        slurm: Partition of Slurm whose nodes do it, a job an object.
+        time_limit: Minutes of one try; ten times the estimate unless given, an hour at least.
+        mem_gb: Memory of a run; an estimate unless given.
+        cpus_per_task: Threads of a run; here the cores shared out, on an engine 1 unless given.
+    """
+
+    list: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LIST")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    overwrite: Flag = False
+    jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    tries: int = TRIES
+    dask: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = ""
+    slurm: Annotated[str, tyro.conf.arg(metavar="PARTITION")] = ""
+    time_limit: Annotated[float | None, tyro.conf.arg(aliases=["--timeout-min"], metavar="MIN")] = (
+        None
+    )
+    mem_gb: Annotated[float | None, tyro.conf.arg(metavar="GB")] = None
+    cpus_per_task: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``batch``: a line an object, and a table at the end."""
+    job, settings = checked(command, arguments)
+    shown = Events(output.event) if output.as_json else Lines(output.shows("info"))
+    try:
+        with _engine(job) as executor, shown:
+            outcomes = batch(
+                job.list,
+                job.out,
+                executor=executor,
+                settings=settings,
+                overwrite=job.overwrite,
+                jobs=job.jobs,
+                tries=job.tries,
+                time_limit_min=job.time_limit,
+                mem_gb=job.mem_gb,
+                cpus_per_task=job.cpus_per_task,
+                listener=shown,
+            )
+    except KeyboardInterrupt as error:
+        left = f"objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}"
+        raise Stopped(exit_code(error) - 128, left) from error
+    output.remark(f"{terminal(job.out)}\n{totals(outcomes)}; {job.out / HTML} shows them.")
+    lost = [one for one in outcomes if one.status not in ("ended", "kept")]
+    if lost:
+        first = lost[0]
+        raise ReconstructionError(
+            f"{len(lost)} of {len(outcomes)} objects have no result, as {first.name}: "
+            f"{first.message} {job.out / CSV} lists all with their reasons. {_GOES_ON}"
+        )
+    paths = {"folder": job.out, CSV: job.out / CSV, HTML: job.out / HTML}
+    output.result(paths, objects=len(outcomes))
+
+
+_GOES_ON = "The same command goes on: what stages finished is kept."
+
+
+@contextmanager
+def _engine(job: _Job) -> Iterator[Executor | None]:
+    """Return what carries out the objects; ``None`` is this machine."""
+    if job.dask:
+        with dask_workers(job.dask) as workers:
+            yield workers
+    elif job.slurm:
+        with SlurmExecutor(job.out / STAGES / "slurm", job.slurm) as jobs:
+            yield jobs
+    else:
+        yield None
+
+
+def checked(command: str, arguments: Sequence[str]) -> tuple[_Job, list[str]]:
+    """Read the arguments, and those behind ``--`` for every object."""
+    own, settings = [*arguments], []
+    if "--" in own:
+        place = own.index("--")
+        own, settings = own[:place], own[place + 1 :]
+    job = read_arguments(_Job, command, own)
+    require(not (job.dask and job.slurm), "--slurm", job.slurm, "none beside --dask")
+    if job.dask:
+        require_dask()
+    if job.slurm:
+        require_slurm()
+    return job, settings

@@ -1,0 +1,98 @@
+"""Jobs of Slurm by ``submitit``, an extra: its only importer."""
+
+import math
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from importlib.util import find_spec
+from pathlib import Path
+from platform import node
+from typing import TYPE_CHECKING
+
+from pimper_torch.batches.task import Outcome, Task
+from pimper_torch.errors import ConfigError
+
+if TYPE_CHECKING:
+    from submitit import Job
+
+# Between two looks at jobs: a choice; submitit asks Slurm once a minute.
+_LOOK_SECONDS = 1.0
+# Of a job beyond its task, which ends by itself at its limit.
+_MORE_MINUTES = 5
+
+
+class SlurmExecutor(Executor):
+    """A job for every task, which asks for its time, memory and threads.
+
+    Args:
+        folder: Where submitit keeps tasks, outcomes and logs; every node must reach it.
+        partition: Of Slurm; its own default where empty.
+        cluster: Of submitit: ``local`` runs jobs on this machine, to try it out.
+    """
+
+    def __init__(self, folder: Path | str, partition: str = "", cluster: str = "slurm") -> None:
+        require_slurm(cluster)
+        from submitit import AutoExecutor
+
+        self._executor = AutoExecutor(folder=folder, cluster=cluster)
+        self._partition = partition
+        self._jobs: dict[Future[Outcome], Job[Outcome]] = {}
+        self._lock, self._closed = threading.Lock(), threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def submit(  # type: ignore[override]
+        self, work: Callable[[Task, str], Outcome], task: Task
+    ) -> Future[Outcome]:
+        """Submit a job, not to nodes where the task was lost."""
+        self._executor.update_parameters(
+            name="pimper",
+            timeout_min=math.ceil(task.limit_s / 60) + _MORE_MINUTES,
+            mem_gb=math.ceil(task.mem_gb),
+            cpus_per_task=task.threads,
+            slurm_partition=self._partition or None,
+            slurm_exclude=",".join(dict.fromkeys(filter(None, task.avoid))) or None,
+        )
+        future: Future[Outcome] = Future()
+        job = self._executor.submit(_at_node, work, task)
+        with self._lock:
+            self._jobs[future] = job
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Look at jobs no more."""
+        self._closed.set()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(_LOOK_SECONDS):
+            with self._lock:
+                jobs = [*self._jobs.items()]
+            for future, job in jobs:
+                if not future.cancelled() and not job.done():
+                    continue
+                with self._lock:
+                    del self._jobs[future]
+                if not future.set_running_or_notify_cancel():
+                    job.cancel(check=False)
+                elif error := job.exception():
+                    future.set_exception(error)
+                else:
+                    future.set_result(job.result())
+
+
+def _at_node(work: Callable[[Task, str], Outcome], task: Task) -> Outcome:
+    return work(task, os.environ.get("SLURMD_NODENAME", node()))
+
+
+def require_slurm(cluster: str = "slurm") -> None:
+    """Refuse to go on without submitit, or without Slurm's commands."""
+    if find_spec("submitit") is None:
+        raise ConfigError(
+            "--slurm needs submitit, which is not installed: pip install 'pimper_torch[slurm]'."
+        )
+    if cluster == "slurm" and shutil.which("sbatch") is None:
+        raise ConfigError(
+            "--slurm needs Slurm's commands, and there is no `sbatch` here. Run it where jobs are "
+            "submitted, as on a login node."
+        )

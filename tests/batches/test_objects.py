@@ -1,0 +1,119 @@
+"""Which objects a folder, a pattern or a table has."""
+
+import pytest
+
+from pimper_torch.batches.objects import Object, read_objects
+from pimper_torch.batches.plan import planned_batch
+from pimper_torch.errors import ConfigError, InputError
+
+
+@pytest.fixture
+def scans(world):
+    for name in ("cup", "ball"):
+        world.add(name)
+    return world.folder / "scans"
+
+
+def names(given):
+    return [one.name for one in read_objects(given)]
+
+
+def test_a_folder_of_folders_has_an_object_each(scans):
+    (scans / ".hidden").mkdir()
+    (scans / "notes.txt").touch()
+    (scans / "jar" / "photos").mkdir(parents=True)
+    assert names(scans) == ["ball", "cup", "jar"]
+    assert [one.photos.name for one in read_objects(str(scans))] == ["ball", "cup", "photos"]
+    assert names([scans / "cup", str(scans / "jar"), Object(name="x", photos=scans)]) == [
+        *("cup", "jar", "x"),
+    ]
+
+
+def test_a_pattern_names_objects_by_what_it_leaves_open(tmp_path):
+    for path in ("may/cup/photos", "may/ball/photos", "june/cup/photos", "june/notes"):
+        (tmp_path / path).mkdir(parents=True)
+    (tmp_path / "july.txt").touch()
+    assert names(f"{tmp_path}/may/*/photos") == ["ball", "cup"]
+    assert names(f"{tmp_path}/*/*/photos") == ["june-cup", "may-ball", "may-cup"]
+    assert names(f"{tmp_path}/[jm]*") == ["june", "may"]
+
+
+def test_a_table_has_settings_in_every_row(scans, tmp_path):
+    (tmp_path / "mine.yaml").write_text("scales: [0.5]\n")
+    table = tmp_path / "list.csv"
+    table.write_text(
+        "photos,name,preset,masks,faces,watertight,scale-bar,reconstruct.shared-camera\n"
+        'scans/cup,mug,fast,scans/ball,500,yes,"0.png,1,2 1.png,3,4 25",no\n'
+        "scans/ball,,mine.yaml,,,no,,TRUE\n"
+    )
+    mug, ball = read_objects(table)
+    assert mug.settings == (
+        *("--preset", "fast", "--masks", str(scans / "ball"), "--faces", "500", "--watertight"),
+        *("--scale-bar", "0.png,1,2", "1.png,3,4", "25", "--reconstruct.no-shared-camera"),
+    )
+    assert ball.settings == (
+        *("--preset", str(tmp_path / "mine.yaml"), "--reconstruct.shared-camera"),
+    )
+    assert (mug.name, ball.name) == ("mug", "ball")
+    assert mug.photos == scans / "cup"
+    assert ball.where == f"{table}, row 3"
+    semicolons = tmp_path / "excel.csv"
+    semicolons.write_bytes("\ufeffphotos;faces\r\nscans/cup;500\r\n".encode())
+    assert read_objects(semicolons)[0].settings == ("--faces", "500")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("name,faces\nx,2\n", "columns are name, faces; needed: `photos`"),
+        ("photos,photos\nscans/cup,scans/cup\n", "each once"),
+        ("", "its columns are none"),
+        ("photos,view\nscans/cup,yes\n", "has the column view, which is the batch's own"),
+        ("photos,faces\nscans/cup,5,6\n", "row 2: has more cells than there are columns (2)"),
+        ("photos,faces\n,5\n", "row 2: `photos` is empty"),
+        ("photos,name\nscans/cup,../cup\n", "row 2: the name is '../cup'"),
+        ("photos,name\nscans/cup,.stages\n", "does not begin with a dot"),
+        ("photos,name\nscans/cup,batch.csv\n", "row 2: the name is 'batch.csv'"),
+        ("photos,name\nscans/cup,a\nscans/ball,A\n", "several objects have one name"),
+        ("photos\n", "no objects; needed: a folder of folders"),
+    ],
+)
+def test_a_table_that_cannot_be_followed_is_refused(scans, tmp_path, text, told):
+    table = tmp_path / "list.csv"
+    table.write_text(text)
+    with pytest.raises((InputError, ConfigError)) as refused:
+        read_objects(table)
+    assert told in str(refused.value)
+    assert str(table) in str(refused.value)
+
+
+@pytest.mark.parametrize("given", ["nowhere", "nowhere/*", "nowhere.csv"])
+def test_a_list_without_objects_is_refused(tmp_path, given):
+    with pytest.raises(InputError, match="nowhere"):
+        read_objects(tmp_path / given)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("photos,fases\nscans/cup,5\n", "--fases"),
+        ("photos,faces\nscans/cup,\nscans/ball,many\n", "row 3: --faces is 'many'"),
+        ("photos,sweep.steps\nscans/cup,-3\n", "row 2: "),
+        ("photos,watertight\nscans/cup,maybe\n", "row 2: "),
+    ],
+)
+def test_a_wrong_setting_is_refused_by_its_row_before_anything_starts(world, scans, text, told):
+    table = world.folder / "list.csv"
+    table.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        planned_batch(read_objects(table), world.out)
+    assert told in str(refused.value)
+    assert f"{table}, row" in str(refused.value)
+    assert not world.out.exists()
+
+
+def test_settings_of_all_come_before_those_of_a_row(world, scans):
+    table = world.folder / "list.csv"
+    table.write_text("photos,faces\nscans/cup,500\n")
+    (task,) = planned_batch(read_objects(table), world.out, ("--faces", "9", "--stl")).tasks
+    assert task.arguments[4:] == ("--faces", "9", "--stl", "--faces", "500", "--json")
