@@ -90,8 +90,9 @@ def light_of_mesh(
         patch, row, column = (part[::stride] for part in mask.nonzero(as_tuple=True))
         sampled = registered.radiance[patch, :, :, row, column]
         finite = sampled.isfinite().all(dim=2)
-        radiance.append(torch.where(finite[..., None], sampled, 0))
-        visible.append(registered.valid[patch, :, row, column] & finite)
+        radiance.append(templates.among_all(torch.where(finite[..., None], sampled, 0)))
+        seen_by = registered.valid[patch, :, row, column] & finite
+        visible.append(templates.among_all(seen_by))
         to_world = templates.patch_from_world[patch, :3, :3].to(bucket_normals)
         normals.append((bucket_normals[patch, row, column, None] @ to_world)[:, 0])
         positions = templates.points_patch[patch, row, column, None]
