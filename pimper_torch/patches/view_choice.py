@@ -1,7 +1,5 @@
 """The views that a facet is seen in, of many: the best ones, shared by blocks of like facets."""
 
-from functools import partial
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -46,11 +44,11 @@ def view_blocks(
 
     def of_group(group: Int[Tensor, " facet"]) -> list[tuple[Tensor, Tensor]]:
         weight = view_weights(centres[group], normals[group], exact, spacing.detach(), caster)
-        towards = partial(_towards, exact.centers_world, centres)
         blocks, waiting = [], [torch.arange(len(group))]
         while waiting:
             some = waiting.pop()
-            chosen = best_views(weight[some], towards(group[some]), count)
+            towards = exact.centers_world - centres[group[some]].mean(dim=0)
+            chosen = best_views(weight[some], normalize(towards, dim=1), count)
             seen = weight[some] > 0
             could = seen.sum(dim=1).clamp_max(count)
             served = seen[:, chosen].sum(dim=1)[could > 0] / could[could > 0]
@@ -60,7 +58,7 @@ def view_blocks(
                 waiting += [some[part] for part in halves(like[group[some]])]
         return blocks
 
-    groups, waiting = [], [torch.arange(len(faces))]
+    groups, waiting = [], [torch.arange(len(faces), device=faces.device)]
     while waiting:
         some = waiting.pop()
         parts = halves(like[some]) if len(some) > _MOST_FACETS else ()
@@ -146,12 +144,3 @@ def halves(
     """Divide points at the median of the axis along which they vary most."""
     order = points[:, points.var(dim=0).argmax()].argsort(stable=True)
     return order[: len(order) // 2], order[len(order) // 2 :]
-
-
-def _towards(
-    cameras: Float[Tensor, "view 3"],
-    centres: Float[Tensor, "face 3"],
-    facets: Int[Tensor, " facet"],
-) -> Float[Tensor, "view 3"]:
-    """Return the directions from a block to the cameras."""
-    return normalize(cameras - centres[facets].mean(dim=0), dim=1)
