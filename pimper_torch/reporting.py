@@ -282,8 +282,8 @@ def _(patches: PatchSet) -> dict[str, int | float]:
 
 @figures.register
 def _(seen: PatchViews) -> dict[str, int | float]:
-    num_views = seen.buckets[0].valid.shape[1]
-    samples = sum(int(bucket.inside.sum()) for bucket in seen.patches.buckets) * num_views
+    pairs = zip(seen.patches.buckets, seen.buckets, strict=True)
+    samples = sum(int(bucket.inside.sum()) * views.valid.shape[1] for bucket, views in pairs)
     return {"samples": samples, "missing_fraction": missing_fraction(seen)}
 
 

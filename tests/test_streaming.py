@@ -194,3 +194,79 @@ def test_gradients_reach_the_photographs_through_the_buckets(given):
     (gradient,) = torch.autograd.grad(light, images)
     assert gradient.isfinite().all()
     assert gradient.abs().max() > 0
+
+
+def with_others(given):
+    """Put photographs that buckets are not seen in between those that they are."""
+    views, cameras, patches = given
+    order = torch.tensor([0, 0, 1, 2, 5, 3, 4, 3, 5, 2])
+    own = torch.tensor([1, 0, 1, 1, 0, 1, 1, 0, 1, 0]) > 0
+    more = views.replace(
+        images=views.images[order],
+        names=tuple(f"{row}.png" for row in range(len(order))),
+        sizes_px=views.sizes_px[order],
+        focals_px=views.focals_px[order],
+        masks=None if views.masks is None else views.masks[order],
+    )
+    buckets = tuple(bucket.replace(views=own) for bucket in patches.buckets)
+    return (more, cameras.take(order), patches.replace(buckets=buckets)), own
+
+
+@pytest.mark.parametrize("kernels", ["numba", "torch"])
+def test_photographs_that_a_bucket_is_not_seen_in_change_no_bit_of_it(given, kernels):
+    (views, cameras, patches), own = with_others(given)
+    factorize = Factorize()
+    with using(kernels):
+        seen = Warp()(*given)
+        among = Warp()(views, cameras, patches)
+        light = factorize.light(seen)
+        field = light.field
+        spread = {
+            name: torch.zeros(len(own), *value.shape[1:]).index_copy(0, own.nonzero()[:, 0], value)
+            for name in ("soft", "point_light", "closeness", "colour")
+            if (value := getattr(field, name)) is not None
+        }
+        of_all = light.replace(field=field.replace(**spread))
+        found = []
+        for one, shown, lit in ((given, seen, light), ((views, cameras), among, of_all)):
+            solved = factorize.conclude(factorize.solve(shown, lit))
+            found.append(list(values(Sweep()(one[0], one[1], shown, solved))))
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_light_is_fitted_to_the_photographs_that_buckets_have_as_if_others_were_missing(given):
+    views, cameras, patches = given
+    masks = torch.tensor([[1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 1]]) > 0
+    own = [masks[number % 2] for number in range(len(patches.buckets))]
+    every = Warp()(*given)
+    missing = every.replace(
+        buckets=tuple(
+            bucket.replace(
+                valid=bucket.valid & mask[:, None, None],
+                radiance=bucket.radiance * mask[:, None, None, None],
+            )
+            for bucket, mask in zip(every.buckets, own, strict=True)
+        )
+    )
+    buckets = tuple(
+        bucket.replace(views=mask) for bucket, mask in zip(patches.buckets, own, strict=True)
+    )
+    found = Factorize().light(Warp()(views, cameras, patches.replace(buckets=buckets))).field
+    expected = Factorize().light(missing).field
+    for name in ("soft", "point_light", "closeness", "colour", "origin"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+
+
+def test_gradients_reach_the_photographs_that_a_bucket_is_seen_in_alone(given):
+    (views, cameras, patches), own = with_others(given)
+
+    def gradient(views, cameras, patches):
+        images = views.images.clone().requires_grad_()
+        seen = Warp()(views.replace(images=images), cameras, patches)
+        sum((bucket.radiance**2).sum() for bucket in seen.buckets).backward()
+        return images.grad
+
+    found = gradient(views, cameras, patches)
+    assert not found[~own].any()
+    assert torch.equal(found[own], gradient(*given))

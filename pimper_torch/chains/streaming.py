@@ -149,7 +149,10 @@ def photometry_and_heights(
             patches=patches, buckets=tuple(bucket.photometry for bucket in found)
         )
         photometric = factorize.conclude(solved)
-        samples = cameras.num_views * sum(int(each.inside.sum()) for each in patches.buckets)
+        samples = sum(
+            int(each.inside.sum()) * bucket.photometry.lights_patch.shape[1]
+            for each, bucket in zip(patches.buckets, found, strict=True)
+        )
         told["samples"] = samples
         told["missing_fraction"] = 1 - sum(bucket.num_valid for bucket in found) / max(1, samples)
         told.update(figures(photometric))

@@ -111,7 +111,8 @@ def world_lights(
     for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
         world_from_patch = templates.patch_from_world.mT  # only its rotation is used
         directed = rotate(world_from_patch, found.lights_patch[..., 1:4])
-        lights.append(torch.cat([found.lights_patch[..., :1], directed], dim=-1))
+        own = torch.cat([found.lights_patch[..., :1], directed], dim=-1)
+        lights.append(templates.among_all(own))
         facets.append(templates.facet)
         determined.append(found.determined)
     order = torch.cat(facets).argsort()

@@ -248,16 +248,25 @@ def _eliminate(cross: Doubles, inverse: Doubles, first: int, matrix: Doubles) ->
     weights = np.empty(TILE)
     samples = slice(first, first + TILE)
     own = inverse[samples]
-    for p in range(len(cross)):
+    count = len(cross)
+    shows = np.empty(count, np.bool_)
+    for p in range(count):
         row = cross[p, samples]
-        shows = 0.0
+        total = 0.0
+        for i in range(TILE):
+            total += own[i] * row[i] * row[i]
+        shows[p] = total != 0
+    for p in range(count):
+        if not shows[p]:
+            continue
+        row = cross[p, samples]
         for i in range(TILE):
             weights[i] = own[i] * row[i]
-            shows += weights[i] * weights[i]
-        if shows == 0:
-            continue
         q = p
-        while q + 4 <= len(cross):
+        while q + 4 <= count:
+            if not (shows[q] or shows[q + 1] or shows[q + 2] or shows[q + 3]):
+                q += 4
+                continue
             a, b = cross[q, samples], cross[q + 1, samples]
             c, d = cross[q + 2, samples], cross[q + 3, samples]
             on_a = on_b = on_c = on_d = 0.0
@@ -271,7 +280,7 @@ def _eliminate(cross: Doubles, inverse: Doubles, first: int, matrix: Doubles) ->
             matrix[p, q + 2] -= on_c
             matrix[p, q + 3] -= on_d
             q += 4
-        while q < len(cross):
+        while q < count:
             a = cross[q, samples]
             on_a = 0.0
             for i in range(TILE):

@@ -18,7 +18,7 @@ Array = NDArray[Any]
 
 @compiled(
     "void(float32[:,::1], float32[:,::1], uint8[:,::1], uint8[:,::1], int64[:,::1],"
-    "float64[:,:,::1], float64[:,::1], int64[:,::1], float64[:,::1], float64[::1],"
+    "int64[::1], float64[:,:,::1], float64[:,::1], int64[:,::1], float64[:,::1], float64[::1],"
     "float32[:,:,::1], float32[:,:,:,::1], boolean[:,:,::1], float64, float64,"
     "float32[:,:,:,:,::1], boolean[:,:,:,::1])"
 )
@@ -28,6 +28,7 @@ def register(
     unusable_finest: Array,
     unusable_coarser: Array,
     levels: Array,
+    rows: Array,
     image_from_patch: Array,
     centers_patch: Array,
     sizes_px: Array,
@@ -44,9 +45,10 @@ def register(
     """Resample the views, and mark valid samples, occlusion aside.
 
     Args:
-        finest: Images, one row per view.
+        finest: Images, one in a row.
         unusable_finest: Fraction of every pixel that is unusable, in 255ths.
         levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
+        rows: Of each view's image.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         outward: Unit normals, patch frame.
@@ -63,6 +65,7 @@ def register(
     steepest = min_facing * min_facing
     for patch in range(patches):
         for view in range(views):
+            image = rows[view]
             m = image_from_patch[patch * views + view]
             center = centers_patch[patch * views + view]
             any_sample = False
@@ -135,22 +138,22 @@ def register(
                                 )
                                 if here == 0:
                                     unusable += weight * bilinear(
-                                        unusable_finest, view, at, aside, under, across, down
+                                        unusable_finest, image, at, aside, under, across, down
                                     )
                                     for channel in range(channels):
                                         blended[channel] = weight * bilinear(
-                                            finest, view, at, aside, under, across, down
+                                            finest, image, at, aside, under, across, down
                                         )
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
                                 unusable += weight * bilinear(
-                                    unusable_coarser, view, start + at, aside, under, across, down
+                                    unusable_coarser, image, start + at, aside, under, across, down
                                 )
                                 at += channels * start
                                 for channel in range(channels):
                                     value = weight * bilinear(
-                                        coarser, view, at, aside, under, across, down
+                                        coarser, image, at, aside, under, across, down
                                     )
                                     blended[channel] = (
                                         value if step == 0 else blended[channel] + value

@@ -131,7 +131,7 @@ def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
 
 
 @compiled(
-    "void(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,:,::1],"
+    "void(float32[:,::1], float32[:,::1], int64[:,::1], int64[::1], float64[:,:,::1],"
     "float64[:,::1], float64[::1], float64[:,::1], float64[::1], float32[:,:,::1],"
     "float32[:,:,:,::1], float32[:,:,:,::1], float32[:,:,::1], boolean[:,:,:,::1],"
     "boolean[:,:,::1], float32[::1], float64[::1], int64[::1], int64, int64, float64,"
@@ -141,6 +141,7 @@ def costs(
     finest: Array,
     coarser: Array,
     levels: Array,
+    rows: Array,
     image_from_patch: Array,
     centers_patch: Array,
     focals: Array,
@@ -164,8 +165,9 @@ def costs(
     """Choose the views of each sample, and evaluate its cost at all heights.
 
     Args:
-        finest: Gray images, one row per view.
+        finest: Gray images, one in a row.
         levels: Height, width and offset of every level.
+        rows: Of each view's image.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         outward: Unit, along which a sample is swept; patch frame.
@@ -279,7 +281,7 @@ def costs(
                             coarser,
                             levels,
                             fractions,
-                            view,
+                            rows[view],
                             level,
                             blend,
                             inverse_z * (u0 + move * du),

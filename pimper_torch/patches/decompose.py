@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -16,6 +16,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
 from pimper_torch.patches.transfer import transfer
+from pimper_torch.patches.view_choice import view_blocks
 from pimper_torch.records import Cameras, CoarseMesh, Failure, PatchSet, Surface, Templates
 from pimper_torch.stage import Stage
 
@@ -28,14 +29,17 @@ class DecomposeConfig:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's
             zeta, made independent of the scene's unit.
         overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
-        max_samples: Of all facets in all views that they face: where there would be more, samples
-            lie further apart. Bounds time and memory; infinite for no limit.
+        num_views: Largest number of views of a facet. Where more face one, each is seen in its best
+            ones, spread in direction, which it shares with a block of facets.
+        max_samples: Of all facets in all views that they face, ``num_views`` at most: where there
+            would be more, samples lie further apart. Bounds time and memory; infinite for no limit.
         bucket_entries: Samples times views of templates that are batched together: few enough
             for a processor's cache.
     """
 
     samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
     overlap_samples: Annotated[float, Range(least=1, most=65_535)] = 2.0  # the widest photograph
+    num_views: Annotated[int, Range(least=3, most=100_000)] = 40
     max_samples: Annotated[float, Range(least=1)] = 4.5e7
     bucket_entries: Annotated[int, Range(least=1, most=100_000_000)] = 300_000  # 100 bytes each
 
@@ -82,7 +86,9 @@ class Decompose(Stage):
         density = self.config.samples_per_pixel * scale
         spacing = sample_spacing(vertices, cameras, coarse.reference, density)
         area = face_normals(vertices, faces).norm(dim=-1) / 2
-        warped = (area * views_facing(vertices, faces, cameras)).sum()
+        limit = self.config.num_views
+        faced = views_facing(vertices, faces, cameras)
+        warped = (area * faced.clamp_max(limit)).sum()
         spacing = torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
         # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
@@ -90,10 +96,18 @@ class Decompose(Stage):
         low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
         high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
         sides = ((high - low) / spacing).ceil().long() + 1
-        samples = self.config.bucket_entries // cameras.num_views
+        blocks = [
+            (torch.arange(len(faces), device=faces.device), faced.new_ones(cameras.num_views))
+        ]
+        if bool((faced > limit).any()):
+            blocks = view_blocks(coarse.mesh, cameras, spacing, limit)
+        frames = patch_from_world, corners, enlarged, low, spacing
         buckets = tuple(
-            _templates(facets, raster, patch_from_world, corners, enlarged, low, spacing)
-            for facets, raster in group_by_size(sides, max(1, samples))
+            _templates(some[facets], raster, views > 0, *frames)
+            for some, views in blocks
+            for facets, raster in group_by_size(
+                sides[some], max(1, self.config.bucket_entries // int(views.sum()))
+            )
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
         return patches if surface is None else transfer(patches, surface.mesh)
@@ -217,6 +231,7 @@ def group_by_size(
 def _templates(
     facets: Int[Tensor, " bucket"],
     raster: tuple[int, int],
+    views: Bool[Tensor, " view"],
     patch_from_world: Float[Tensor, "face 4 4"],
     corners: Float[Tensor, "face 3 2"],
     enlarged: Float[Tensor, "face 3 2"],
@@ -236,4 +251,5 @@ def _templates(
         depth=torch.zeros_like(barycentric[..., 0]),
         barycentric=barycentric,
         inside=(within >= 0).all(dim=-1),
+        views=None if bool(views.all()) else views,
     )

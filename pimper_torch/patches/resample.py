@@ -16,14 +16,16 @@ def resampled(
     cameras: Cameras,
     sources: Sources,
     templates: Templates,
+    rows: Int[Tensor, " view"],
     min_facing: float,
     dark_level: float,
 ) -> Observations:
-    """Resample all views on a bucket of templates, without occlusion.
+    """Resample views on a bucket of templates, without occlusion.
 
     Pixels are computed in float64; images are looked up in float32.
 
     Args:
+        rows: Where each camera's photograph is among the sources.
         min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
@@ -44,6 +46,7 @@ def resampled(
         *sources.images.arrays,
         *sources.unusable.arrays,
         as_array(sources.images.table),
+        as_array(rows),
         as_array(image_from_patch.flatten(0, 1)),
         as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
         as_array(cameras.sizes_px),

@@ -122,6 +122,11 @@ class PriorMaps(Record):
     maps: Sources
     in_world: bool = False
 
+    def of(self, views: Int[Tensor, " view"]) -> "tuple[PriorMaps, Int[Tensor, ' row']]":
+        """Take the maps of some views, numbered among these, and their rows in ``maps``."""
+        row, view = (self.view[:, None] == views).nonzero(as_tuple=True)
+        return self.take(row).replace(view=view), row
+
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the pinholes that the maps were seen by."""
         own = cameras.take(self.view)

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -20,7 +20,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.priors import merged
 from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.resample import occluded, resampled
-from pimper_torch.patches.sources import LEVELS, Sources, prepare
+from pimper_torch.patches.sources import LEVELS, PriorMaps, Sources, prepare
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
@@ -103,6 +103,9 @@ class Warp(Stage):
         self, channels: int, cameras: Cameras, sources: Sources, templates: Templates
     ) -> Observations:
         """Register a bucket; patches that cannot be have no valid sample."""
+        rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
+        if sources.lights is not None:
+            sources = sources.replace(lights=templates.own(sources.lights))
 
         def lost(some: slice) -> Observations:
             raster = templates.take(some).depth
@@ -111,7 +114,7 @@ class Warp(Stage):
             valid = radiance[:, :, 0] > 0
             unseen = [
                 (maps, Observations(radiance=radiance[:, maps.view], valid=valid[:, maps.view]))
-                for maps in sources.priors
+                for maps, _ in _maps_of(sources, rows)
             ]
             priors: PatchPriors | None = None
             if unseen or sources.lights is not None:
@@ -119,7 +122,7 @@ class Warp(Stage):
             return Observations(radiance=radiance, valid=valid, priors=priors)
 
         found = over_patches(
-            lambda some: self._register(cameras, sources, templates.take(some)),
+            lambda some: self._register(cameras, sources, rows, templates.take(some)),
             templates.facet,
             "warp",
             lost,
@@ -133,11 +136,17 @@ class Warp(Stage):
         )
         return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
 
-    def _register(self, cameras: Cameras, sources: Sources, templates: Templates) -> Observations:
-        found = self._resampled(cameras, sources, templates, self.config.dark_level)
+    def _register(
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+    ) -> Observations:
+        found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
         guesses = [
-            (maps, self._resampled(maps.cameras(cameras), maps.maps, templates, -math.inf))
-            for maps in sources.priors
+            (maps, self._resampled(maps.cameras(cameras), maps.maps, own, templates, -math.inf))
+            for maps, own in _maps_of(sources, rows)
         ]
         shown = found.valid
         for maps, guess in guesses:
@@ -152,9 +161,14 @@ class Warp(Stage):
         return found.replace(valid=found.valid & ~hidden, priors=priors)
 
     def _resampled(
-        self, cameras: Cameras, sources: Sources, templates: Templates, dark_level: float
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+        dark_level: float,
     ) -> Observations:
-        """Resample views on a bucket, without occlusion."""
+        """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
         images = sources.images.finest
         fast = images.dtype == torch.float32 and compiled_for(
             images,
@@ -167,11 +181,16 @@ class Warp(Stage):
         )
         if fast:
             steepest = math.cos(math.radians(self.config.max_tilt_deg))
-            return resampled(cameras, sources, templates, steepest, dark_level)
-        return self._reference(cameras, sources, templates, dark_level)
+            return resampled(cameras, sources, templates, rows, steepest, dark_level)
+        return self._reference(cameras, sources, rows, templates, dark_level)
 
     def _reference(
-        self, cameras: Cameras, sources: Sources, templates: Templates, dark_level: float
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+        dark_level: float,
     ) -> Observations:
         world_from_patch = invert_rigid(templates.patch_from_world)
         num, height, width = templates.depth.shape
@@ -182,8 +201,8 @@ class Warp(Stage):
             transferred = templates.normals_patch.detach().reshape(num, -1, 3)
             outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
         seen = [
-            self._seen_by(view, templates, points_world, outward, cameras, sources, dark_level)
-            for view in range(cameras.num_views)
+            self._seen_by(view, row, templates, points_world, outward, cameras, sources, dark_level)
+            for view, row in enumerate(rows.tolist())
         ]
         return Observations(
             radiance=torch.stack([radiance for radiance, _ in seen], dim=1),
@@ -193,6 +212,7 @@ class Warp(Stage):
     def _seen_by(
         self,
         view: int,
+        row: int,
         templates: Templates,
         points_world: Float[Tensor, "patch height width 3"],
         outward: Float[Tensor, "patch height width 3"],
@@ -217,14 +237,21 @@ class Warp(Stage):
         size = cameras.sizes_px[view].to(pixels)
         within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
         wanted = wanted & within
-        found = look_up(sources.images.levels(view), pixels[wanted], level[wanted])
-        fractions = [fraction.to(found) for fraction in sources.unusable.levels(view)]
+        found = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
+        fractions = [fraction.to(found) for fraction in sources.unusable.levels(row)]
         lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
         usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
         radiance = found.new_zeros(*wanted.shape, found.shape[1])
         radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
         valid = torch.zeros_like(wanted).index_put((wanted,), usable)
         return radiance * valid[:, None], valid
+
+
+def _maps_of(
+    sources: Sources, rows: Int[Tensor, " view"]
+) -> list[tuple[PriorMaps, Int[Tensor, " map"]]]:
+    """List the guessed maps of some views, where there are any, and their rows."""
+    return [(maps, own) for maps, own in (each.of(rows) for each in sources.priors) if len(own)]
 
 
 def missing_fraction(seen: PatchViews) -> float:

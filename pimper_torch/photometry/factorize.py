@@ -310,15 +310,17 @@ class Factorize(Stage):
         Returns:
             Albedo and lights up to the factor of the scene, which :meth:`conclude` sets.
         """
-        buckets, colour = [], light.field.colour
+        buckets = []
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
+            own = light.replace(field=templates.own(light.field))
+            colour = own.field.colour
             if colour is not None and not bool((colour == 1).all()):
                 balanced = registered.radiance / colour[..., None, None].to(registered.radiance)
                 registered = registered.replace(radiance=balanced)
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
             found = over_patches(
-                partial(self._solved, bucket, light),
+                partial(self._solved, bucket, own),
                 templates.facet,
                 "factorize",
                 partial(_lost, bucket),
@@ -500,7 +502,7 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
         rows = rows_of(templates, registered, own)
         patch_from_world = templates.patch_from_world.to(own)
         centre = invert_rigid(patch_from_world)[:, :3, 3]
-        lights = field.lights_at(centre, -patch_from_world[:, 2, :3])
+        lights = templates.own(field).lights_at(centre, -patch_from_world[:, 2, :3])
         lights = rotate_lights(patch_from_world, lights)
         gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)

@@ -31,17 +31,17 @@ class LightField(Record):
     the square of the distance.
 
     Attributes:
-        origin: World.
         soft: Harmonics ``(1, n)`` and those of second order, world.
         point_light: ``e``; zero for none.
         closeness: ``c``, the inverse distance; zero for a distant light.
+        origin: World.
         colour: Of all light; radiance over it is gray. White if ``None``.
     """
 
-    origin: Float[Tensor, " 3"]
     soft: Float[Tensor, "view 9"]
     point_light: Float[Tensor, "view 3"]
     closeness: Float[Tensor, " view"]
+    origin: Float[Tensor, " 3"]
     colour: Float[Tensor, "view channel"] | None = None
 
     def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:

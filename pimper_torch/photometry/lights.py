@@ -41,6 +41,9 @@ _TRIED = 2500
 # Maximum number of samples that the light is fitted to: a choice, 2,000 per parameter.
 LIGHT_SAMPLES = 10_000
 
+# Maximum number of views whose lights are fitted together, as time grows with its cube: a choice.
+_TOGETHER = 80
+
 # Thinned templates keep this multiple of LIGHT_SAMPLES on their facets: some are in no view.
 _SPARE = 2
 
@@ -90,8 +93,9 @@ def light_of_mesh(
         patch, row, column = (part[::stride] for part in mask.nonzero(as_tuple=True))
         sampled = registered.radiance[patch, :, :, row, column]
         finite = sampled.isfinite().all(dim=2)
-        radiance.append(torch.where(finite[..., None], sampled, 0))
-        visible.append(registered.valid[patch, :, row, column] & finite)
+        radiance.append(templates.among_all(torch.where(finite[..., None], sampled, 0)))
+        seen_by = registered.valid[patch, :, row, column] & finite
+        visible.append(templates.among_all(seen_by))
         to_world = templates.patch_from_world[patch, :3, :3].to(bucket_normals)
         normals.append((bucket_normals[patch, row, column, None] @ to_world)[:, 0])
         positions = templates.points_patch[patch, row, column, None]
@@ -125,6 +129,9 @@ def fit_light_field(
             the simplest that none with more parameters predicts better than, significantly.
         iterations: At most, for each model.
 
+    Lights of more than 80 views are fitted in groups, of every so many-th view, and brought to one
+    scale by the albedo that the groups have in common; the model is selected by the first of them.
+
     Returns:
         The scale between light and albedo is free; here the median of ``|l|`` over the views,
         at the centroid of the points, is 1. A view without data has zero light.
@@ -154,14 +161,18 @@ def fit_light_field(
     origin = positions.mean(dim=0)
     size = _mean_distance(positions - origin)
     geometry = own_normals, (positions - origin) / size
-    name = _selected(samples, *geometry, iterations) if model == "auto" else model
-    found, mixing = _fit(name, samples, *geometry, iterations)
-    solution, terms = with_gradients(found, samples).lights, len(mixing)
-    lights = solution[:, :terms] @ mixing
-    point_lights, closeness = torch.zeros_like(lights[:, :3]), torch.zeros_like(lights[:, 0])
-    if name != "soft":
-        point_lights = solution[:, terms:-1]
-        closeness = closeness if points is None else solution[:, -1] / size
+    step = -(-views // _TOGETHER)
+    groups = [_every(samples, step, first) for first in range(step)]
+    name = _selected(groups[0], *geometry, iterations) if model == "auto" else model
+    fits = [_lights(name, group, *geometry, iterations) for group in groups]
+    scales = [1.0, *(_ratio(each[2], fits[0][2]) for each in fits[1:])]
+    order = torch.cat([torch.arange(first, views, step) for first in range(step)]).argsort()
+    lights, point_lights = (
+        torch.cat([scale * each[part] for scale, each in zip(scales, fits, strict=True)])[order]
+        for part in (0, 1)
+    )
+    closeness = torch.cat([each[3] for each in fits])[order]
+    closeness = torch.zeros_like(closeness) if points is None else closeness / size
     factor = _median_length(lights.square().sum(dim=1) + point_lights.square().sum(dim=1))
     return LightField(
         origin=origin.to(radiance),
@@ -169,6 +180,43 @@ def fit_light_field(
         point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
+
+
+def _every(samples: ImageSamples, step: int, first: int) -> ImageSamples:
+    """Take every so many-th view."""
+    some = slice(first, None, step)
+    return ImageSamples(radiance=samples.radiance[:, some], seen=samples.seen[:, some])
+
+
+def _ratio(
+    albedo: Float[Tensor, " sample"], other: Float[Tensor, " sample"]
+) -> Float[Tensor, ""] | float:
+    """Return the median ratio of two albedos where both are known; 1 where none is."""
+    both = (albedo > 0) & (other > 0)
+    return (albedo[both] / other[both]).median() if bool(both.any()) else 1.0
+
+
+def _lights(
+    name: str,
+    samples: ImageSamples,
+    normals: Float[Tensor, "sample 3"],
+    points: Float[Tensor, "sample 3"],
+    iterations: int,
+) -> tuple[
+    Float[Tensor, "view 9"],
+    Float[Tensor, "view 3"],
+    Float[Tensor, " sample"],
+    Float[Tensor, " view"],
+]:
+    """Return fitted harmonics, point lights, albedo, and closeness, in units of the points."""
+    found, mixing = _fit(name, samples, normals, points, iterations)
+    fitted, terms = with_gradients(found, samples), len(mixing)
+    solution = fitted.lights
+    lights = solution[:, :terms] @ mixing
+    point_lights, closeness = torch.zeros_like(lights[:, :3]), torch.zeros_like(lights[:, 0])
+    if name != "soft":
+        point_lights, closeness = solution[:, terms:-1], solution[:, -1]
+    return lights, point_lights, fitted.albedo, closeness
 
 
 def _fit(

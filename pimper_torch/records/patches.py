@@ -14,12 +14,12 @@ from enum import IntEnum
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
-from pimper_torch.records.record import Record
+from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
 
 AnyPatches = TypeVar("AnyPatches", bound="OverPatches")
@@ -41,6 +41,8 @@ class Templates(Record):
             it has some.
         normals_patch: Of the surface that a template carries, unit, facing the viewer. ``None``
             while the template is flat: the coarse mesh's smoothed normals stand in.
+        views: Which of all views the bucket is seen in, where it is not all of them: later records
+            of it have these alone, in their order.
     """
 
     facet: Int[Tensor, " patch"]
@@ -51,6 +53,27 @@ class Templates(Record):
     barycentric: Float[Tensor, "patch height width 3"]
     inside: Bool[Tensor, "patch height width"]
     normals_patch: Float[Tensor, "patch height width 3"] | None = None
+    views: Bool[Tensor, " view"] | None = None
+
+    def rows(self, num_views: int) -> Int[Tensor, " row"]:
+        """Return the numbers of the views that the bucket is seen in; of all, they are so many."""
+        if self.views is None:
+            return torch.arange(num_views, device=self.facet.device)
+        return self.views.nonzero()[:, 0]
+
+    def own(self, record: AnyRecord) -> AnyRecord:
+        """Take the views that the bucket is seen in from a record of all views."""
+        return record if self.views is None else record.take(self.views)
+
+    def among_all(self, values: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
+        """Put values of the bucket's views, along the second axis, among those of all views.
+
+        Zero in those that the bucket is not seen in.
+        """
+        if self.views is None:
+            return values
+        shape = len(values), len(self.views), *values.shape[2:]
+        return values.new_zeros(shape).index_copy(1, self.rows(len(self.views)), values)
 
     def faults_of(self, num_facets: int) -> Iterator[tuple[str, str, str]]:
         """List facets that are none of so many, and templates of no size."""
@@ -219,7 +242,7 @@ class Observations(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchViews(OverPatches):
-    """All views, registered on all templates."""
+    """Views, registered on all templates: all of them, or those of a template's bucket."""
 
     patches: PatchSet
     buckets: tuple[Observations, ...]
@@ -453,6 +476,7 @@ def _given(
     unit = torch.where(valid[..., None], normals / length[..., None], facing)
     lights = lights.to(like)
     if lights.ndim == 2:
+        lights = lights if templates.views is None else lights[templates.views]
         rotated = torch.einsum("pij,vj->pvi", templates.patch_from_world[:, :3, :3], lights[:, 1:])
         lights = torch.cat([lights[:, :1].expand(len(like), -1, 1), rotated], dim=-1)
     determined = valid.flatten(1).any(dim=1)

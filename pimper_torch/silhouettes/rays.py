@@ -180,6 +180,7 @@ def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Ar
     margin = np.minimum(points, size - points).min(axis=1) + 0.5
     good = (rotation <= most) & (margin >= config.border_px) & (rise != 0)
     chosen = np.arange(0, len(points), stride).astype(int)
+    chosen = chosen[chosen < len(points)]  # rounding may add one
     chosen = chosen[good[chosen]]
     rows = np.concatenate([points, tangent, outward, np.abs(rise)[:, None]], axis=1)
     return np.asarray(rows[chosen])

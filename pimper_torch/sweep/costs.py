@@ -17,6 +17,7 @@ def compiled_costs(
     transferred: Float[Tensor, "patch height width 3"],
     cameras: Cameras,
     sources: Sources,
+    rows: Int[Tensor, " view"],
     poses: Int[Tensor, " view"] | None,
     *,
     ladder: Float[Tensor, " hypothesis"],
@@ -30,6 +31,7 @@ def compiled_costs(
     Args:
         registered: Which views have which samples.
         photometry: Normals and lights.
+        rows: Where each camera's photograph is among the sources.
         poses: Number of each view's pose, where some have several.
         transferred: Normals that samples are swept along.
         ladder: Heights that are tried, in samples.
@@ -50,6 +52,7 @@ def compiled_costs(
     sweep.costs(
         *sources.gray.arrays,
         as_array(sources.gray.table),
+        as_array(rows),
         as_array(image_from_patch.flatten(0, 1)),
         as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
         as_array((exact.intrinsics[:, 0, 0] * exact.intrinsics[:, 1, 1]).sqrt()),

@@ -217,6 +217,8 @@ class Sweep(Stage):
     ) -> Heights:
         config = self.config
         templates, registered, photometry = bucket
+        rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
+        poses = None if poses is None else poses[rows]
         transferred = transferred_normals(coarse, templates)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
         priors = registered.priors
@@ -234,7 +236,7 @@ class Sweep(Stage):
             photometry.lights_patch,
             photometry.convergence.residual,
         )
-        given = templates, registered, photometry, transferred, cameras, sources, poses
+        given = templates, registered, photometry, transferred, cameras, sources, rows, poses
         if fast:
             costs, swept = compiled_costs(
                 *given,
@@ -293,13 +295,14 @@ class Sweep(Stage):
         transferred: Float[Tensor, "patch height width 3"],
         cameras: Cameras,
         sources: Sources,
+        images: Int[Tensor, " view"],
         poses: Int[Tensor, " view"] | None,
     ) -> tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]:
         """Return the cost of every height, and 1 where a sample is swept, else 0."""
         rows = self._rows(templates, registered, photometry, transferred, cameras, poses)
         step = _STEP * templates.spacing
         moves = step[rows.patch, None] * self._ladder.to(step)
-        radiance = self._look_up(rows, templates, moves, cameras, sources)
+        radiance = self._look_up(rows, templates, moves, cameras, sources, images)
         scale = self._scale(photometry)
         cost = inconsistency(radiance, rows.shading, rows.seen, scale[rows.patch])
         swept = torch.zeros_like(templates.depth).flatten().index_fill(0, rows.index, 1.0)
@@ -369,6 +372,7 @@ class Sweep(Stage):
         moves: Float[Tensor, "sample hypothesis"],
         cameras: Cameras,
         sources: Sources,
+        images: Int[Tensor, " view"],
     ) -> Float[Tensor, "sample chosen hypothesis"]:
         """Look every sample up at all heights in its chosen views."""
         found = moves.new_zeros(*rows.chosen.shape, moves.shape[1]).flatten(0, 1)
@@ -389,7 +393,7 @@ class Sweep(Stage):
             squeezed = (away * outward).sum(dim=-1).clamp_min(_MIN_FACING)
             level = (across * squeezed.sqrt()).clamp_min(1).log2()
             level = level[:, None].expand(-1, moves.shape[1]).flatten()
-            radiance = look_up(sources.gray.levels(view), pixels, level)
+            radiance = look_up(sources.gray.levels(int(images[view])), pixels, level)
             found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
         return found.reshape(*rows.chosen.shape, moves.shape[1])
 

@@ -12,7 +12,6 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     DepthPatches,
-    Observations,
     PatchSet,
     PatchViews,
     PhotometricPatches,
@@ -61,7 +60,7 @@ def plot_patch(
     figure = _figure(len(panels) + (residual is not None))
     all_axes = figure.subplots(1, len(panels) + (residual is not None), squeeze=False)[0]
     if seen is not None and residual is not None:
-        _draw_light(all_axes[-1], seen.buckets[0], residual, sample)
+        _draw_light(all_axes[-1], seen, residual, sample)
     for axes, (title, raster) in zip(all_axes, panels, strict=False):
         picture = raster.detach().float().cpu()
         if picture.ndim == 3:
@@ -89,11 +88,12 @@ def _residual(patch: AnyPatch, seen: PatchViews) -> Float[Tensor, "view height w
 
 def _draw_light(
     axes: "Axes",
-    views: Observations,
+    seen: PatchViews,
     residual: Float[Tensor, "view height width"],
     sample: tuple[int, int] | None,
 ) -> None:
     """Draw a sample's radiance in every view that has it, observed and predicted."""
+    (views,), (templates,) = seen.buckets, seen.patches.buckets
     if sample is None:
         worst = int(residual.square().nansum(dim=0).argmax())
         sample = worst // residual.shape[2], worst % residual.shape[2]
@@ -103,8 +103,9 @@ def _draw_light(
     if not len(shown):
         raise InputError(f"plot_patch: no view has sample {sample}; needed: one that is lit.")
     observed = views.gray[0, shown.to(views.valid.device), row, column].detach().cpu()
-    axes.plot(shown.numpy(), observed.numpy(), "k.", label="observed")
-    axes.plot(shown.numpy(), (observed - off[shown]).numpy(), "C1_", label="predicted")
+    numbers = templates.rows(len(off)).cpu()[shown].numpy()
+    axes.plot(numbers, observed.numpy(), "k.", label="observed")
+    axes.plot(numbers, (observed - off[shown]).numpy(), "C1_", label="predicted")
     axes.set_title(f"sample {row}, {column}", fontsize="small")
     axes.set_xlabel("view", fontsize="small")
     axes.legend(fontsize="x-small")
@@ -178,10 +179,11 @@ def _panels(patch: AnyPatch) -> list[tuple[str, Tensor]]:
         (templates,) = patch.buckets
         return [("template's depth", templates.depth[0]), ("inside", templates.inside[0])]
     if isinstance(patch, PatchViews):
-        (seen,) = patch.buckets
+        (seen,), (templates,) = patch.buckets, patch.patches.buckets
+        numbers = templates.rows(seen.valid.shape[1]).tolist()
         shown = seen.valid[0].flatten(1).any(dim=1).nonzero()[:, 0].tolist()
         radiance = seen.radiance[0].movedim(1, -1)
-        return [(f"view {view}", _in_colour(radiance[view])) for view in shown]
+        return [(f"view {numbers[view]}", _in_colour(radiance[view])) for view in shown]
     if isinstance(patch, PhotometricPatches):
         (found,) = patch.buckets
         return [

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -59,3 +60,34 @@ def test_shading_is_the_same_in_every_frame(generator):
         rotate_lights(target_from_source, lights) @ harmonics(rotate(target_from_source, n)).mT
     )
     assert_close(rotated, lights @ harmonics(n).mT)
+
+
+def test_lights_of_many_views_are_exact_though_they_are_fitted_in_groups(generator, monkeypatch):
+    J, n, lights, _ = data(generator, views=11)
+    seen = torch.rand(J.shape, generator=generator) > 0.3
+    monkeypatch.setattr("pimper_torch.photometry.lights._TOGETHER", 4)
+    found = fit_light_field(torch.where(seen, J, torch.nan), seen, n)
+    assert (found.point_light == 0).all()
+    assert_close(found.soft[:, :4], lights, rtol=1e-5, atol=1e-5)  # one scale for all groups
+
+
+@pytest.mark.slow
+def test_gradients_of_lights_that_are_fitted_in_groups_are_those_of_differences(
+    generator, monkeypatch
+):
+    J, n, _, _ = data(generator, samples=40, views=7)
+    J = J + 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
+    change = 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
+    weight = torch.randn(7, 9, generator=generator, dtype=torch.float64)
+    monkeypatch.setattr("pimper_torch.photometry.lights._TOGETHER", 4)
+
+    def told(step):
+        radiance = (J + step * change).requires_grad_()
+        field = fit_light_field(radiance, torch.ones_like(J) > 0, n, model="soft")
+        return (field.soft * weight).sum(), radiance
+
+    value, radiance = told(0.0)
+    (gradient,) = torch.autograd.grad(value, radiance)
+    step = 1e-4
+    difference = (told(step)[0] - told(-step)[0]).detach() / (2 * step)
+    assert_close((gradient * change).sum(), difference, rtol=1e-3, atol=0)

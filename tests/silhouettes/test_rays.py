@@ -92,6 +92,12 @@ def test_the_number_of_rays_is_what_is_asked_for(cameras):
     assert bool(((count >= 45) & (count <= 51)).all())
 
 
+def test_no_number_of_rays_reaches_past_the_end_of_a_contour(cameras):
+    found = silhouettes_of(ball, cameras)
+    for asked in (31, 62):
+        assert len(contour_rays(found, cameras, RayConfig(per_view=asked)).view) > 0
+
+
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ConfigError, match="per_view"):
         RayConfig(per_view=0)
