@@ -21,6 +21,7 @@ from pimper_torch.io.focal_lengths import focals_px
 from pimper_torch.io.header import Header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
+from pimper_torch.mapped import each, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
 
@@ -115,7 +116,7 @@ def load_views(
     pictures = read_pictures(paths, headers, sizes, encoding)
     images = pictures.images
     has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
-    drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
+    drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
     opacities = []
     if mask_paths is not None:
         ways = _read_masks(mask_paths, paths, headers)
@@ -493,7 +494,7 @@ def _refuse_black(
 ) -> None:
     lit = [
         float((image[:, :high, :wide] > _BLACK).float().mean()) > _LIT_FRACTION
-        for image, (wide, high) in zip(images, sizes, strict=True)
+        for (image,), (wide, high) in zip(each(images), sizes, strict=True)
     ]
     black = [name for name, one in zip(names, lit, strict=True) if not one]
     if black:
@@ -512,7 +513,7 @@ def _judge_saturation(
     """Refuse photographs saturated all over, and warn of those with hardly anything else."""
     usable = [
         float((image.amax(dim=0)[mask] < SATURATED).float().mean())
-        for image, mask in zip(images, drawn, strict=True)
+        for image, mask in each(images, drawn)
     ]
     blind = [
         name for name, fraction in zip(names, usable, strict=True) if fraction <= _LIT_FRACTION
@@ -539,7 +540,7 @@ def _judge_saturation(
 def _refuse_empty(
     drawn: Bool[Tensor, "view height width"], names: tuple[str, ...], folder: Path | None
 ) -> None:
-    empty = [name for name, mask in zip(names, drawn, strict=True) if not bool(mask.any())]
+    empty = [name for name, (mask,) in zip(names, each(drawn), strict=True) if not bool(mask.any())]
     if empty:
         where = f"{folder}: the masks" if folder else "the alpha channels"
         raise InputError(

@@ -14,6 +14,7 @@ from pimper_torch.errors import InputError, caution
 from pimper_torch.io.decode import Decoded, decode
 from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
+from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, Srgb, find_saturation
 from pimper_torch.radiometry.primaries import in_srgb_primaries
@@ -81,7 +82,7 @@ def read_pictures(
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
     _refuse_padding(files, sizes_px, channels)
-    images = torch.zeros(len(files), channels, height, width)
+    images = zeros((len(files), channels, height, width))
     given = None if encoding.saturation == "auto" else encoding
     opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
     whites = _found(tallies)
@@ -204,6 +205,7 @@ def _fill(
             opaque[-1] = drawn
         if tally:
             tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
+        drop_pages()
     return tuple(opaque), tallies
 
 
