@@ -7,7 +7,7 @@ files have no names, so that nothing is left of them when the process ends, howe
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from math import prod
 from pathlib import Path
@@ -40,7 +40,7 @@ def zeros(
     size = prod(shape) * dtype.itemsize
     folder = _folder() if size >= LARGE and torch.device(device).type == "cpu" else None
     if folder is None:
-        return torch.zeros(*shape, dtype=dtype, device=device)
+        return torch.zeros(list(shape), dtype=dtype, device=device)
     try:
         with tempfile.TemporaryFile(prefix="pimper_", dir=folder) as file:
             # Writing to pages for which there is no space would kill the process.
@@ -53,7 +53,49 @@ def zeros(
             "folder of another disk, or shrink the photographs (`--max-size-px`)."
         ) from error
     _mapped.add(pages)
-    return torch.frombuffer(pages, dtype=dtype).view(*shape)
+    return torch.frombuffer(pages, dtype=dtype).view(list(shape))
+
+
+def copied(tensor: Tensor) -> Tensor:
+    """Copy a tensor to contiguous memory, or a file where it is large. Differentiable."""
+    return zeros(tensor.shape, tensor.dtype, tensor.device).copy_(tensor)
+
+
+def taken(tensor: Tensor, index: slice | Tensor) -> Tensor:
+    """Index the first axis, into a file where the result is large."""
+    if isinstance(index, slice) or tensor.nbytes < LARGE or tensor.requires_grad:
+        return tensor[index]
+    rows = torch.arange(len(tensor), device=tensor.device)[index]
+    found = zeros((len(rows), *tensor.shape[1:]), tensor.dtype, tensor.device)
+    at_once = max(1, len(tensor) * LARGE // tensor.nbytes)
+    for into, some in zip(torch.split(found, at_once), torch.split(rows, at_once), strict=True):
+        into.copy_(tensor[some])
+        drop_pages()
+    return found
+
+
+def parts(shapes: Sequence[Sequence[int]], device: torch.device | str = "cpu") -> list[Tensor]:
+    """Return zeros of several shapes, together in a file where they are large together."""
+    sizes = list(map(prod, shapes))
+    pieces = torch.split(zeros((sum(sizes),), device=device), sizes)
+    return [piece.view(*shape) for piece, shape in zip(pieces, shapes, strict=True)]
+
+
+def by_view(work: Callable[..., Tensor], *rasters: Sequence[Tensor] | Tensor) -> Tensor:
+    """Stack what is computed of every view by itself, in a file where it is large.
+
+    Args:
+        work: Called with the view of every raster; gives tensors of one shape.
+        rasters: Of at least one view.
+    """
+    found = None
+    for view, some in enumerate(each(*rasters)):
+        one = work(*some)
+        if found is None:
+            found = zeros((len(rasters[0]), *one.shape), one.dtype, one.device)
+        found[view] = one
+    assert found is not None
+    return found
 
 
 def drop_pages() -> None:

@@ -13,6 +13,10 @@ from pimper_torch import mapped
 from pimper_torch.errors import OutputError
 from pimper_torch.io.photographs import load_views
 from pimper_torch.memory import resident_bytes
+from pimper_torch.patches.sources import prepare
+from pimper_torch.records import Lens, Silhouettes
+from pimper_torch.sfm.undistort import undistort
+from pimper_torch.store import digest, settled
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
@@ -136,3 +140,49 @@ def test_folders_in_memory_are_known_by_their_mount():
         pytest.skip("no folder is in memory here")
     assert all(map(mapped._in_memory, inside))
     assert not mapped._in_memory("/proc")
+
+
+def test_parts_copies_and_selections_are_what_they_are_in_memory(request):
+    tensor = torch.arange(60.0).reshape(5, 12)
+    picked = torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, True])
+    plain = [tensor[index] for index in picked]
+    request.getfixturevalue("small")
+    found = [mapped.taken(tensor, index) for index in picked]
+    assert all(map(torch.equal, plain, found))
+    assert all(map(is_mapped, found))
+    assert torch.equal(mapped.copied(tensor.T), tensor.T)
+    assert torch.equal(mapped.copied(torch.tensor(3)), torch.tensor(3))
+    first, second = mapped.parts([(2, 3), (4,)])
+    second.fill_(1)
+    assert not bool(first.any())
+    assert (first.shape, second.shape) == ((2, 3), (4,))
+
+
+def test_what_is_copied_keeps_its_gradient(small):
+    values = torch.ones(3, requires_grad=True)
+    mapped.copied(values).square().sum().backward()
+    assert values.grad is not None
+    assert values.grad.tolist() == [2, 2, 2]
+
+
+def chain_of(photos):
+    """Load photographs, bend them, take masks for silhouettes and build pyramids."""
+    views = load_views(photos, masks=photos.with_name("masks"))
+    params = (30.0, 15.0, 10.0, -0.1)
+    lens = Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=30, height=20)
+    views, _ = undistort(views.take([2, 0, 3]), (lens, lens, lens))
+    inside = mapped.by_view(torch.Tensor.float, views.masks)
+    found = Silhouettes(inside=inside, reliable=torch.ones(3, dtype=torch.bool), source="masks")
+    sources = prepare(views.replace(masks=found.masks & views.inside))
+    pyramids = sources.images, sources.gray, sources.unusable
+    arrays = [one for pyramid in pyramids for one in (pyramid.finest, pyramid.coarser)]
+    return [*arrays, views.masks, settled(found).inside], digest(sources)
+
+
+def test_stages_give_the_same_bits_from_photographs_on_disk(photos, request):
+    plain, hashed = chain_of(photos)
+    request.getfixturevalue("small")
+    found, again = chain_of(photos)
+    assert all(map(torch.equal, plain, found))
+    assert all(map(is_mapped, found))
+    assert again == hashed

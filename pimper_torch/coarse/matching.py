@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.kernels.arrays import as_array
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, Record, SparseScene
 
 # Added to radiance over its bright level before the root, so that the noise of black pixels is not
@@ -46,15 +47,15 @@ class Level(Record):
 def level_of(scene: SparseScene, factor: int) -> Level:
     """Reduce the photographs by a whole factor; remainders at the right and the bottom are cut."""
     views, cameras = scene.views, scene.cameras
-    usable = views.inside if views.masks is None else views.inside & views.masks
-    gray = torch.stack(
-        [
-            avg_pool2d(image.mean(dim=0, keepdim=True).nan_to_num(0, 0, 0), factor)[0]
-            for image in views.images
-        ]
+    usable = views.inside
+    if views.masks is not None:
+        usable = by_view(torch.logical_and, usable, views.masks)
+    gray = by_view(
+        lambda image: avg_pool2d(image.mean(dim=0, keepdim=True).nan_to_num(0, 0, 0), factor)[0],
+        views.images,
     ).clamp_min(0)
     # All of a reduced pixel has to be usable: the smallest value is that of the pool's.
-    usable = torch.stack([avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4 for one in usable])
+    usable = by_view(lambda one: avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4, usable)
     shown = gray[usable] if bool(usable.any()) else gray.reshape(-1)
     rank = min(len(shown), int(_BRIGHT * len(shown)) + 1)
     bright = shown.kthvalue(rank).values.clamp_min(torch.finfo(gray.dtype).tiny)

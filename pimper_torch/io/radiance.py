@@ -187,6 +187,7 @@ def _fill(
         whites: Levels of saturation that were found.
     """
     opaque: list[Tensor | None] = []
+    drawn: Tensor | None = None
     tallies: dict[_Kind, _Tally] = {}
     for index in track(range(len(paths))):
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
@@ -200,9 +201,10 @@ def _fill(
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
         opaque.append(None)
         if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
-            drawn = torch.zeros(images.shape[-2:], dtype=torch.bool)
-            drawn[:high, :wide] = resized_mask(decoded.alpha, wide, high)
-            opaque[-1] = drawn
+            if drawn is None:
+                drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
+            drawn[index, :high, :wide] = resized_mask(decoded.alpha, wide, high)
+            opaque[-1] = drawn[index]
         if tally:
             tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
         drop_pages()
