@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import chain
 from math import prod
 from pathlib import Path
 from weakref import WeakSet
@@ -19,7 +20,7 @@ from torch import Tensor
 from pimper_torch.errors import OutputError
 
 # Bytes from which a tensor is in a file: a choice. Photographs of smaller sets stay in memory.
-LARGE = 2**28
+LARGE = 2**26
 
 _mapped: WeakSet[mmap.mmap] = WeakSet()
 
@@ -82,19 +83,21 @@ def parts(shapes: Sequence[Sequence[int]], device: torch.device | str = "cpu") -
 
 
 def by_view(work: Callable[..., Tensor], *rasters: Sequence[Tensor] | Tensor) -> Tensor:
-    """Stack what is computed of every view by itself, in a file where it is large.
+    """Stack what is computed of every view by itself.
 
     Args:
         work: Called with the view of every raster; gives tensors of one shape.
         rasters: Of at least one view.
     """
-    found = None
-    for view, some in enumerate(each(*rasters)):
-        one = work(*some)
-        if found is None:
-            found = zeros((len(rasters[0]), *one.shape), one.dtype, one.device)
-        found[view] = one
-    assert found is not None
+    return stacked((work(*some) for some in each(*rasters)), len(rasters[0]))
+
+
+def stacked(tensors: Iterator[Tensor], count: int) -> Tensor:
+    """Stack tensors of one shape as they come, in a file where they are large together."""
+    first = next(tensors)
+    found = zeros((count, *first.shape), first.dtype, first.device)
+    for place, one in enumerate(chain([first], tensors)):
+        found[place] = one
     return found
 
 
