@@ -9,6 +9,7 @@ from pathlib import Path
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.mapped import drop_pages
 from pimper_torch.records import PatchSet
 
 # Bytes that the fusion's last round takes for each vertex, on top of what the process holds when
@@ -68,10 +69,14 @@ def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -
 
 
 def resident_bytes() -> float:
-    """Return what the process holds now; 0 where the system does not tell."""
+    """Return what the process holds now, 0 where the system does not tell.
+
+    Pages of files do not count, as the system drops them where memory is needed.
+    """
     with suppress(OSError, IndexError, ValueError):
         fields = Path("/proc/self/status").read_text(encoding="ascii")
-        return 1024.0 * float(fields.split("VmRSS:")[1].split()[0])
+        kinds = ("RssAnon:", "RssShmem:")
+        return 1024.0 * sum(float(fields.split(kind)[1].split()[0]) for kind in kinds)
     return 0.0
 
 
@@ -81,5 +86,6 @@ def release_memory() -> None:
     With 30 photographs of 1600x1200 the threads that write them leave 400 MB, COLMAP's as much
     again, and patches before the fusion some 200, which would add to what comes after.
     """
+    drop_pages()
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -18,6 +18,7 @@ import torch
 
 from pimper_torch.failures import halved, out_of_memory, released, skipped
 from pimper_torch.ledger import added_up
+from pimper_torch.mapped import drop_pages
 from pimper_torch.progress import listening, report
 
 Item = TypeVar("Item")
@@ -53,6 +54,7 @@ def side_by_side(
     with nullcontext() if _working.get() else added_up():
         for done, result in enumerate(results, start=1):
             yield result
+            drop_pages()
             if tracked:
                 report(done, len(items))
 

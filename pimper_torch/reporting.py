@@ -252,9 +252,10 @@ def _(scene: SparseScene) -> dict[str, int | float]:
 
 @figures.register
 def _(silhouettes: Silhouettes) -> dict[str, int | float]:
+    masks = silhouettes.masks
     return {
         "reliable_views": int(silhouettes.reliable.sum()),
-        "object_fraction": _mean(silhouettes.masks.flatten().float()),
+        "object_fraction": int(masks.count_nonzero()) / max(1, masks.numel()),
     }
 
 

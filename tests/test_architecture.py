@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[1]
 # which draws the contact sheet of a result with it.
 ROOMS = [
     "errors",
+    "mapped",
     "config",
     "progress",
     "cores",

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import by_view, zeros
 from pimper_torch.records import Silhouettes, SparseScene
 
 # Pixels kept round the silhouettes, for windows that reach beyond what they match. A choice.
@@ -31,9 +32,11 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     size = boxes[:, 1] - low
     width, height = size.amax(dim=0).tolist()
     views, masks = scene.views, silhouettes.masks
-    images = views.images.new_zeros(views.num_views, views.images.shape[1], height, width)
-    shown = torch.zeros_like(images[:, 0], dtype=torch.bool)
-    leave_out("coarse.cropping", views.inside & ~masks)
+    images = zeros(
+        (*views.images.shape[:2], height, width), views.images.dtype, views.images.device
+    )
+    shown = zeros((views.num_views, height, width), torch.bool, images.device)
+    leave_out("coarse.cropping", by_view(lambda one, mask: one & ~mask, views.inside, masks))
     intrinsics = scene.cameras.intrinsics.clone()
     for view, ((left, top), (w, h)) in enumerate(zip(low.tolist(), size.tolist(), strict=True)):
         rows, columns = slice(top, top + h), slice(left, left + w)
@@ -50,13 +53,14 @@ def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Ten
     """Return the corners of boxes round the silhouettes, first inside, then outside."""
     masks = silhouettes.masks
     ends = []
-    for along in (masks.any(dim=1), masks.any(dim=2)):  # columns, then rows
+    for axis in range(2):  # columns, then rows
+        along = by_view(lambda mask, axis=axis: mask.any(dim=axis), masks)
         index = torch.arange(along.shape[1], device=along.device)
         first = torch.where(along, index, along.shape[1]).amin(dim=1) - _MARGIN
         last = torch.where(along, index, -1).amax(dim=1) + 1 + _MARGIN
         ends.append(torch.stack([first, last], dim=1))
     boxes = torch.stack(ends, dim=2)
-    empty = ~masks.flatten(1).any(dim=1)
+    empty = ~along.any(dim=1)
     boxes = torch.where(empty[:, None, None], boxes.new_tensor([[0, 0], [1, 1]]), boxes)
     limit = sizes_px.to(boxes)[:, None]
     return torch.minimum(boxes.clamp_min(0), limit)

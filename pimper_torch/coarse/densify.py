@@ -17,6 +17,8 @@ from pimper_torch.config import Range, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
+from pimper_torch.mapped import stacked, zeros
+from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
 
@@ -98,8 +100,14 @@ def depth_maps(
         level = level_of(scene, factor)
         search = partial(_search, scene, points, level, config, maps[-1] if maps else None)
         solve = partial(_search_or_nothing, search, scene.views.names, level)
-        found = list(side_by_side(solve, range(scene.cameras.num_views)))
-        maps.append(_checked(factor, level, found))
+        # Small results among what threads free would keep their memory from being used again.
+        fields = zeros((2, *level.tone.shape), level.tone.dtype, level.tone.device)
+        found = []
+        for view, one in enumerate(side_by_side(solve, range(scene.cameras.num_views))):
+            fields[0, view], fields[1, view] = one.inverse_depth, one.score
+            found.append(one.replace(inverse_depth=fields[0, view], score=fields[1, view]))
+        maps.append(_checked(factor, level, fields, found))
+        release_memory()
     return tuple(maps)
 
 
@@ -214,10 +222,14 @@ def sweep(
     return (field + at).clamp_min(smallest), score
 
 
-def _checked(factor: int, level: Level, found: Sequence[_Found]) -> DepthMaps:
+def _checked(
+    factor: int,
+    level: Level,
+    fields: Float[Tensor, "2 view height width"],
+    found: Sequence[_Found],
+) -> DepthMaps:
     """Find as valid the depths whose windows match and that other views agree with."""
-    inverse_depth = torch.stack([one.inverse_depth for one in found])
-    score = torch.stack([one.score for one in found])
+    inverse_depth, score = fields
     sources = torch.full((len(found), _NUM_SOURCES), -1, device=score.device)
     for view, one in enumerate(found):
         sources[view, : len(one.sources)] = one.sources
@@ -226,7 +238,7 @@ def _checked(factor: int, level: Level, found: Sequence[_Found]) -> DepthMaps:
     def counted(view: int) -> Int[Tensor, "height width"]:
         return agreeing(level, inverse_depth, good, view, found[view].sources, _MAX_ERROR_PX)
 
-    agreed = torch.stack(list(side_by_side(counted, range(len(found)), tracked=False)))
+    agreed = stacked(side_by_side(counted, range(len(found)), tracked=False), len(found))
     return DepthMaps(
         factor=factor,
         level=level,

@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.kernels.arrays import as_array
+from pimper_torch.mapped import by_view, each
 from pimper_torch.records import Cameras, Record, SparseScene
 
 # Added to radiance over its bright level before the root, so that the noise of black pixels is not
@@ -46,20 +47,24 @@ class Level(Record):
 def level_of(scene: SparseScene, factor: int) -> Level:
     """Reduce the photographs by a whole factor; remainders at the right and the bottom are cut."""
     views, cameras = scene.views, scene.cameras
-    usable = views.inside if views.masks is None else views.inside & views.masks
-    gray = torch.stack(
-        [
-            avg_pool2d(image.mean(dim=0, keepdim=True).nan_to_num(0, 0, 0), factor)[0]
-            for image in views.images
-        ]
-    ).clamp_min(0)
+    usable = views.inside
+    if views.masks is not None:
+        usable = by_view(torch.logical_and, usable, views.masks)
+
+    def reduced(image: Float[Tensor, "channel _ _"]) -> Float[Tensor, "_ _"]:
+        gray = image.mean(dim=0, keepdim=True).nan_to_num(0, 0, 0)
+        return avg_pool2d(gray, factor)[0].clamp_min(0)
+
+    gray = by_view(reduced, views.images)
     # All of a reduced pixel has to be usable: the smallest value is that of the pool's.
-    usable = torch.stack([avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4 for one in usable])
-    shown = gray[usable] if bool(usable.any()) else gray.reshape(-1)
+    usable = by_view(lambda one: avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4, usable)
+    shown = torch.cat([one[lit] for one, lit in each(gray, usable)])
+    shown = shown if len(shown) else gray.reshape(-1)
     rank = min(len(shown), int(_BRIGHT * len(shown)) + 1)
-    bright = shown.kthvalue(rank).values.clamp_min(torch.finfo(gray.dtype).tiny)
+    level = np.partition(shown.cpu().numpy(), rank - 1)[rank - 1]
+    bright = max(float(level), torch.finfo(gray.dtype).tiny)
     return Level(
-        tone=(gray / bright + _PEDESTAL).sqrt(),
+        tone=by_view(lambda one: (one / bright + _PEDESTAL).sqrt(), gray),
         usable=usable,
         cameras=Cameras(
             intrinsics=scale_intrinsics(cameras.intrinsics, 1 / factor, 1 / factor),

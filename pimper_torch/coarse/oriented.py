@@ -15,6 +15,7 @@ from pimper_torch.coarse.matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record, SparseScene
 
@@ -47,6 +48,9 @@ _MAX_NOISE_STEPS = 1.0
 # Neighbours of a dense point that its normal is fitted to, a choice, and how many normals are
 # fitted at once, which bounds memory to tens of MB a thread.
 _COMMON, _AT_ONCE = 24, 10_000
+
+# Points, about, whose cells are averaged at once; they take some 150 bytes each. A choice.
+_SLAB = 2_000_000
 
 # Length of the mean of unit normals round a point, at least: that of normals which scatter by
 # 60 degrees. A choice.
@@ -94,7 +98,15 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
             clouds.append(cloud)
         return OrientedPoints.cat(clouds)
 
-    return OrientedPoints.cat(list(side_by_side(of_view, range(maps[0].valid.shape[0]))))
+    most, count = sum(int(one.valid.count_nonzero()) for one in maps), 0
+    like = maps[0].inverse_depth
+    rows = zeros((most, 7), like.dtype, like.device)
+    for cloud in side_by_side(of_view, range(maps[0].valid.shape[0])):
+        found = cloud.points_world, cloud.normals_world, cloud.noise[:, None]
+        rows[count : count + len(cloud.noise)] = torch.cat(found, dim=1)
+        count += len(cloud.noise)
+    points, normals, noise = torch.split(rows[:count], [3, 3, 1], dim=1)
+    return OrientedPoints(points_world=points, normals_world=normals, noise=noise[:, 0])
 
 
 def _covered(
@@ -232,11 +244,25 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
 
 
 def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
+    """Average the points of each cell, slab by slab along the first axis."""
     points = cloud.points_world
     if len(points) == 0:
         return cloud
-    index = ((points - points.amin(dim=0)) / cell).floor().long()
-    side = index.amax(dim=0) + 1
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    side = ((high - low) / cell).floor().long() + 1
+    column = ((points[:, 0] - low[0]) / cell).floor().long()
+    slab = torch.bincount(column).cumsum(dim=0).sub(1).div(_SLAB, rounding_mode="floor")[column]
+    numbers = torch.unique(slab).tolist()
+    slabs = [_of_slab(cloud.take(slab == number), cell, low, side) for number in numbers]
+    return OrientedPoints.cat(slabs)
+
+
+def _of_slab(
+    cloud: OrientedPoints, cell: float, low: Float[Tensor, "3"], side: Int[Tensor, "3"]
+) -> OrientedPoints:
+    """Average the points of each cell of a grid with so many cells a side from a corner."""
+    points = cloud.points_world
+    index = ((points - low) / cell).floor().long()
     facing = cloud.normals_world.abs().argmax(dim=-1)
     towards = cloud.normals_world.gather(1, facing[:, None])[:, 0] > 0
     key = (index[:, 0] * side[1] + index[:, 1]) * side[2] + index[:, 2]

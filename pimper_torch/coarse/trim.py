@@ -1,6 +1,7 @@
 """Which faces of a closed surface the photographs support."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -94,7 +95,7 @@ def view_counts(
         return torch.stack([seen, lit, behind])
 
     counts = side_by_side(of_view, range(cameras.num_views), tracked=False)
-    seen, lit, behind = torch.stack(list(counts)).sum(dim=0)
+    seen, lit, behind = reduce(torch.add, counts)
     return ViewCounts(seen=seen, lit=lit, behind=behind)
 
 

@@ -7,9 +7,13 @@ from pimper_torch.doctor.photograph import Photograph
 
 # Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
 # photographs of 900x600, 13.0 megapixels in all) 112 s and 2.06 GB, the jar (30 of 1600x1200, 57.6
-# megapixels) 364 s and 6.7 GB. The jar at 800 pixels (14.4 megapixels) took 2.29 GB; the line says
-# 2.2. Stages share them as in runs of the jar, the mug and the demo, from 0.3 to 57.6 megapixels.
-_GB, _GB_A_MEGAPIXEL = 0.7, 0.104
+# megapixels) 364 s and 6.7 GB. Stages share the time as in runs of the jar, the mug and the demo,
+# from 0.3 to 57.6 megapixels. Of the memory 64 bytes a pixel were photographs, which are on disk
+# where they are large; what is left grows with the surface, and so with the pixels of one
+# photograph: 1.2 GB for the demo, 3.0 for the jar. Depth maps take 7.3 MB a photograph
+# (docs/decisions.md, "Photographs on disk").
+_GB, _GB_A_MEGAPIXEL_OF_ONE, _GB_A_VIEW = 0.9, 1.25, 0.0073
+_GB_OF_DISK = 0.045  # a megapixel: photographs twice, masks, silhouettes and pyramids
 
 
 def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
@@ -17,10 +21,11 @@ def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
 
     >>> seconds, gigabytes = estimate(57.6, 30)
     >>> round(seconds), round(gigabytes, 2)
-    (355, 6.69)
+    (355, 3.3)
     """
     seconds = sum(seconds for _, seconds in planned(megapixels, num_views))
-    return seconds, _GB + _GB_A_MEGAPIXEL * megapixels
+    surface = _GB_A_MEGAPIXEL_OF_ONE * megapixels / max(1, num_views)
+    return seconds, _GB + max(surface, _GB_A_VIEW * num_views)
 
 
 def planned(
@@ -66,11 +71,13 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
     told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
+    if (disk := _GB_OF_DISK * megapixels) > needed:
+        told = f"{told}; {disk:.0f} GB of disk for temporary files"
     if available_gb is None or needed <= available_gb:
         yield ok("cost", told)
         return
     longest = max(max(one.width, one.height) for one in photographs)
-    fits = max(0.0, (0.9 * available_gb - _GB) / _GB_A_MEGAPIXEL)
+    fits = max(0.0, (0.9 * available_gb - _GB) / _GB_A_MEGAPIXEL_OF_ONE) * len(photographs)
     size = int(longest * min(1.0, fits / megapixels) ** 0.5) // 50 * 50
     smaller = f"Give `--max-size-px {size}`, or fewer photographs."
     yield warned(

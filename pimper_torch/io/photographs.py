@@ -21,6 +21,7 @@ from pimper_torch.io.focal_lengths import focals_px
 from pimper_torch.io.header import Header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.turned_masks import choose_ways, mask_ways
+from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
 
@@ -115,19 +116,19 @@ def load_views(
     pictures = read_pictures(paths, headers, sizes, encoding)
     images = pictures.images
     has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
-    drawn = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
-    opacities = []
+    drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
+    opacities, dark = [], False
     if mask_paths is not None:
         ways = _read_masks(mask_paths, paths, headers)
         opacities = _laid(ways, images, sizes, Path(str(masks)))
-    if opacities and _is_dark(opacities, mask_object, Path(str(masks))):
-        opacities = [1 - opacity for opacity in opacities]
+        dark = _is_dark(opacities, mask_object, Path(str(masks)))
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if opacities:
-            opacity = opacities[index]
+            opacity = 1 - opacities[index] if dark else opacities[index]
             drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
+        drop_pages()
     _refuse_black(images, sizes, names, Path(folder))
     if has_masks and not opacities:
         _tell_alpha(pictures.opaque, names, Path(folder))
@@ -403,7 +404,7 @@ def _is_dark(
     if mask_object != "auto":
         return mask_object == "dark"
     border, centre = [], []
-    for opacity in opacities:
+    for (opacity,) in each(opacities):
         high, wide = opacity.shape
         border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
         border.append(opacity[:, -1].mean())
@@ -437,15 +438,13 @@ def _read_masks(
 ) -> list[list[Float[Tensor, "_ _"]]]:
     """Read 1 on the object, 0 off it, in the ways in which each mask may lie on its photograph."""
     masks = [read_header(path) for path in paths]
-    # One of another size is refused without decoding it.
-    levels = [
-        _brightness(path)
-        if sorted((mask.width, mask.height)) == sorted((header.width, header.height))
-        else torch.zeros(mask.height, mask.width)
-        for path, mask, header in zip(paths, masks, headers, strict=True)
-    ]
-    each = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
-    return [mask_ways(*one) for one in each]
+    levels = parts([(mask.height, mask.width) for mask in masks])
+    for (level,), path, mask, header in zip(each(levels), paths, masks, headers, strict=True):
+        # One of another size is refused without decoding it.
+        if sorted((mask.width, mask.height)) == sorted((header.width, header.height)):
+            level.copy_(_brightness(path))
+    drawn = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
+    return [mask_ways(*one) for one in drawn]
 
 
 def _laid(
@@ -479,10 +478,12 @@ def _brightness(path: Path) -> Float[Tensor, "height width"]:
     return drawn if bool(drawn.any()) else opaque
 
 
-def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> list[Float[Tensor, "_ _"]]:
-    """Return 1 where a mask is at least half as bright as the brightest of all masks."""
-    half = max(float(level.max()) for level in levels) / 2
-    return [((level >= half) & (level > 0)).float() for level in levels]
+def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor, "_ _"]]:
+    """Write 1 where a mask is at least half as bright as the brightest of all, 0 elsewhere."""
+    half = max(float(level.max()) for (level,) in each(levels)) / 2
+    for (level,) in each(levels):
+        level.copy_((level >= half) & (level > 0))
+    return levels
 
 
 def _refuse_black(
@@ -493,7 +494,7 @@ def _refuse_black(
 ) -> None:
     lit = [
         float((image[:, :high, :wide] > _BLACK).float().mean()) > _LIT_FRACTION
-        for image, (wide, high) in zip(images, sizes, strict=True)
+        for (image,), (wide, high) in zip(each(images), sizes, strict=True)
     ]
     black = [name for name, one in zip(names, lit, strict=True) if not one]
     if black:
@@ -512,7 +513,7 @@ def _judge_saturation(
     """Refuse photographs saturated all over, and warn of those with hardly anything else."""
     usable = [
         float((image.amax(dim=0)[mask] < SATURATED).float().mean())
-        for image, mask in zip(images, drawn, strict=True)
+        for image, mask in each(images, drawn)
     ]
     blind = [
         name for name, fraction in zip(names, usable, strict=True) if fraction <= _LIT_FRACTION
@@ -539,7 +540,7 @@ def _judge_saturation(
 def _refuse_empty(
     drawn: Bool[Tensor, "view height width"], names: tuple[str, ...], folder: Path | None
 ) -> None:
-    empty = [name for name, mask in zip(names, drawn, strict=True) if not bool(mask.any())]
+    empty = [name for name, (mask,) in zip(names, each(drawn), strict=True) if not bool(mask.any())]
     if empty:
         where = f"{folder}: the masks" if folder else "the alpha channels"
         raise InputError(

@@ -14,6 +14,7 @@ from pimper_torch.errors import InputError, caution
 from pimper_torch.io.decode import Decoded, decode
 from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
+from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.progress import track
 from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, Srgb, find_saturation
 from pimper_torch.radiometry.primaries import in_srgb_primaries
@@ -81,7 +82,7 @@ def read_pictures(
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
     _refuse_padding(files, sizes_px, channels)
-    images = torch.zeros(len(files), channels, height, width)
+    images = zeros((len(files), channels, height, width))
     given = None if encoding.saturation == "auto" else encoding
     opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
     whites = _found(tallies)
@@ -186,6 +187,7 @@ def _fill(
         whites: Levels of saturation that were found.
     """
     opaque: list[Tensor | None] = []
+    drawn: Tensor | None = None
     tallies: dict[_Kind, _Tally] = {}
     for index in track(range(len(paths))):
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
@@ -199,11 +201,13 @@ def _fill(
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
         opaque.append(None)
         if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
-            drawn = torch.zeros(images.shape[-2:], dtype=torch.bool)
-            drawn[:high, :wide] = resized_mask(decoded.alpha, wide, high)
-            opaque[-1] = drawn
+            if drawn is None:
+                drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
+            drawn[index, :high, :wide] = resized_mask(decoded.alpha, wide, high)
+            opaque[-1] = drawn[index]
         if tally:
             tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
+        drop_pages()
     return tuple(opaque), tallies
 
 

@@ -20,6 +20,7 @@ from pimper_torch.io.estimates import mask_path
 from pimper_torch.io.finish import Finished, MeshFiles, finished
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.io.reports import lights_report, summary_report
+from pimper_torch.mapped import each
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
@@ -205,8 +206,10 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
 def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:
     folder.mkdir()
     names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
-    for name, mask, (width, height) in zip(names, silhouettes.masks, sizes, strict=True):
-        drawn = mask[:height, :width].to(torch.uint8) * 255
+    for name, (inside,), (width, height) in zip(
+        names, each(silhouettes.inside), sizes, strict=True
+    ):
+        drawn = (inside[:height, :width] > 0.5).to(torch.uint8) * 255
         path = mask_path(folder, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(drawn.numpy()).save(path)

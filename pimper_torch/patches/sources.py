@@ -14,6 +14,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import as_array
+from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.pyramid import halve
 from pimper_torch.radiometry import SATURATED
@@ -144,15 +145,15 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
         levels: Maximum number; small photographs have fewer.
     """
     images = views.images
-    if not all(bool(image.isfinite().all()) for image in images):
+    if not all(bool(image.isfinite().all()) for (image,) in each(images)):
         # NaN times a weight of 0 is NaN; zeros are marked as unusable.
-        images = torch.where(images.isfinite(), images, 0)
+        images = by_view(lambda image: torch.where(image.isfinite(), image, 0), images)
     count, _, height, width = images.shape
     sizes = _sizes(height, width, levels)
     one = partial(_one, views, images, saturation_level, len(sizes))
     parts = side_by_side(one, range(count), tracked=False)
     first = next(parts)
-    filled = tuple(part.new_empty(count, *part.shape) for part in first)
+    filled = tuple(zeros((count, *part.shape), part.dtype, part.device) for part in first)
     for view, found in enumerate(chain([first], parts)):
         for whole, part in zip(filled, found, strict=True):
             whole[view] = part

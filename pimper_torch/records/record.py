@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from pimper_torch.errors import InputError
+from pimper_torch.mapped import taken
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Index = Sequence[int] | slice | Tensor
@@ -124,7 +125,7 @@ class Record:
                 changes[name] = value.take(index)
             elif value is not None:
                 place = index.to(value.device) if isinstance(index, Tensor) else index
-                changes[name] = value[place]
+                changes[name] = taken(value, place)
         return self.replace(**changes)
 
     @classmethod

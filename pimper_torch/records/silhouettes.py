@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.mapped import by_view
 from pimper_torch.records.record import Record
 from pimper_torch.records.views import Views
 
@@ -46,7 +47,7 @@ class Silhouettes(Record):
         """
         reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
         return cls(
-            inside=views.inside.float(),
+            inside=by_view(Tensor.float, views.inside),
             reliable=reliable,
             source="everything",
             planes_world=(no_planes() if planes_world is None else planes_world).to(views.images),
@@ -55,4 +56,4 @@ class Silhouettes(Record):
     @property
     def masks(self) -> Bool[Tensor, "view height width"]:
         """True where the pixel more likely shows the object than not."""
-        return self.inside > 0.5
+        return by_view(lambda inside: inside > 0.5, self.inside)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.mapped import by_view
 from pimper_torch.records.faults import no_pinhole, not_rigid, once
 from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
@@ -69,9 +70,7 @@ class Views(Record):
         height, width = self.images.shape[-2:]
         columns = torch.arange(width, device=self.images.device)
         rows = torch.arange(height, device=self.images.device)
-        in_width = columns < self.sizes_px[:, 0, None]
-        in_height = rows < self.sizes_px[:, 1, None]
-        return in_height[:, :, None] & in_width[:, None, :]
+        return by_view(lambda size: (rows < size[1])[:, None] & (columns < size[0]), self.sizes_px)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

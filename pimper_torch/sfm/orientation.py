@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
+from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
 from pimper_torch.sfm.crops import resize_fits
 from pimper_torch.sfm.model import SparseModel, longest_tracks
@@ -229,4 +230,5 @@ def _squares(model: SparseModel, views: Views, allowed: Bool[Tensor, "view 4"]) 
             centers = turned_pixels(some.observation_pixels[here] * scale, *before, quarters)
             across = turned_vectors(sides[here], quarters)
             patterns[here, quarters] = squares_in(picture, centers, across)
+        drop_pages()
     return Squares(some, patterns)

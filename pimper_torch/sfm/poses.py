@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, some
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.sound_views import with_views
@@ -48,8 +49,8 @@ def pictures_of_poses(views: Views) -> Views:
     first = views.take([int(own[0]) for own in groups])
     masks = views.masks
     return first.replace(
-        images=torch.stack([views.images[own].mean(dim=0) for own in groups]),
-        masks=None if masks is None else torch.stack([masks[own].any(dim=0) for own in groups]),
+        images=by_view(lambda own: views.images[own].mean(dim=0), groups),
+        masks=None if masks is None else by_view(lambda own: masks[own].any(dim=0), groups),
         focals_px=torch.stack([views.focals_px[own].nanmedian() for own in groups]),
         poses=None,
     )
@@ -155,10 +156,10 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
 
 def _texture(views: Views) -> Float[Tensor, " view"]:
     """Compute the mean step of the square root of radiance between neighbouring pixels."""
-    level = views.images.detach().mean(dim=1).clamp(0, 1).sqrt()
-    return torch.stack(
-        [
-            one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()
-            for one, (wide, high) in zip(level, views.sizes_px.tolist(), strict=True)
-        ]
-    )
+
+    def of_view(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Float[Tensor, ""]:
+        wide, high = size.tolist()
+        one = image.detach().mean(dim=0).clamp(0, 1).sqrt()
+        return one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()
+
+    return by_view(of_view, views.images, views.sizes_px)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.mapped import zeros
 from pimper_torch.records import Lens, Views
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
@@ -119,7 +120,7 @@ def turned_views(views: Views, quarters: Sequence[int]) -> Views:
         for (width, height), turns in zip(views.sizes_px.tolist(), quarters, strict=True)
     ]
     wide, high = (max(sides) for sides in zip(*sizes, strict=True))
-    images = views.images.new_zeros(*views.images.shape[:2], high, wide)
+    images = zeros((*views.images.shape[:2], high, wide), views.images.dtype, views.images.device)
     masks = None if views.masks is None else views.masks.new_zeros(len(sizes), high, wide)
     for view, ((width, height), turns) in enumerate(zip(sizes, quarters, strict=True)):
         before = turned_size(width, height, turns)

@@ -16,6 +16,7 @@ from pimper_torch.errors import (
     some,
 )
 from pimper_torch.ledger import kept_entries, leave_out, noted_entries, repeat_entries
+from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.components import choose_component
@@ -285,7 +286,7 @@ def _require_finite(views: Views) -> None:
     """Refuse pixels that are no numbers, which resampling would spread over their neighbours."""
     odd = [
         f"{name} ({int((~image.isfinite()).any(dim=0).sum())} pixels)"
-        for name, image in zip(views.names, views.images, strict=True)
+        for name, (image,) in zip(views.names, each(views.images), strict=True)
         if not bool(image.isfinite().all())
     ]
     if odd:

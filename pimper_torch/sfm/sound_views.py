@@ -10,6 +10,7 @@ from pimper_torch.errors import ReconstructionError
 from pimper_torch.failures import skipped
 from pimper_torch.geometry.projection import project
 from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import each
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Failure, SparseScene
 
@@ -94,14 +95,13 @@ def _failure(what: str, name: str, reason: str, done: str) -> Failure:
 def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
     """List the views that cannot be used, each with the reason."""
     inside, masks = scene.views.inside, scene.views.masks
-    for view in range(scene.views.num_views):
-        shown = inside[view]
+    for view, (image, shown) in enumerate(each(scene.views.images, inside)):
         if masks is not None:
             shown = shown & masks[view]
         reason = _nowhere(scene, view)
         if not reason and not bool(shown.any()):
             reason = "its mask is empty"
-        reason = reason or _blank(scene.views.images[view], shown)
+        reason = reason or _blank(image, shown)
         if reason:
             yield view, reason
 

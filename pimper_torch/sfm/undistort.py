@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.mapped import zeros
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
@@ -34,16 +35,19 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         half; what touches a saturated pixel is saturated. Differentiable in the radiance. A
         view without distortion is left untouched.
     """
-    images = torch.empty_like(views.images)  # takes memory only where it is written
-    valid = torch.zeros_like(views.images[:, 0], dtype=torch.bool)
+    pinholes = pinholes_for(lenses).to(views.images)
+    if all(map(is_pinhole, lenses)):
+        return views, pinholes
+    shape, device = views.images.shape, views.images.device
+    images = zeros(shape, views.images.dtype, device)
+    valid = zeros((shape[0], *shape[2:]), torch.bool, device)
     whole = views.masks is None
     for index, (image, inside) in enumerate(undistorted(views, lenses)):
         height, width = inside.shape
-        images[index, :, height:], images[index, :, :, width:] = 0, 0
         images[index, :, :height, :width], valid[index, :height, :width] = image, inside
         whole = whole and bool(inside.all())
     masks = None if whole else valid
-    return views.replace(images=images, masks=masks), pinholes_for(lenses).to(views.images)
+    return views.replace(images=images, masks=masks), pinholes
 
 
 def undistorted(

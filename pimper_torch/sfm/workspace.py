@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pimper_torch.mapped import drop_pages
 from pimper_torch.memory import release_memory
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
@@ -85,3 +86,4 @@ def _write(views: Views, index: int, space: Workspace) -> None:
     if views.masks is not None:
         mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
         Image.fromarray(mask).save(space.masks / f"{space.files[index]}.png", compress_level=1)
+    drop_pages()

@@ -16,6 +16,7 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from pimper_torch.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.mapped import by_view, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Silhouettes
 from pimper_torch.silhouettes.contours import box_round
@@ -56,16 +57,21 @@ class _Conflicts:
         Args:
             chosen: Views that take part; all others have no conflicts.
         """
-        denied, seen = (one & chosen[:, None, None] for one in (self.denied, self.seen))
-        count, most = denied.sum(dim=1), chosen.sum() - 1
-        count = torch.where(seen.sum(dim=1) >= _SEEN * most, count, len(chosen))
-        fewest = count.amin(dim=-1)
-        valid = fewest < len(chosen)
-        best = (count == fewest[..., None]) & valid[..., None]
-        share = (denied & best[:, None]).sum(dim=-1) / best.sum(dim=-1).clamp_min(1)[:, None]
-        total = valid.sum(dim=-1).clamp_min(1)
-        own = (valid & (fewest > 0)).sum(dim=-1) / total
-        return own * chosen, share.sum(dim=-1) / total[:, None] * chosen[:, None]
+        most = chosen.sum() - 1
+
+        def of_view(denied: Tensor, seen: Tensor) -> Tensor:
+            denied, seen = (one & chosen[:, None, None] for one in (denied, seen))
+            count = torch.where(seen.sum(dim=0) >= _SEEN * most, denied.sum(dim=0), len(chosen))
+            fewest = count.amin(dim=-1)
+            valid = fewest < len(chosen)
+            best = (count == fewest[:, None]) & valid[:, None]
+            share = (denied & best).sum(dim=-1) / best.sum(dim=-1).clamp_min(1)
+            total = valid.sum().clamp_min(1)
+            own = (valid & (fewest > 0)).sum() / total
+            return torch.cat([own[None], share.sum(dim=-1) / total])
+
+        found = by_view(of_view, self.denied, self.seen) * chosen[:, None]
+        return found[:, 0], found[:, 1:]
 
 
 def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> Bool[Tensor, " view"]:
@@ -81,7 +87,8 @@ def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> Bool[Tensor, " 
     box = box_round(silhouettes, cameras)
     if box is None:
         return torch.zeros_like(silhouettes.reliable)
-    conflicts = _conflicts(silhouettes.masks[views], cameras.take(views.tolist()), box)
+    masks = silhouettes.take(views.tolist()).masks
+    conflicts = _conflicts(masks, cameras.take(views.tolist()), box)
     left = torch.ones(len(views), dtype=torch.bool)
     while left.sum() >= max(3, len(views) // 2 + 1):
         own, with_others = conflicts.of(left)
@@ -102,8 +109,9 @@ def _conflicts(
 ) -> _Conflicts:
     """Follow rays through pixels of each silhouette in smaller pictures."""
     by = max(1, math.ceil(max(masks.shape[1:]) / _SIZE_PX))
-    pooled = (max_pool2d(mask[None].float().cpu(), by, ceil_mode=True)[0] > 0 for mask in masks)
-    small = torch.stack(list(pooled))
+    small = by_view(
+        lambda mask: max_pool2d(mask[None].float().cpu(), by, ceil_mode=True)[0] > 0, masks
+    )
     cameras = cameras.to("cpu").to(torch.float32)
     cameras = cameras.replace(
         intrinsics=scale_intrinsics(cameras.intrinsics, 1 / by, 1 / by),
@@ -126,8 +134,11 @@ def _conflicts(
         reach = step[:, None] * cameras.intrinsics[:, 0, 0, None, None] / depth
         return seen & (value < -reach - _SLACK * max(height, width)), seen
 
-    denied, seen = zip(*side_by_side(followed, range(len(small)), tracked=False), strict=True)
-    return _Conflicts(denied=torch.stack(denied), seen=torch.stack(seen))
+    shape = len(small), len(small), _PIXELS, _PLACES
+    conflicts = _Conflicts(denied=zeros(shape, torch.bool), seen=zeros(shape, torch.bool))
+    for view, found in enumerate(side_by_side(followed, range(len(small)), tracked=False)):
+        conflicts.denied[view], conflicts.seen[view] = found
+    return conflicts
 
 
 def _places(

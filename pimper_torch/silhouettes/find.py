@@ -7,6 +7,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
 from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.sfm.poses import OneAPose
 from pimper_torch.silhouettes.agreement import Agreement, agreement_of
@@ -54,7 +55,9 @@ class FindSilhouettes(Stage):
             return Silhouettes.everything(scene.views)
         if masks is not None:
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
-            found = Silhouettes(inside=masks.float(), reliable=reliable, source="masks")
+            found = Silhouettes(
+                inside=by_view(Tensor.float, masks), reliable=reliable, source="masks"
+            )
             return self._agreeing(_believed(found, scene.views.names), scene)
         if config.object == "masks":
             raise InputError(
@@ -82,11 +85,11 @@ class FindSilhouettes(Stage):
         hull = None
         if box is not None:
             hull = visual_hull(others, cameras, box.float(), num_voxels=self.details.num_voxels)
-        # What looks past a photograph's edge once it is undistorted is black.
-        shown = scene.views.inside & (scene.views.images.detach().amax(dim=1) > 0)
-        inside = silhouettes.inside.clone()
+        within = scene.views.inside
+        inside = by_view(Tensor.detach, silhouettes.inside)
         for view in doubted.nonzero()[:, 0].tolist():
-            inside[view] = shown[view].to(inside)
+            # What looks past a photograph's edge once it is undistorted is black.
+            inside[view] = within[view] & (scene.views.images[view].detach().amax(dim=0) > 0)
             if hull is not None:
                 width, height = (int(side) for side in scene.views.sizes_px[view])
                 K, pose = cameras.intrinsics[view], cameras.cam_from_world[view]
@@ -158,7 +161,7 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
         silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
             that were not believed.
     """
-    used = silhouettes.inside > _USED
+    used = by_view(lambda inside: inside > _USED, silhouettes.inside)
     given = scene.views.masks
     if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene
@@ -185,7 +188,7 @@ def of_all_photographs(
 def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
     """Take empty silhouettes for unreliable: the hull of all views would be empty."""
     leave_out("silhouettes.unreliable", ~silhouettes.reliable, names=names)
-    empty = silhouettes.reliable & ~(silhouettes.inside > 0.5).flatten(1).any(dim=1)
+    empty = silhouettes.reliable & ~by_view(lambda inside: (inside > 0.5).any(), silhouettes.inside)
     leave_out("silhouettes.empty", empty, names=names)
     if not bool(empty.any()):
         return silhouettes

@@ -13,6 +13,7 @@ from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.geometry.projection import rays_through
+from pimper_torch.mapped import parts
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, Silhouettes
 from pimper_torch.silhouettes.opencv import signed_distance
@@ -193,7 +194,10 @@ def visual_hull(
         other = torch.zeros_like(masks[view]) if unknown is None else unknown[view]
         return _framed(masks[view], other, cameras.sizes_px[view].tolist())
 
-    maps = list(side_by_side(framed, views, tracked=False))
+    sizes = [(high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
+    maps = parts(sizes, masks.device)
+    for whole, found in zip(maps, side_by_side(framed, views, tracked=False), strict=True):
+        whole.copy_(found)
     chosen = cameras.take(views)
     low, high = box_world.to(chosen.intrinsics)
     first = _voted(maps, chosen, box_world, _FIRST, (disagreeing, min_seen))

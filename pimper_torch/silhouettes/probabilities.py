@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from pimper_torch.mapped import zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes.agreement import agreement_of, repaired
@@ -40,7 +41,7 @@ def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"
         inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
         return torch.where((border < -2) & (hull > 2), _UNSURE_OUTSIDE, inside)
 
-    found = torch.empty(len(cuts.masks), height, width, device=device)
+    found, within = zeros((len(cuts.masks), height, width), device=device), views.inside
     for view, inside in enumerate(side_by_side(enlarged, range(len(cuts.masks)), tracked=False)):
-        found[view] = inside.to(device)
-    return found * views.inside
+        found[view] = inside.to(device) * within[view]
+    return found

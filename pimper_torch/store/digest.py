@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from pimper_torch.mapped import LARGE, drop_pages
+
 _BYTES = 16
 # Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
 # hand on the same tensors, and writing into a tensor counts up its version.
@@ -95,7 +97,9 @@ def _tensor(tensor: Tensor) -> str:
     flat = tensor.detach().cpu().resolve_conj().resolve_neg().reshape(-1)
     if flat.stride() != (1,):  # one entry may have any stride
         flat = flat.clone(memory_format=torch.contiguous_format)
-    hashed.update(flat.view(torch.uint8).numpy().data)
+    for part in torch.split(flat.view(torch.uint8), LARGE):
+        hashed.update(part.numpy().data)
+        drop_pages()
     found = hashed.hexdigest()
     _known[tensor] = (version, found)
     return found

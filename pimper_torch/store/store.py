@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from pimper_torch.errors import OutputError, PimperError
+from pimper_torch.mapped import copied
 from pimper_torch.records import Record
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.store.digest import digest
@@ -138,7 +139,7 @@ def settled(record: AnyRecord) -> AnyRecord:
             return value
         if value.is_contiguous() and value.data_ptr() % _ALIGNMENT == 0:
             return value
-        return copies.setdefault(id(value), value.clone(memory_format=torch.contiguous_format))
+        return copies.setdefault(id(value), copied(value))
 
     found: AnyRecord = pytree.tree_map(one, record)
     return found
