@@ -17,6 +17,15 @@ from pimper_torch.records import PatchSet
 # 3.0 million (benchmarks/speed.py).
 _BYTES_PER_VERTEX = 1200
 
+# Bytes for each vertex where it goes by blocks, for the coarser mesh that is solved whole; what is
+# kept of all vertices meanwhile; and bytes for each vertex of a block: 740, 285 and 1,370 for a jar
+# of 1.06 million in 8 blocks.
+_BYTES_BY_BLOCKS, _BYTES_KEPT, _BYTES_OF_BLOCK = 750, 300, 1400
+
+# Halvings of the limit that a block may take at most: a choice. A few hundred facets are the least
+# that is worth a block.
+_HALVINGS = 6
+
 # Vertices of the surface for each square of their spacing: 1.6 in the demo. Equilateral triangles
 # have 1.15, but an edge is cut as the finer of its facets asks for.
 _PER_SQUARE = 1.6
@@ -38,34 +47,46 @@ def bytes_of(size: str, field: str = "max_memory") -> float:
     return float(found[1]) * _UNITS[found[2].upper()]
 
 
-def require_memory(limit: float, patches: PatchSet, scale: float, last: float) -> None:
-    """Refuse a run whose last round would take more memory than it may.
+def largest_problem(limit: float, patches: PatchSet, scale: float, last: float) -> float:
+    """Return how many vertices the fusion may solve for at once; infinite where all fit.
+
+    Blocks take a half, a quarter or a smaller such part of the limit, so that their number does not
+    depend on a few bytes that are held.
 
     Args:
         limit: Bytes that the process may hold.
-        scale: Of the photographs in that round.
+        scale: Of the photographs in this round.
         last: Of the photographs in the last one.
+
+    Raises:
+        ReconstructionError: The last round would take more memory than it may, by blocks too.
     """
     if math.isinf(limit):
-        return
+        return math.inf
     mesh, spacing = patches.coarse.mesh, float(patches.buckets[0].spacing[0].detach())
     area = float(face_normals(mesh.vertices_world.detach(), mesh.faces).norm(dim=1).sum()) / 2
     vertices = _PER_SQUARE * area / (spacing * scale / last) ** 2
     held = resident_bytes()
-    needed = held + _BYTES_PER_VERTEX * vertices
-    if needed > limit:
-        room = max(limit - held, 0.0) / (_BYTES_PER_VERTEX * vertices)
+    if held + _BYTES_PER_VERTEX * vertices <= limit:
+        return math.inf
+    room = limit - held - _BYTES_KEPT * vertices
+    parts = [limit / 2**power for power in range(1, _HALVINGS + 1)]
+    part = next((part for part in parts if part <= room), None)
+    needed = held + _BYTES_BY_BLOCKS * vertices
+    if part is None or needed > limit:
+        fraction = max(limit - held, 0.0) / (_BYTES_BY_BLOCKS * vertices)
         advice = (
             f"Shrink the photographs (`--max-size-px`) or take fewer samples "
-            f"(`decompose.samples_per_pixel`) by a factor of {room**0.5:.2f} a side."
-            if room > 0
+            f"(`decompose.samples_per_pixel`) by a factor of {fraction**0.5:.2f} a side."
+            if fraction > 0
             else "The photographs alone take that: shrink them (`--max-size-px`)."
         )
         raise ReconstructionError(
             f"max_memory is {limit / 1e9:.1f} GB, but the surface will have about "
-            f"{vertices / 1e6:.1f} million vertices, and its fusion takes about "
+            f"{vertices / 1e6:.1f} million vertices, and its fusion by blocks takes about "
             f"{needed / 1e9:.1f} GB in all, {held / 1e9:.1f} of which are held now. {advice}"
         )
+    return part / _BYTES_OF_BLOCK
 
 
 def resident_bytes() -> float:

@@ -1,11 +1,12 @@
 import mmap
+from contextlib import suppress
 
 import pytest
 from probes import small_scene
 
 import pimper_torch as pt
 from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.memory import bytes_of, require_memory, resident_bytes
+from pimper_torch.memory import bytes_of, largest_problem, resident_bytes
 from pimper_torch.patches.decompose import Decompose
 
 
@@ -20,15 +21,28 @@ def test_what_is_no_size_is_refused(text):
         pt.load_config("default", {"max_memory": text})
 
 
-def test_a_run_that_would_take_more_than_it_may_is_refused_with_what_it_needs():
+def test_a_surface_is_fused_whole_by_blocks_or_not_at_all(monkeypatch):
     scene, coarse = small_scene(num_views=6, width=64)
     patches = Decompose()(coarse, scene.cameras)
-    require_memory(float("inf"), patches, 0.5, 1.0)
-    require_memory(resident_bytes() + 1e9, patches, 0.5, 1.0)
-    with pytest.raises(ReconstructionError, match=r"in all.*by a factor of 0\.\d+ a side"):
-        require_memory(resident_bytes() + 2e6, patches, 0.5, 1.0)
+    assert largest_problem(float("inf"), patches, 0.5, 1.0) == float("inf")
+    assert largest_problem(resident_bytes() + 1e9, patches, 0.5, 1.0) == float("inf")
+    monkeypatch.setattr("pimper_torch.memory.resident_bytes", lambda: 1e5)
+    with pytest.raises(
+        ReconstructionError, match=r"by blocks.*in all.*by a factor of 0\.\d+ a side"
+    ):
+        largest_problem(2e5, patches, 0.5, 1.0)
     with pytest.raises(ReconstructionError, match="photographs alone"):
-        require_memory(1e6, patches, 0.5, 1.0)
+        largest_problem(9e4, patches, 0.5, 1.0)
+    found = []
+    for step in range(100):
+        limit = 1e5 * 1.1**step
+        with suppress(ReconstructionError):
+            found.append(limit / largest_problem(limit, patches, 0.5, 1.0))
+    # Parts of the limit, in vertices of blocks: none where all fits, the larger limits.
+    first = next(index for index, part in enumerate(found) if part == 0)
+    assert first > 0
+    assert not any(found[first:])
+    assert all(part / found[0] in (0.25, 0.5, 1, 2, 4) for part in found[:first])
 
 
 def test_what_is_held_is_what_was_allocated():

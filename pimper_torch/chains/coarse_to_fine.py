@@ -1,5 +1,6 @@
 """The chain from coarse to fine: all facets together, each pass on the surface before."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +25,7 @@ from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SURFACE, SWEEP
 from pimper_torch.kernels.switch import Kernels
-from pimper_torch.memory import bytes_of, release_memory, require_memory
+from pimper_torch.memory import bytes_of, largest_problem, release_memory
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -62,7 +63,8 @@ class CoarseToFineConfig:
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
             what is constant to autograd: structure from motion, the coarse surface (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
-        max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
+        max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
+            the first pass.
         hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
@@ -122,7 +124,7 @@ class CoarseToFine(Chain):
         self.warp: Warping = Warp(config.warp)
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
-        self.fuse: Callable[[SweptPatches, Contours, bool], Surface] = Fuse(config.fuse)
+        self.fuse: Callable[..., Surface] = Fuse(config.fuse)
         self.repair: Callable[[Surface], Surface] = Repair()
         self.remesh: Callable[[SweptPatches, Surface, Contours], CoarseMesh] = Remesh(config.remesh)
         self.extract = Extract(config.extract)
@@ -152,6 +154,7 @@ class CoarseToFine(Chain):
         sources = Prepared(self.warp, scene.views)
         heights: SweptPatches | None = None
         surface: Surface | None = None
+        by_blocks: tuple[float, ...] = ()
         first, last = self.config.scales[0], len(self.config.scales)
         for number, scale in enumerate(self.config.scales, start=1):
             with held() as cautions:
@@ -160,7 +163,8 @@ class CoarseToFine(Chain):
                 patches = self.decompose(coarse, cameras, surface, scale)
                 if number == 1:
                     limit = bytes_of(self.config.max_memory)
-                    require_memory(limit, patches, first, self.config.scales[-1])
+                    most = largest_problem(limit, patches, first, self.config.scales[-1])
+                    by_blocks = () if math.isinf(most) else (most,)
                 heights = self.kept(
                     photometry_and_heights,
                     self.warp,
@@ -176,7 +180,9 @@ class CoarseToFine(Chain):
                 release_memory()
                 if number == 1:
                     self.need(SURFACE)
-                surface = self.repair(self.kept(self.fuse, heights, contours, number == last))
+                surface = self.repair(
+                    self.kept(self.fuse, heights, contours, number == last, *by_blocks)
+                )
             if number == last:  # what earlier passes would warn of as well
                 for message in cautions:
                     caution(message, stacklevel=3)

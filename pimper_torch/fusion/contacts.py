@@ -26,11 +26,13 @@ class Contacts(Record):
         points: World.
         lines: Along which they are known, unit.
         variance: Of where they are along these; scene units squared.
+        facet: Nearest to each.
     """
 
     points: Float[Tensor, "point 3"]
     lines: Float[Tensor, "point 3"]
     variance: Float[Tensor, " point"]
+    facet: Int[Tensor, " point"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -40,6 +42,7 @@ class BaseSurface(Record):
     Attributes:
         points: Of the subdivided mesh's vertices now.
         faces: Of the subdivided mesh.
+        facet: Each vertex lies in.
         heights: Of the vertices now.
         directions: ``d``, unit.
         reach: Points further off are not of this surface.
@@ -48,16 +51,17 @@ class BaseSurface(Record):
 
     points: Float[Tensor, "vertex 3"]
     faces: Int[Tensor, "face 3"]
+    facet: Int[Tensor, " vertex"]
     heights: Float[Tensor, " vertex"]
     directions: Float[Tensor, "vertex 3"]
     reach: float
     finest: float | Float[Tensor, ""]
 
-    def lines_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Return the direction of the vertex nearest to each point; which one is constant."""
+    def nearest(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+        """Return the vertex nearest to each point; a constant."""
         tree = cKDTree(self.points.detach().cpu().numpy())
         _, nearest = tree.query(points.detach().cpu().numpy())
-        return self.directions[torch.as_tensor(nearest, device=self.faces.device)]
+        return torch.as_tensor(nearest, device=self.faces.device)
 
 
 def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
@@ -65,10 +69,16 @@ def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
 
     Differentiable; which vertex is nearest is constant.
     """
-    line = surface.lines_at(points.points_world)
+    vertex = surface.nearest(points.points_world)
+    line = surface.directions[vertex]
     covariance = points.covariance_world.to(line)
     variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
-    return Contacts(points=points.points_world.to(line), lines=line, variance=variance)
+    return Contacts(
+        points=points.points_world.to(line),
+        lines=line,
+        variance=variance,
+        facet=surface.facet[vertex],
+    )
 
 
 def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
@@ -79,13 +89,15 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
 
     Differentiable; where the rays touch, and which vertex is nearest, is constant.
     """
-    line = surface.lines_at(contours.points_world)
+    vertex = surface.nearest(contours.points_world)
+    line = surface.directions[vertex]
     facing = (line * contours.normals_world.to(line)).sum(dim=-1)
     usable = facing.detach() > MIN_FACING
     return Contacts(
         points=contours.points_world.to(line)[usable],
         lines=line[usable],
         variance=contours.variance.to(line)[usable] / facing[usable].square(),
+        facet=surface.facet[vertex][usable],
     )
 
 

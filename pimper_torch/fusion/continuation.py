@@ -90,19 +90,26 @@ def about_mean(
 
 
 def enclosed(
-    known: Bool[Tensor, " vertex"], faces: Int[Tensor, "face 3"]
+    known: Bool[Tensor, " vertex"],
+    faces: Int[Tensor, "face 3"],
+    border: Bool[Tensor, " vertex"] | None = None,
 ) -> Bool[Tensor, " vertex"]:
     """Find what known vertices enclose: groups of others that do not reach the border.
 
     A group without any known vertex beside it is not enclosed.
+
+    Args:
+        border: Of the surface; without, that of the faces.
 
     >>> fan = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
     >>> enclosed(torch.tensor([False, True, True, True]), fan)
     tensor([ True, False, False, False])
     """
     label = vertex_components(faces, ~known)
+    if border is None:
+        border = boundary_vertices(faces, len(known))
     reaches = torch.zeros(len(known), dtype=torch.bool, device=known.device)
-    reaches[label[boundary_vertices(faces, len(known)) & ~known]] = True
+    reaches[label[border & ~known]] = True
     corner = known[faces]
     ends = faces[corner.any(dim=1)[:, None] & ~corner]
     beside = torch.zeros_like(reaches)

@@ -76,6 +76,7 @@ def fuse_terms(
     start: Float[Tensor, " vertex"],
     damping: Float[Tensor, " vertex"],
     iterations: int,
+    factors: Sequence[Float[Tensor, ""]] | None = None,
 ) -> Fused:
     """Solve, estimate the noise, and solve again.
 
@@ -83,6 +84,7 @@ def fuse_terms(
         kinds: Of terms; those without equations are skipped.
         start: Heights that vertices keep without other terms.
         damping: Information of these.
+        factors: Of the noise, where they are known.
 
     Differentiable in targets, coefficients, information, damping and start, through the weights and
     the factors too: every solve answers by the implicit function. That takes as many more solves
@@ -91,35 +93,32 @@ def fuse_terms(
     Where the equations have no solution, heights are those of the solve before, or ``start``, and
     that is told (:func:`~pimper_torch.failures.skipped`).
     """
-    found = [torch.ones((), dtype=torch.float64, device=start.device) for _ in kinds]
+    one = torch.ones((), dtype=torch.float64, device=start.device)
+    found = [one for _ in kinds] if factors is None else list(factors)
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
     generator = torch.Generator().manual_seed(0)  # of signs: any will do
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
     probe = probe.double().to(start.device)
     heights: Tensor | None = None
-    for _ in range(iterations - 1):
-        try:
+    try:
+        for _ in range(iterations - 1):
             heights, answer = _solved(
                 kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
             )
-        except SingularSystemError as error:
-            _kept(error)
-            break
-        for index, kind in enumerate(kinds):
-            if not kind.evaluated or len(kind.targets) == 0:
-                continue
-            square, used = _evaluated(kind, weights[index], heights, probe, answer)
-            redundancy = 1 - used / found[index] / total(weights[index])
-            square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
-            found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
-            weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
-    else:
-        try:
-            (heights,) = _solved(
-                kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
-            )
-        except SingularSystemError as error:
-            _kept(error)
+            for index, kind in enumerate(kinds):
+                if not kind.evaluated or len(kind.targets) == 0:
+                    continue
+                square, used = _evaluated(kind, weights[index], heights, probe, answer)
+                redundancy = 1 - used / found[index] / total(weights[index])
+                square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
+                if factors is None:
+                    found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
+                weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
+        (heights,) = _solved(
+            kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
+        )
+    except SingularSystemError as error:
+        _kept(error)
     return Fused(
         heights=start.double() if heights is None else heights,
         factors=tuple(found),

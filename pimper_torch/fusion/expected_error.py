@@ -59,34 +59,28 @@ def expected_error(
     """
     generator = torch.Generator().manual_seed(0)  # of noise: any will do
     region = regions(subdivision)
-    noises, starts = [], []
+    solves = (coarse,) if fine is coarse else (coarse, fine)
+    sides: list[list[Tensor]] = [[] for _ in solves]
     for _ in range(draws):
-        noises.append(
-            [
-                _noise(kind, weight, factor, subdivision, region, generator)
-                for kind, weight, factor in zip(
-                    coarse.kinds, coarse.weights, fine.factors, strict=True
-                )
-            ]
-        )
-        starts.append(_normal(generator, coarse.damping) / coarse.damping.double().sqrt())
-    off = _answers(coarse, noises, starts)
-    if fine is not coarse:
-        detail = _answers(fine, noises, starts)
-        off = detail + CoarsePart(subdivision, facets)(off - detail)
+        noise = [
+            _noise(kind, weight, factor, subdivision, region, generator)
+            for kind, weight, factor in zip(coarse.kinds, coarse.weights, fine.factors, strict=True)
+        ]
+        start = _normal(generator, coarse.damping) / coarse.damping.double().sqrt()
+        for solve, side in zip(solves, sides, strict=True):
+            side.append(_answerable(solve, noise, start))
+    off, *detail = (_answers(*each) for each in zip(solves, sides, strict=True))
+    for each in detail:
+        off = each + CoarsePart(subdivision, facets)(off - each)
     return off.square().mean(dim=1).sqrt()
 
 
-def _answers(
-    fused: Fused,
-    noises: list[list[Float[Tensor, " _"]]],
-    starts: list[Float[Tensor, " vertex"]],
-) -> Float[Tensor, "vertex draw"]:
+def _answers(fused: Fused, sides: list[Float[Tensor, " vertex"]]) -> Float[Tensor, "vertex draw"]:
     """Return the heights' answers to errors of the targets, all draws at once."""
-    sides = [_answerable(fused, *each) for each in zip(noises, starts, strict=True)]
     rows, cols, values = fused.matrix()
     what = "the expected error"
     system = prepare(rows, cols, values, len(fused.heights), what, tolerance=_ACCURACY)
+    del rows, cols, values
     return system.solve(torch.stack(sides, dim=1))
 
 

@@ -4,6 +4,7 @@ It reads in the order of its ``forward``: the errors that facets have in common 
 coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -11,21 +12,32 @@ from operator import or_
 from typing import Annotated, cast
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.fusion.bands import CoarsePart
-from pimper_torch.fusion.continuation import about_mean
+from pimper_torch.fusion.blend import Blend, ray_directions, vertex_spacing
+from pimper_torch.fusion.blocks import Coarse, Key, Typical, block_of, parts_of, pooled, sampled
+from pimper_torch.fusion.continuation import about_mean, enclosed
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
 from pimper_torch.fusion.normal_bias import NormalBias, normal_bias
-from pimper_torch.fusion.problem import FINEST, Problem, pose
-from pimper_torch.fusion.terms import TERMS, Normals, Passing, Term
-from pimper_torch.geometry.subdivision import transferred
+from pimper_torch.fusion.problem import FINEST, Problem, laid, pose
+from pimper_torch.fusion.terms import (
+    ROTATION,
+    SLOPES,
+    TERMS,
+    Normals,
+    Passing,
+    Term,
+    own_slope_variance,
+    rotation,
+)
+from pimper_torch.geometry.subdivision import Subdivision, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
@@ -83,13 +95,13 @@ class _Shared(Record):
         tilt: Of the normals of each facet; ``None`` if no position tells it.
         tilt_variance: Of what remains of it in the normals that it was added to.
         terms: With the variance of the errors that a facet's positions have in common.
-        expected: Expected errors of the heights; ``None`` if they are not asked for.
+        coarse: The coarser subdivided mesh.
     """
 
     tilt: NormalBias | None
     tilt_variance: Float[Tensor, ""]
     terms: tuple[Term, ...]
-    expected: Float[Tensor, " vertex"] | None
+    coarse: Coarse
 
 
 class Fuse(Stage):
@@ -126,13 +138,17 @@ class Fuse(Stage):
             require(isinstance(term, Term), "Fuse: terms", term, "modules derived from Term")
         self.terms = nn.ModuleList(terms)
 
-    def forward(self, swept: SweptPatches, contours: Contours, expected: bool = True) -> Surface:
+    def forward(
+        self, swept: SweptPatches, contours: Contours, expected: bool = True, most: float = math.inf
+    ) -> Surface:
         """Fuse what is known of all patches.
 
         Args:
             swept: Photometry and swept heights of all patches.
             contours: What silhouettes say about the surface.
             expected: Whether the expected error of every vertex is found.
+            most: Vertices of the subdivided mesh that are solved for at once, about. A surface of
+                more is solved for by overlapping blocks (:mod:`~pimper_torch.fusion.blocks`).
 
         The convergence's residual is the root mean square distance that the surface moved, in
         scene units; its iterations are the solves at full size for the detail.
@@ -142,30 +158,29 @@ class Fuse(Stage):
                 is not finite.
         """
         config = self.config
-        lit = any(isinstance(term, Normals) for term in self._terms)
-        coarse = pose(swept, _COARSER * config.samples_per_vertex, lit)
-        terms = tuple(term.bound(coarse, contours) for term in self._terms)
-        coarse = _sloped(coarse, terms)
-        shared = self._shared(coarse, terms, expected)
-        subdivided = coarse.subdivision
-        del coarse
+        problem = pose(swept, _COARSER * config.samples_per_vertex, self._lit)
+        terms = tuple(term.bound(problem, contours) for term in self._terms)
+        problem = _sloped(problem, terms)
+        several = _COARSER**2 * len(problem.points) > most
+        shared = self._shared(problem, terms, expected, several)
+        del problem
         release_memory()
-        fine = _sloped(pose(swept, config.samples_per_vertex, lit), shared.terms)
-        release_memory()
-        solved = self._solve(fine, shared)
-        release_memory()
-        leave_out("fuse.support", ~fine.blend.supported, at=fine.points)
-        leave_out("fuse.normals", ~fine.known, at=fine.points)
-        leave_out("fuse.albedo", ~fine.blend.observed, at=fine.points)
-        subdivision, directions, blend = fine.subdivision, fine.directions, fine.blend
-        heights = solved.to(blend.heights)
+        subdivision = laid(swept, config.samples_per_vertex)
+        blend, heights, albedo = self._blended(swept, subdivision, shared, most)
+        directions = ray_directions(subdivision, swept.patches.coarse)
+        points = subdivision.points + blend.heights[:, None] * directions
+        leave_out("fuse.support", ~blend.supported, at=points)
+        leave_out("fuse.normals", ~(blend.seen & self._lit), at=points)
+        leave_out("fuse.albedo", ~blend.observed, at=points)
         vertices = subdivision.points + heights[:, None] * directions
         normals = vertex_normals(vertices, subdivision.faces)
         error: Float[Tensor, " vertex"] | None = None
-        if shared.expected is not None:
-            along = transferred(shared.expected, subdivided, subdivision).to(normals)
+        coarse = shared.coarse
+        if coarse.expected is not None:
+            along = transferred(coarse.expected, coarse.subdivision, subdivision.points).to(normals)
             facing = (normals.detach() * directions.detach()).sum(dim=-1).abs()
-            error = torch.hypot(along * facing, FINEST * fine.spacing.detach())
+            spacing = vertex_spacing(swept.patches, config.samples_per_vertex).median()
+            error = torch.hypot(along * facing, FINEST * spacing.detach())
         moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
@@ -173,7 +188,7 @@ class Fuse(Stage):
             facet=subdivision.facet,
             barycentric=subdivision.barycentric,
             normals_world=normals,
-            albedo=about_mean(blend.albedo, blend.observed, fine.edges),
+            albedo=albedo,
             information=blend.normal_information,
             height_information=blend.offset_information,
             expected_error=error,
@@ -184,14 +199,84 @@ class Fuse(Stage):
             ),
         )
 
+    def _blended(
+        self, swept: SweptPatches, whole: Subdivision, shared: _Shared, most: float
+    ) -> tuple[Blend, Float[Tensor, " vertex"], Float[Tensor, "vertex channel"]]:
+        """Return all vertices' patches, heights and albedo, block by block where memory asks."""
+        mesh, coarse = swept.patches.coarse.mesh, shared.coarse
+        parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
+        typical: Typical = {}
+        if coarse.detail is not None:
+            parts = parts_of(whole, mesh, most)
+            some = (self._noise(swept, whole, mine, shared) for mine in sampled(parts))
+            typical = {**coarse.typical, **coarse.noise, **pooled(some)}
+        channels = swept.photometric.buckets[0].albedo.shape[-1]
+        values = whole.points.new_zeros(len(whole.points), 1 + channels, dtype=torch.float64)
+        blends, owned = [], []
+        for mine in parts:
+            problem = self._posed(swept, whole, mine, shared, typical)
+            heights = self._solve(problem, shared)
+            release_memory()
+            blend, block = problem.blend, problem.block
+            albedo = about_mean(blend.albedo, blend.observed, problem.edges)
+            found = block.weight[:, None] * torch.cat([heights[:, None], albedo], dim=1)
+            values = values.index_add(0, block.vertex, found)
+            blends.append(blend.take(block.own))
+            owned.append(block.vertex[block.own])
+            del problem, blend, block, found
+            release_memory()
+        joined = Blend.cat(blends).take(torch.cat(owned).argsort())
+        return joined, values[:, 0].to(joined.heights), values[:, 1:].to(joined.albedo)
+
+    def _posed(
+        self,
+        swept: SweptPatches,
+        whole: Subdivision,
+        mine: Bool[Tensor, " facet"],
+        shared: _Shared,
+        typical: Typical,
+    ) -> Problem:
+        """Pose the problem of some facets, without the tilt that the normals of each share."""
+        block = block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
+        problem = pose(swept, self.config.samples_per_vertex, self._lit, block)
+        problem = _sloped(problem.replace(typical=typical), shared.terms)
+        release_memory()
+        if shared.tilt is None:
+            return problem
+        tilt = shared.tilt.at(problem.subdivision, problem.facets)
+        return problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
+
+    def _noise(
+        self,
+        swept: SweptPatches,
+        whole: Subdivision,
+        mine: Bool[Tensor, " facet"],
+        shared: _Shared,
+    ) -> dict[Key, tuple[int, Float[Tensor, ""]]]:
+        """Return the noise factors of a block, each with the number of equations that show it."""
+        problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)
+        made = _Made.of(shared.terms, problem)
+        fused = self._fused(problem, made)
+        numbers = [len(kind.targets) for kind in fused.kinds]
+        return dict(zip(made.keys, zip(numbers, fused.factors, strict=True), strict=True))
+
+    @property
+    def _lit(self) -> bool:
+        return any(isinstance(term, Normals) for term in self._terms)
+
     @property
     def _terms(self) -> tuple[Term, ...]:
         return tuple(cast("Term", term) for term in self.terms)
 
-    def _shared(self, problem: Problem, terms: tuple[Term, ...], expected: bool) -> _Shared:
+    def _shared(
+        self, problem: Problem, terms: tuple[Term, ...], expected: bool, several: bool
+    ) -> _Shared:
         """Estimate the errors that a facet has in common, and the expected error of the heights.
 
         Normals and positions are estimated from each other, in turns.
+
+        Args:
+            several: Whether the heights are needed, for several blocks.
         """
         subdivision, facets, known = problem.subdivision, problem.facets, problem.known
         made = _Made.of(terms, problem)
@@ -203,7 +288,7 @@ class Fuse(Stage):
                 tilt=None,
                 tilt_variance=normals.new_zeros(()),
                 terms=terms,
-                expected=self._expected(problem, made) if expected else None,
+                coarse=self._coarse(problem, made, expected, several),
             )
 
         def doubted(term: Term) -> bool:
@@ -217,7 +302,7 @@ class Fuse(Stage):
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
             tilted = problem.replace(tilt_variance=tilt.variance())
-            fused = self._fused(problem, taken.again(tilted).equations())
+            fused = self._fused(problem, taken.again(tilted))
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
             made, problem = made.evaluated(problem, fused.heights, vertex, doubted)
@@ -230,27 +315,51 @@ class Fuse(Stage):
             tilt=tilt,
             tilt_variance=variance,
             terms=made.terms,
-            expected=self._expected(straight, made, variance) if expected else None,
+            coarse=self._coarse(straight, made, expected, several, variance),
         )
 
-    def _expected(
-        self, problem: Problem, made: "_Made", tilt_variance: Float[Tensor, ""] | None = None
-    ) -> Float[Tensor, " vertex"] | None:
-        """Solve as at full size, and give the expected error of the heights."""
-        if self.config.error_draws == 0:
-            return None
-        independent = correlated = self._fused(problem, made.again(problem).equations())
+    def _coarse(
+        self,
+        problem: Problem,
+        made: "_Made",
+        expected: bool,
+        several: bool,
+        tilt_variance: Float[Tensor, ""] | None = None,
+    ) -> Coarse:
+        """Solve as at full size, if anything of it is needed."""
+        subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
+        coarse, expected = Coarse(subdivision=subdivision), expected and draws > 0
+        if not (expected or several):
+            return coarse
+        made = made.again(problem)
+        independent = correlated = self._fused(problem, made)
         if tilt_variance is not None:
             common = made.again(problem.replace(tilt_variance=tilt_variance)).equations()
-            correlated = fuse_like(independent, common, problem.blend.heights)
-        subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
-        return solved_or(
-            lambda: expected_error(independent, correlated, subdivision, facets, draws),
-            lambda: None,
-            stage="fuse",
-            name="the expected error",
-            done="The surface has no expected errors",
-            memory=True,
+            correlated = fuse_like(independent, common, problem.start_of_shape)
+        if several:
+            start, known = problem.start, problem.known
+            exposed = ~(known | enclosed(known, subdivision.faces))
+            coarse = coarse.replace(
+                detail=independent.heights - start,
+                shape=correlated.heights - start,
+                exposed=exposed.double(),
+                noise=dict(zip(made.keys, independent.factors, strict=True)),
+                typical={
+                    SLOPES: own_slope_variance(problem),
+                    ROTATION: rotation(problem) / _COARSER,  # steps of a random walk are shorter
+                },
+            )
+        if not expected:
+            return coarse
+        return coarse.replace(
+            expected=solved_or(
+                lambda: expected_error(independent, correlated, subdivision, facets, draws),
+                lambda: None,
+                stage="fuse",
+                name="the expected error",
+                done="The surface has no expected errors",
+                memory=True,
+            )
         )
 
     def _solve(self, problem: Problem, shared: _Shared) -> Float[Tensor, " vertex"]:
@@ -259,20 +368,16 @@ class Fuse(Stage):
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
         """
-        if shared.tilt is not None:
-            tilt = shared.tilt.at(problem.subdivision, problem.facets)
-            normals = normalize(problem.photometric + tilt, dim=-1)
-            problem = problem.replace(photometric=normals)
         made = _Made.of(shared.terms, problem)
         release_memory()
-        fused = self._fused(problem, made.equations())
+        fused = self._fused(problem, made)
         detail = fused.heights
         if shared.tilt is None:
             return detail
         common = made.again(problem.replace(tilt_variance=shared.tilt_variance)).equations()
 
         def with_coarse_shape() -> Float[Tensor, " vertex"]:
-            shape = fuse_like(fused, common, problem.blend.heights).heights
+            shape = fuse_like(fused, common, problem.start_of_shape).heights
             return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
 
         return solved_or(
@@ -283,9 +388,12 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _fused(self, problem: Problem, kinds: list[Equations]) -> Fused:
-        start, iterations = problem.blend.heights, self.config.noise_iterations
-        return fuse_terms(kinds, start, problem.damping, iterations)
+    def _fused(self, problem: Problem, made: "_Made") -> Fused:
+        kinds, typical, iterations = made.equations(), problem.typical, self.config.noise_iterations
+        one = problem.spacing.new_ones((), dtype=torch.float64)
+        known = any(key in typical for key in made.keys)
+        factors = [typical.get(key, one) for key in made.keys] if known else None
+        return fuse_terms(kinds, problem.start, problem.damping, iterations, factors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,6 +415,11 @@ class _Made:
         """List those of all terms, or of some."""
         pairs = zip(self.terms, self.kinds, strict=True)
         return [one for term, kinds in pairs if wanted(term) for one in kinds]
+
+    @property
+    def keys(self) -> list[tuple[int, int]]:
+        """The term's number, and that among its kinds, of every kind."""
+        return [(term, kind) for term, kinds in enumerate(self.kinds) for kind in range(len(kinds))]
 
     def without(self, unwanted: Callable[[Term], bool]) -> "_Made":
         """Leave out some terms."""

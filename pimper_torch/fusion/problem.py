@@ -1,16 +1,18 @@
 """One subdivided mesh, heights of its vertices, and what patches know there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
+from pimper_torch.fusion.blocks import Block, Typical
 from pimper_torch.fusion.contacts import BaseSurface
 from pimper_torch.fusion.equations import upright
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.topology import face_edges
+from pimper_torch.geometry.topology import boundary_vertices, face_edges
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.memory import release_memory
 from pimper_torch.records import DepthPatches, Depths, FacetPoints, Record, SweptPatches
@@ -18,6 +20,10 @@ from pimper_torch.records import DepthPatches, Depths, FacetPoints, Record, Swep
 # Information of every vertex about its present height, in units of one over its spacing squared:
 # as if it were known to 100 spacings. It decides where nothing else does.
 _DAMPING = 1e-4
+
+# The same of a vertex that is held on the border of a block: a hundred times the information of
+# slopes that are known to 0.25 degrees.
+_HELD = 1e7
 
 # Points of the cloud further off the surface than this, in its spacings, are not of it: a choice.
 _REACH = 20.0
@@ -52,6 +58,8 @@ class Problem(Record):
         tilt_variance: Of the tilt that the normals of a facet have in common, squared radians;
             ``None`` for independent errors.
         caster: Of rays on the surface, while terms are made that need it.
+        block: Of the whole subdivided mesh that this one is.
+        typical: Values that it does not show itself, as others of the mesh's blocks do.
     """
 
     subdivision: Subdivision
@@ -68,8 +76,10 @@ class Problem(Record):
     correlated: float
     cloud: FacetPoints | None
     photometric: Float[Tensor, "vertex 3"]
+    block: Block
     tilt_variance: Float[Tensor, ""] | None = None
     caster: RayCaster | None = None
+    typical: Typical = field(default_factory=dict)
 
     @property
     def facet(self) -> Int[Tensor, " vertex"]:
@@ -82,11 +92,18 @@ class Problem(Record):
         return (self.normals * self.directions).sum(dim=-1)
 
     @property
+    def border(self) -> Bool[Tensor, " vertex"]:
+        """Where the surface ends, or goes on beyond the block to where it does."""
+        ends = boundary_vertices(self.subdivision.faces, len(self.points))
+        return ends & ~self.block.held | self.block.exposed
+
+    @property
     def surface(self) -> BaseSurface:
         """The surface that the vertices lie on now."""
         return BaseSurface(
             points=self.points,
             faces=self.subdivision.faces,
+            facet=self.facet,
             heights=self.blend.heights,
             directions=self.directions,
             reach=float(_REACH * self.spacing.detach()),
@@ -95,25 +112,53 @@ class Problem(Record):
 
     @property
     def damping(self) -> Float[Tensor, " vertex"]:
-        """Information of every vertex's present height."""
-        return (_DAMPING / self.spacing**2).expand_as(self.blend.heights)
+        """Information of every vertex's present height, and of one that is held."""
+        square = self.spacing**2
+        return torch.where(self.block.held, _HELD / square, _DAMPING / square)
+
+    @property
+    def start(self) -> Float[Tensor, " vertex"]:
+        """Heights that vertices keep without other terms."""
+        return self.blend.heights + self.block.detail.to(self.blend.heights)
+
+    @property
+    def start_of_shape(self) -> Float[Tensor, " vertex"]:
+        """The same, with the errors that facets have in common."""
+        return self.blend.heights + self.block.shape.to(self.blend.heights)
 
 
-def pose(swept: SweptPatches, samples_per_vertex: float, slopes: bool) -> Problem:
+def laid(swept: SweptPatches, samples_per_vertex: float) -> Subdivision:
+    """Lay a subdivided mesh over the facets.
+
+    Args:
+        samples_per_vertex: Template samples between neighbouring vertices.
+    """
+    patches = swept.patches
+    mesh = patches.coarse.mesh
+    return subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(patches, samples_per_vertex))
+
+
+def pose(
+    swept: SweptPatches, samples_per_vertex: float, slopes: bool, block: Block | None = None
+) -> Problem:
     """Lay a subdivided mesh over the facets, and blend the patches on it.
 
     Args:
         swept: Photometry and swept heights of all patches.
         samples_per_vertex: Template samples between neighbouring vertices.
         slopes: Whether photometric normals take part.
+        block: Of a mesh that is laid already; without, one is laid over all facets.
     """
     patches = swept.patches
     facets = patches.coarse.mesh.faces
     spacing = vertex_spacing(patches, samples_per_vertex)
-    subdivision = subdivide(patches.coarse.mesh.vertices_world, facets, spacing)
+    block = block or Block.whole(laid(swept, samples_per_vertex), facets)
+    subdivision = block.subdivision
     directions = ray_directions(subdivision, patches.coarse)
-    height_fields = transferred_height_fields(swept)
-    blend = blend_patches(height_fields, subdivision, directions, _OUTLIER_SAMPLES, swept.buckets)
+    some = swept.of_facets(block.facets)
+    height_fields = transferred_height_fields(some)
+    blend = blend_patches(height_fields, subdivision, directions, _OUTLIER_SAMPLES, some.buckets)
+    del some, height_fields
     # A vertex stands for so many samples, each of which has its own information.
     density = samples_per_vertex**2
     blend = blend.replace(offset_information=density * blend.offset_information)
@@ -137,6 +182,7 @@ def pose(swept: SweptPatches, samples_per_vertex: float, slopes: bool) -> Proble
         correlated=max(1.0, swept.averaged / density),
         cloud=patches.coarse.points,
         photometric=blend.normals_world,
+        block=block,
     )
 
 

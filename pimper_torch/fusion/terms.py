@@ -56,6 +56,9 @@ UNKNOWN_SLOPE_DEG = 6.0
 # 5.0 on the mug, 11.5 on the potatoes and 3.7 on the jar.
 UNMEASURED = 5.0
 
+# Names of what :func:`own_slope_variance` and :func:`rotation` return, among typical values.
+SLOPES, ROTATION = "slopes", "rotation"
+
 
 class Term(nn.Module):
     """A kind of evidence on the heights of vertices.
@@ -304,7 +307,9 @@ class Passing(Term):
         if self.contacts is None:
             return []
         caster = problem.caster or RayCaster(problem.points, problem.subdivision.faces)
-        return [passing(self.contacts, problem.surface, caster)]
+        # Lines through points beyond a block meet it, too, where the object is thin.
+        contacts = self.contacts.take(problem.block.facets[self.contacts.facet])
+        return [passing(contacts, problem.surface, caster)]
 
 
 class KeptSlopes(Term):
@@ -334,10 +339,10 @@ class KeptSlopes(Term):
         start, facet = problem.blend.heights, problem.facet
         variance = own_slope_variance(problem, self.unknown_deg)
         together = variance * torch.bincount(facet)[facet].to(problem.normals)
-        inpainted = enclosed(problem.known, problem.subdivision.faces)
+        inpainted = enclosed(problem.known, problem.subdivision.faces, problem.border)
         normals = problem.blend.normals_world
         if bool(inpainted.any()):
-            damping = _rotation(problem.normals, edges[problem.lit]) / together
+            damping = rotation(problem) / together
             normals = continued(normals, ~inpainted, edges, problem.normals, damping)
             normals = normalize(normals, dim=-1)
         over = inpainted[edges].any(dim=1) & upright(edges, along, normals) & ~problem.sloped
@@ -375,6 +380,8 @@ def own_slope_variance(
     problem: Problem, unknown_deg: float = UNKNOWN_SLOPE_DEG
 ) -> Float[Tensor, ""]:
     """Estimate the variance of the surface's own slopes from the photometric normals."""
+    if SLOPES in problem.typical:
+        return problem.typical[SLOPES]
     if not bool(problem.known.any()):
         return problem.normals.new_tensor(math.radians(unknown_deg) ** 2)
     difference = (problem.blend.normals_world - problem.normals)[problem.known]
@@ -388,10 +395,11 @@ def slope_variance(information: Float[Tensor, " vertex"]) -> Float[Tensor, " ver
     return 0.5 / information.clamp(1 / high, 1 / low)
 
 
-def _rotation(
-    normals: Float[Tensor, "vertex 3"], edges: Int[Tensor, "edge 2"]
-) -> Float[Tensor, ""]:
-    """Return the mean squared angle between normals along edges, folds cut; squared radians."""
-    one, other = normals[edges].unbind(dim=1)
+def rotation(problem: Problem) -> Float[Tensor, ""]:
+    """Return the mean squared angle between normals along lit edges, folds cut; squared radians."""
+    if ROTATION in problem.typical:
+        return problem.typical[ROTATION]
+    edges = problem.edges[problem.lit]
+    one, other = problem.normals[edges].unbind(dim=1)
     square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
     return (total(square) / max(len(edges), 1)).clamp_min(_MIN_ROTATION)

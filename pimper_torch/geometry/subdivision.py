@@ -105,15 +105,15 @@ def subdivide(
 
 
 def transferred(
-    values: Float[Tensor, " vertex"], source: Subdivision, target: Subdivision
+    values: Float[Tensor, " vertex"], source: Subdivision, points: Float[Tensor, "asked 3"]
 ) -> Float[Tensor, " asked"]:
-    """Return values known on one subdivided mesh at the vertices of another over the same facets.
+    """Return values known on a subdivided mesh at other points of the same facets.
 
     They are blended from the three nearest vertices, by the inverse of the distance. For what is
     smooth. A constant to autograd but in ``values``.
     """
     tree = cKDTree(source.points.detach().cpu().double().numpy())
-    asked = target.points.detach().cpu().double().numpy()
+    asked = points.detach().cpu().double().numpy()
     count = min(_BLENDED, len(source.points))
     apart, near = tree.query(asked, k=list(range(1, count + 1)), workers=-1)
     closeness = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)

@@ -40,12 +40,14 @@ class PreparedMatrix(ABC):
         what: str = "the linear system",
         tolerance: float = DEFAULT_TOLERANCE,
     ) -> None:
-        self.rows, self.cols, self._values, self._what = rows, cols, values, what
         index = tuple(part.cpu().numpy().astype(np.int32) for part in (rows, cols))
         entries = values.detach().double().cpu().numpy()
         self._matrix = coo_array((entries, index), shape=(size, size)).tocsr()
         self._diagonal = torch.from_numpy(self._matrix.diagonal())
         refuse_hopeless(torch.from_numpy(self._matrix.data), self._diagonal, what)
+        if not values.requires_grad:  # gradients alone need the entries
+            rows, cols, values = (part.new_empty(0) for part in (rows, cols, values))
+        self.rows, self.cols, self._values, self._what = rows, cols, values, what
         self._prepare(tolerance)
 
     @abstractmethod

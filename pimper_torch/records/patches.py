@@ -8,7 +8,7 @@ plane z = 0 and its outward normal is -z. A depth on the template is a coordinat
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeVar
@@ -112,7 +112,7 @@ class OverPatches(Record):
         for index, bucket in enumerate(self._templates.buckets):
             row = (bucket.facet == facet).nonzero()[:, 0]
             if len(row):
-                return self._part(index, row[:1])
+                return self._part({index: row[:1]})
         raise IndexError(f"no patch stands on facet {facet}; there are {len(self)} patches")
 
     def __iter__(self: AnyPatches) -> Iterator[AnyPatches]:
@@ -124,10 +124,19 @@ class OverPatches(Record):
         found: PatchSet = self.patches  # type: ignore[attr-defined]
         return found
 
-    def _part(self: AnyPatches, index: int, row: Tensor) -> AnyPatches:
-        patches = self._templates._part(index, row)
-        bucket = self.buckets[index].take(row)  # type: ignore[attr-defined]
-        return self.replace(patches=patches, buckets=(bucket,))
+    def of_facets(self: AnyPatches, facets: Bool[Tensor, " facet"]) -> AnyPatches:
+        """Return the patches of some facets, which keep their numbers."""
+        if bool(facets.all()):
+            return self
+        rows = {
+            index: facets[bucket.facet].nonzero()[:, 0]
+            for index, bucket in enumerate(self._templates.buckets)
+        }
+        return self._part({index: row for index, row in rows.items() if len(row)})
+
+    def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
+        """Take rows of some buckets."""
+        return self.replace(patches=self._templates._part(rows), buckets=_taken(self, rows))
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List buckets that are not those of the templates, and what is wrong in one."""
@@ -144,6 +153,10 @@ class OverPatches(Record):
                 yield f"buckets[{index}]", f"has patches, height, width {shape}", needed
             for name, found, needed in bucket.faults():
                 yield f"buckets[{index}].{name}", found, needed
+
+
+def _taken(patches: Any, rows: Mapping[int, Tensor]) -> tuple[Any, ...]:  # noqa: ANN401
+    return tuple(patches.buckets[index].take(row) for index, row in rows.items())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -170,8 +183,8 @@ class PatchSet(OverPatches):
     def _templates(self) -> "PatchSet":
         return self
 
-    def _part(self, index: int, row: Tensor) -> "PatchSet":
-        return self.replace(buckets=(self.buckets[index].take(row),))
+    def _part(self, rows: Mapping[int, Tensor]) -> "PatchSet":
+        return self.replace(buckets=_taken(self, rows))
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List templates of facets that are none, and of no size."""
@@ -517,10 +530,9 @@ class OverPhotometry(OverPatches):
         """The decomposition underneath."""
         return self.photometric.patches
 
-    def _part(self: AnyPatches, index: int, row: Tensor) -> AnyPatches:
-        photometric = self.photometric._part(index, row)  # type: ignore[attr-defined]
-        bucket = self.buckets[index].take(row)  # type: ignore[attr-defined]
-        return self.replace(photometric=photometric, buckets=(bucket,))
+    def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
+        photometric = self.photometric._part(rows)  # type: ignore[attr-defined]
+        return self.replace(photometric=photometric, buckets=_taken(self, rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -155,6 +155,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     surface = BaseSurface(
         points=subdivision.points,
         faces=subdivision.faces,
+        facet=subdivision.facet,
         heights=transferred,
         directions=along,
         reach=1.0,
@@ -193,6 +194,7 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
     surface = BaseSurface(
         points=tilted,
         faces=subdivision.faces,
+        facet=subdivision.facet,
         heights=torch.zeros(len(tilted), dtype=torch.float64),
         directions=along,
         reach=1.0,
@@ -282,6 +284,7 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivi
         surface = BaseSurface(
             points=subdivision.points + raised[:, None] * along,
             faces=subdivision.faces,
+            facet=subdivision.facet,
             heights=raised,
             directions=along,
             reach=9.0,
@@ -319,6 +322,7 @@ def test_a_contour_stays_where_it_is_as_the_surface_is_raised(subdivision, gener
         surface = BaseSurface(
             points=subdivision.points + raised[:, None] * UP,
             faces=subdivision.faces,
+            facet=subdivision.facet,
             heights=raised,
             directions=along,
             reach=9.0,

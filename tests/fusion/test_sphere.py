@@ -58,11 +58,15 @@ def free():
 
 @pytest.fixture(scope="module")
 def cap():
-    """Facets whose corners lie on the sphere, with its exact normals and heights."""
+    return cap_of(2)
+
+
+def cap_of(count):
+    """Facets in some rings, whose corners lie on the sphere, with its exact normals and heights."""
     rings = [torch.zeros(1, 2, dtype=torch.float64)]
-    for ring in (1, 2):
+    for ring in range(1, count + 1):
         angle = torch.arange(6 * ring) * (math.tau / (6 * ring)) + 0.3
-        rings.append(0.3 * ring * torch.stack([angle.cos(), angle.sin()], dim=1).double())
+        rings.append(0.6 / count * ring * torch.stack([angle.cos(), angle.sin()], dim=1).double())
     xy = torch.cat(rings)
     vertices = torch.cat([xy, 1 - (1 - xy.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
     faces = torch.tensor(Delaunay(xy.numpy()).simplices).long()

@@ -163,7 +163,7 @@ def test_what_is_smooth_is_transferred_from_a_coarser_subdivided_mesh_over_the_s
     def wave(subdivision):
         return 1 + torch.sin(3 * subdivision.points[:, 0]) * subdivision.points[:, 1]
 
-    off = transferred(wave(rough), rough, fine) - wave(fine)
+    off = transferred(wave(rough), rough, fine.points) - wave(fine)
     assert off.abs().max() < 3.2 * 0.04 / 2  # the slope, over half a spacing
     assert off.abs().mean() < 0.005
-    assert_close(transferred(wave(rough), rough, rough), wave(rough))
+    assert_close(transferred(wave(rough), rough, rough.points), wave(rough))
