@@ -28,8 +28,6 @@ MAY_BE_INFINITE = {
     "RepairConfig.max_extent",
     "RepairConfig.max_stretch",
     "AlignConfig.scale_limit",
-    "AlignConfig.outlier",
-    "RefineConfig.outlier_samples",
     "DecomposeConfig.max_samples",
     "WarpConfig.saturation_level",
 }

@@ -15,7 +15,7 @@ from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
-from pimper_torch.paper.integrate import Integrate, IntegrateConfig
+from pimper_torch.paper.integrate import Integrate
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -67,7 +67,6 @@ class PublishedConfig:
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
-    integrate: IntegrateConfig = field(default_factory=IntegrateConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
@@ -99,7 +98,7 @@ class Published(Chain):
         self.decompose = Decompose(config.decompose)
         self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
         self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
-        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate(config.integrate)
+        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
         self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
         self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
         self.extract = Extract(config.extract)

@@ -546,15 +546,12 @@ class SweptPatches(OverPhotometry):
 
 
 class AlignStatus(IntEnum):
-    """Whether neighbours bear a patch's height field out."""
+    """Whether a patch's height field meets a neighbour's."""
 
     ALIGNED = 0
-    """Moved to where it agrees with a neighbour at least."""
+    """Moved to where it agrees best with its neighbours."""
     ALONE = 1
     """No neighbour's height field lies over its own: it stays on the mesh."""
-    DISPUTED = 2
-    """Every neighbour that it meets lies elsewhere, even after all was tried: it stays on
-    the mesh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -588,7 +585,7 @@ class Depths(Record):
 
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
-        """Whether a neighbour bears the height field out; false before alignment."""
+        """Whether the height field meets a neighbour's; false before alignment."""
         if self.status is None:
             return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
         return self.status == int(AlignStatus.ALIGNED)
