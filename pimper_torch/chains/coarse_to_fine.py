@@ -59,7 +59,8 @@ class CoarseToFineConfig:
     Attributes:
         chain: Which chain these are the settings of.
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface (torch).
+            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
+            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a run whose last pass would take more is refused in its first.
         hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.

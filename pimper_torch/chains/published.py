@@ -51,7 +51,8 @@ class PublishedConfig:
     Attributes:
         chain: Which chain these are the settings of.
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface (torch).
+            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
+            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """

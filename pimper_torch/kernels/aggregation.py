@@ -1,6 +1,6 @@
-"""Aggregates and prolongation of algebraic multigrid: twin of ``linalg/aggregation.py``.
+"""Aggregates and prolongation of algebraic multigrid, for ``linalg/aggregation.py``.
 
-Matrices are compressed rows, both triangles. Names and constants are those of that module.
+Matrices are compressed rows, both triangles.
 Functions with ``first`` and ``last`` work on the rows from ``first`` up to ``last`` alone.
 """
 
