@@ -21,7 +21,6 @@ MAY_BE_INFINITE = {
     "FineSurfaceConfig.hole_px",
     "RemeshConfig.max_departure",
     "OpenMvsConfig.max_minutes",
-    "PmvsConfig.max_minutes",
     "ExtractConfig.max_expected_error",
     "ExtractConfig.max_hole",
     "ExtractConfig.max_stretch",

@@ -95,7 +95,7 @@ class OpenMvs(Stage):
         wanted = [INTERFACE, DENSIFY, RECONSTRUCT] + [REFINE] * config.refine
         found = {program: program.find(config.folder) for program in wanted}
         with workspace("openmvs", config.keep_in) as folder:
-            names = write_photographs(scene, folder / "images", ".png")
+            names = write_photographs(scene, folder / "images")
             write_pinhole_model(scene, names, folder / "sparse")
             mesh = _Run(found, folder, config).surface()
         return estimate_of(mesh, scene, coarse)
