@@ -20,11 +20,7 @@ _Handler = Callable[[int, types.FrameType | None], Any] | int | None
 
 
 class Stopped(KeyboardInterrupt):
-    """The process was told to stop.
-
-    Attributes:
-        number: Of the signal.
-    """
+    """The process was told to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)

@@ -126,7 +126,6 @@ def strong_connections(
         coupled: Sum of each row's couplings over its diagonal.
         min_strength: Of an entry over the largest coupling of both rows.
         min_coupled: Of an unknown; below it, smoothing alone solves for it.
-        strong: Written.
     """
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):

@@ -128,8 +128,6 @@ class PatchSet(OverPatches):
     """The decomposition: every facet of the coarse mesh has one template.
 
     Attributes:
-        coarse: The facets.
-        buckets: Their templates.
         surface: What the templates carry, and what hides what; ``None`` for the facets
             themselves.
     """
@@ -245,7 +243,6 @@ class Convergence(Record):
     Attributes:
         iterations: Taken until it stopped.
         residual: Root mean square over what was observed, in the units of the data.
-        cause: A :class:`StopCause` each.
     """
 
     iterations: Int[Tensor, " patch"]
@@ -303,7 +300,6 @@ class Photometry(Record):
             one over squared radians, 0 where not valid.
         status: A :class:`PatchStatus` each. The normals of a patch that is not determined
             are those of the coarse mesh, and none of its samples is valid.
-        convergence: Of the factorization.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
@@ -480,11 +476,7 @@ def _given(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPhotometry(OverPatches):
-    """What is known of all patches beyond their photometry.
-
-    Attributes:
-        photometric: Normals, albedo and light.
-    """
+    """What is known of all patches beyond their photometry."""
 
     photometric: PhotometricPatches
 
@@ -537,7 +529,6 @@ class SweptPatches(OverPhotometry):
     """Heights of all patches, with the photometry they were swept under.
 
     Attributes:
-        buckets: The heights.
         averaged: Samples in the window that costs were averaged over.
     """
 
@@ -596,7 +587,6 @@ class DepthPatches(OverPhotometry):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
-        buckets: The height fields.
         mismatch: Root mean square distance of neighbouring height fields where they overlap, scene
             units: before alignment, then after each of its rounds. ``None`` before it.
     """

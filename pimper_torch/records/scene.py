@@ -49,7 +49,6 @@ class SparseScene(Record):
     Attributes:
         views: The registered photographs, undistorted to the pinholes in ``cameras``.
         cameras: Pinholes, one a registered view.
-        points_world: The cloud.
         reprojection_errors_px: Mean over each point's track.
         observation_point: Which point each observation sees.
         observation_view: Which view it is made in.

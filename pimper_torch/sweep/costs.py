@@ -29,7 +29,6 @@ def compiled_costs(
 
     Args:
         registered: Which views have which samples.
-        photometry: Normals and lights.
         poses: Number of each view's pose, where some have several.
         transferred: Normals that samples are swept along.
         ladder: Heights that are tried, in samples.

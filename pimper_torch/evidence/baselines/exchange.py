@@ -21,7 +21,6 @@ def write_photographs(scene: SparseScene, folder: Path) -> tuple[str, ...]:
 
     Args:
         scene: Any; padding is cut off.
-        folder: Made if it is not there.
 
     Returns:
         The files' names, ``00000000.png`` and so on, in the order of the views.

@@ -75,11 +75,7 @@ def _executable(path: Path) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """A limit of time that several programs share.
-
-    Attributes:
-        began: Set by itself.
-    """
+    """A limit of time that several programs share."""
 
     minutes: float
     began: float = field(default_factory=time.monotonic)

@@ -24,7 +24,6 @@ class Outcome(Record):
     """A method's estimate, and its cost.
 
     Attributes:
-        estimate: Surface, cameras, lights.
         seconds: Wall clock without structure from motion.
         mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
         samples: Samples of all templates times views, missing ones included.

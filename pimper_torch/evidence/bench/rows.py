@@ -20,28 +20,20 @@ class Row(Record):
     Percentages are of 100. Lengths are percentages of the true bounding box's diagonal.
 
     Attributes:
-        scene: Name.
-        method: Preset or baseline.
         mesh_points: Vertices of the coarse mesh.
-        triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
-        missing_percent: Of the samples.
         minutes: Wall clock of this method alone.
         sfm_minutes: Wall clock of the structure from motion that all methods share.
         relative_error: The published 3D error, along the rays of the reference view, per cent.
         coverage_percent: Of the true pixels, those whose ray meets the surface, and not where
             it shows the table; the 3D error is over these.
         mean_normal_deg: Error of the normals that the vertices carry.
-        median_normal_deg: The same.
         mean_shape_normal_deg: Error of the normals of the surface's own shape.
-        median_shape_normal_deg: The same.
         common_percent: Of the true pixels, those that all methods of the table cover that gave
             a surface.
         common_relative_error: The 3D error over these.
         common_mean_normal_deg: Of the normals that the vertices carry, over these.
-        common_median_normal_deg: The same.
         common_mean_shape_normal_deg: Of the surface's own shape, over these.
-        common_median_shape_normal_deg: The same.
         pitted_percent: Rays where these are far further off than around: pimples and pits.
         chamfer: Mean of accuracy and completeness of what three views or more see.
         accuracy: Mean distance from the surface to the truth.

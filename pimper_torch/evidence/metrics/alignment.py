@@ -32,7 +32,6 @@ class Alignment(Record):
         description: In words, with whatever tells it from its kin.
         truth_from_world: Upper left block is scale times rotation.
         scale: Scene units of the truth in one of the estimate.
-        rotation_deg: Angle of the rotation.
         cameras: How many pairs of cameras were used; 0 if none.
         trimmed_fraction: Fraction of the samples left out by ``icp``; ``None`` otherwise.
         residual: Root mean square distance of the samples ``icp`` kept, scene units.

@@ -44,7 +44,6 @@ class System(Record):
 
     Attributes:
         rows: Of the entries of ``M + L``; entries named twice add up.
-        cols: Likewise.
         values: The entries, float64; symmetric and positive definite.
         mass: The diagonal of ``M``.
     """

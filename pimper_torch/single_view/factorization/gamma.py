@@ -223,7 +223,6 @@ class _Minimum(Record):
 
     Attributes:
         inner: Whether it is not at an end of the range.
-        error: Standard error of gamma.
     """
 
     problem: EncodedMatrix

@@ -85,7 +85,6 @@ class Continuity(Record):
     Attributes:
         right: Weight in [0, 1] of each step to the right: 1 continuous, ``tie`` rejected, 0
             outside.
-        down: Likewise.
         convergence: Of the weights; the residual is that of continuous steps, in pixels.
     """
 

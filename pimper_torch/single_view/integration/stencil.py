@@ -79,11 +79,7 @@ class RasterSolver(Protocol):
 
 
 class CholeskyRaster:
-    """A sparse factor, on the CPU.
-
-    Args:
-        what: Names the system in errors.
-    """
+    """A sparse factor, on the CPU."""
 
     method = "cholesky"
 
@@ -138,7 +134,6 @@ class MultigridRaster:
 
     Args:
         tolerance: Of the error, in the energy norm, relative.
-        what: Names the system in errors.
     """
 
     method = "multigrid"
