@@ -216,18 +216,6 @@ class Hierarchy:
         """Apply the approximate inverse; the next cycle may overwrite the result."""
         return self._cycle(0, residual)
 
-    def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
-        """Return a copy for a similar matrix: only the finest level is new.
-
-        Args:
-            dominant: As :func:`dominant_diagonal` gives it for the new matrix.
-        """
-        other = object.__new__(Hierarchy)
-        finest, *coarse = self._levels
-        finest = Level(product, 1 / dominant, finest.prolong, finest.restrict)
-        other._levels, other._coarsest = [finest, *coarse], self._coarsest
-        return other
-
     def _cycle(
         self, depth: int, residual: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "unknown ..."]:

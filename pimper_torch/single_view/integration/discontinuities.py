@@ -40,10 +40,6 @@ _FIRST_SCALE, _NARROWER = 3.0, 3.0
 # Of the linear systems' solutions, in their energy: a choice, far below any scale.
 _TOLERANCE = 1e-6
 
-# At the final scale weights change little, and a hierarchy is kept until it needs more cycles than
-# this: a choice.
-_MANY_CYCLES = 25
-
 # Standard deviation of Gaussian noise over its median absolute value.
 _PER_MEDIAN = 1.4826
 
@@ -124,17 +120,13 @@ def find_discontinuities(
             torch.where(tested[0], 1.0, config.tie) * inside[0],
             torch.where(tested[1], 1.0, config.tie) * inside[1],
         )
-        system, solution = None, None
+        solution = None
         scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
         for taken in range(1, config.max_iterations + 1):
             weights = weight_right * fraction[0], weight_down * fraction[1]
-            if system is None or solution is None:
-                system = RasterSystem(
-                    *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
-                )
-            else:
-                keep = narrowed and solution.iterations <= _MANY_CYCLES
-                system = system.refreshed(*weights, anchor, keep=keep)
+            system = RasterSystem(
+                *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
+            )
             solution = _solved(system, steps, weights, anchor, heights, solution)
             residuals = _residuals(steps, solution.values.reshape(steps.inside.shape))
             smallest = _final_scale(residuals, tested, config)
