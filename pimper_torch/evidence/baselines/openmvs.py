@@ -1,5 +1,6 @@
 """OpenMVS, if the user has it: depth maps, Delaunay and graph cut, refinement."""
 
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,12 +16,7 @@ from pimper_torch.evidence.baselines.exchange import (
     write_photographs,
     write_pinhole_model,
 )
-from pimper_torch.evidence.baselines.external import (
-    Deadline,
-    Program,
-    run_program,
-    workspace,
-)
+from pimper_torch.evidence.baselines.external import Deadline, Program, run_program
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
@@ -51,22 +47,14 @@ class OpenMvsConfig:
     """OpenMVS's settings under its defaults.
 
     Attributes:
-        folder: With its programs; else PIMPER_OPENMVS, the PATH or its usual folder say.
         resolution_level: How often the photographs are halved for the depth maps.
-        min_resolution_px: Photographs whose longer side would be less are halved less often.
         refine: Refine the mesh by the photographs at the end; takes long.
-        threads: 0 for all cores.
         max_minutes: For all its programs together; then they are stopped.
-        keep_in: Folder to leave their files in; else they are removed.
     """
 
-    folder: Path | None = None
     resolution_level: Annotated[int, Range(least=0, most=16)] = 1  # halvings: a pixel is left
-    min_resolution_px: Annotated[int, Range(least=1, most=65_535)] = 640
     refine: bool = True
-    threads: Annotated[int, Range(least=0, most=1024)] = 0
     max_minutes: Annotated[float, Range(above=0)] = 120.0
-    keep_in: Path | None = None
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -93,8 +81,9 @@ class OpenMvs(Stage):
         """
         config = self.config
         wanted = [INTERFACE, DENSIFY, RECONSTRUCT] + [REFINE] * config.refine
-        found = {program: program.find(config.folder) for program in wanted}
-        with workspace("openmvs", config.keep_in) as folder:
+        found = {program: program.find() for program in wanted}
+        with tempfile.TemporaryDirectory(prefix="pimper-openmvs-") as temporary:
+            folder = Path(temporary).resolve()
             names = write_photographs(scene, folder / "images")
             write_pinhole_model(scene, names, folder / "sparse")
             mesh = _Run(found, folder, config).surface()
@@ -107,7 +96,7 @@ class _Run:
     def __init__(self, found: dict[Program, Path], folder: Path, config: OpenMvsConfig) -> None:
         self._found, self._folder, self._config = found, folder, config
         self._deadline = Deadline(config.max_minutes)
-        self._threads = config.threads or usable_cores()
+        self._threads = usable_cores()
         self._done = 0
 
     def surface(self) -> Mesh:
@@ -118,7 +107,6 @@ class _Run:
             DENSIFY,
             *("-i", _SCENE),
             *("--resolution-level", str(config.resolution_level)),
-            *("--min-resolution", str(config.min_resolution_px)),
             leaves=(_DENSE,),
         )
         # Since version 2.3 the dense points are not in the scene's file, and must be named;

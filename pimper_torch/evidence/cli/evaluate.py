@@ -70,7 +70,6 @@ class EvaluateOptions:
         samples: Points drawn on each surface.
         seed: Of every draw.
         trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
-        icp_distance: What `icp` makes small: the distance to the true `plane` or `point`.
     """
 
     truth_layout: Layout = "auto"
@@ -82,7 +81,6 @@ class EvaluateOptions:
     samples: int = 200_000
     seed: int = 0
     trimmed_fraction: float = 0.2
-    icp_distance: Literal["plane", "point"] = "plane"
 
     def config(self) -> EvaluateConfig:
         """Return the settings of the evaluation."""
@@ -93,7 +91,7 @@ class EvaluateOptions:
             seen_from=self.seen_from,
             samples=self.samples,
             seed=self.seed,
-            icp=IcpConfig(trimmed_fraction=self.trimmed_fraction, distance=self.icp_distance),
+            icp=IcpConfig(trimmed_fraction=self.trimmed_fraction),
         )
 
 

@@ -19,7 +19,7 @@ import pathlib, shutil, sys
 name, points = pathlib.Path(sys.argv[0]).name, {points}
 known = {{"-i", "-w", "--max-threads"}} | {{
     "InterfaceCOLMAP": set(),
-    "DensifyPointCloud": {{"--resolution-level", "--min-resolution"}},
+    "DensifyPointCloud": {{"--resolution-level"}},
     "ReconstructMesh": {{"-p"}} if points else set(),
     "RefineMesh": {{"--mesh-file"}},
 }}[name]
@@ -151,11 +151,11 @@ def test_every_missing_program_is_named_before_anything_runs(reconstruction, tri
     assert not copy.exists()
 
 
-def test_the_programs_folder_may_be_given(reconstruction, triangle, tmp_path, monkeypatch):
+def test_the_variable_may_name_the_programs_folder(reconstruction, triangle, tmp_path, monkeypatch):
     install(tmp_path, triangle)
     monkeypatch.setenv("PATH", "")
-    config = OpenMvsConfig(folder=tmp_path / "bin")
-    assert len(OpenMvs(config)(reconstruction.scene, reconstruction.coarse).mesh.faces) == 1
+    monkeypatch.setenv("PIMPER_OPENMVS", str(tmp_path / "bin"))
+    assert len(OpenMvs()(reconstruction.scene, reconstruction.coarse).mesh.faces) == 1
 
 
 def test_a_step_that_leaves_nothing_is_named(reconstruction, triangle, tmp_path):
