@@ -20,7 +20,6 @@ LARGEST_COUNT = 2**32
 MAY_BE_INFINITE = {
     "FineSurfaceConfig.hole_px",
     "RemeshConfig.max_departure",
-    "OpenMvsConfig.max_minutes",
     "ExtractConfig.max_expected_error",
     "ExtractConfig.max_hole",
     "ExtractConfig.max_stretch",
