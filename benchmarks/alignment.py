@@ -1,6 +1,6 @@
-"""Alignment of many patches: what it undoes, seconds and peak memory, one row a method.
+"""Alignment of many patches: what it undoes, seconds and peak memory.
 
-    python benchmarks/alignment.py [--facets 5000] [--side 60] [--noise 0.0] [--only METHOD]
+    python benchmarks/alignment.py [--facets 5000] [--side 60] [--noise 0.0]
 
 Facets of a subdivided icosahedron on a sphere with bumps of a facet's size; every patch has
 the exact height field, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a
@@ -20,7 +20,7 @@ import trimesh
 from torch import Tensor
 
 from pimper_torch.geometry.frames import invert_rigid, transform
-from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.alignment.align import Align
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
@@ -38,21 +38,15 @@ from pimper_torch.records import (
 # Wavelength over 2 pi and height of the bumps: slopes of 0.3 over an edge of 0.06.
 BUMP = (0.03, 0.008)
 
-METHODS: dict[str, AlignConfig] = {
-    "bas-relief": AlignConfig(),
-    "published": AlignConfig(offset=False, outlier=float("inf")),
-}
-
 
 def main() -> None:
-    """Print one row a method."""
+    """Print a row."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--facets", type=int, default=5000)
     parser.add_argument("--side", type=int, default=60)
     parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--what", choices=["bas-relief", "scale"], default="bas-relief")
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--only", nargs="+", choices=list(METHODS), default=list(METHODS))
     options = parser.parse_args()
     generator = torch.Generator().manual_seed(0)
     patches = sphere_patches(options.facets, options.side)
@@ -70,23 +64,22 @@ def main() -> None:
         f"({len(sizes)} buckets), {torch.get_num_threads()} threads, "
         f"height fields off by {100 * error(bad, truth):.1f} % of their own size\n"
     )
-    print("| method | s | CPU s | extra memory, MB | error before, % | after, % | scale, % off |")  # noqa: T201
-    print("|---|--:|--:|--:|--:|--:|--:|")  # noqa: T201
-    for name in options.only:
-        before = peak_mb()
-        seconds, cpu = float("inf"), float("inf")
-        for _ in range(options.repeat):
-            began, spent = time.perf_counter(), time.process_time()
-            found = Align(METHODS[name])(bad)
-            seconds = min(seconds, time.perf_counter() - began)
-            cpu = min(cpu, time.process_time() - spent)
-        off = scales(found) / scales(truth) - 1  # transforms chain
-        print(  # noqa: T201
-            f"| {name} | {seconds:.1f} | {cpu:.1f} | {peak_mb() - before:.0f} "
-            f"| {100 * error(bad, truth):.1f} | {100 * error(found, truth):.2f} "
-            f"| {100 * off.abs().median():.1f} |",
-            flush=True,
-        )
+    print("| s | CPU s | extra memory, MB | error before, % | after, % | scale, % off |")  # noqa: T201
+    print("|--:|--:|--:|--:|--:|--:|")  # noqa: T201
+    before = peak_mb()
+    seconds, cpu = float("inf"), float("inf")
+    for _ in range(options.repeat):
+        began, spent = time.perf_counter(), time.process_time()
+        found = Align()(bad)
+        seconds = min(seconds, time.perf_counter() - began)
+        cpu = min(cpu, time.process_time() - spent)
+    off = scales(found) / scales(truth) - 1  # transforms chain
+    print(  # noqa: T201
+        f"| {seconds:.1f} | {cpu:.1f} | {peak_mb() - before:.0f} "
+        f"| {100 * error(bad, truth):.1f} | {100 * error(found, truth):.2f} "
+        f"| {100 * off.abs().median():.1f} |",
+        flush=True,
+    )
 
 
 def sphere_patches(facets: int, side: int) -> PatchSet:

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from derivatives import DerivativeCheck, Tensors, check_derivatives
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
-from pimper_torch.evidence.metrics.derivatives import DerivativeCheck, Tensors, check_derivatives
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.lights import wandering_lights
@@ -42,7 +42,7 @@ class Probe:
     Attributes:
         function: From tensors to tensors, all in float64.
         inputs: The tensors that the chain passed to the stage.
-        scales: See :func:`~pimper_torch.evidence.metrics.derivatives.check_derivatives`.
+        scales: See :func:`~derivatives.check_derivatives`.
     """
 
     function: Callable[[Tensors], Tensors]
@@ -59,7 +59,7 @@ class Probe:
     ) -> dict[tuple[str, str], DerivativeCheck]:
         """Compare autograd with finite differences, by input and output.
 
-        See :func:`~pimper_torch.evidence.metrics.derivatives.check_derivatives`.
+        See :func:`~derivatives.check_derivatives`.
         """
         return check_derivatives(
             self.function,

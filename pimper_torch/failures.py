@@ -128,7 +128,6 @@ def solved_or(
     """Solve, or give something else where equations have no solution.
 
     Args:
-        solve: What may fail.
         otherwise: Gives what stands in for the solution.
         memory: Whether that also helps where memory does not suffice.
     """

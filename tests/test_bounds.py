@@ -20,16 +20,12 @@ LARGEST_COUNT = 2**32
 MAY_BE_INFINITE = {
     "FineSurfaceConfig.hole_px",
     "RemeshConfig.max_departure",
-    "OpenMvsConfig.max_minutes",
-    "PmvsConfig.max_minutes",
     "ExtractConfig.max_expected_error",
     "ExtractConfig.max_hole",
     "ExtractConfig.max_stretch",
     "RepairConfig.max_extent",
     "RepairConfig.max_stretch",
     "AlignConfig.scale_limit",
-    "AlignConfig.outlier",
-    "RefineConfig.outlier_samples",
     "DecomposeConfig.max_samples",
     "WarpConfig.saturation_level",
 }

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from derivatives import check_derivatives
 from probes import probes, small_scene
 
 import pimper_torch as pt
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.learned import LearnedPrior
 from pimper_torch.records import Silhouettes
 from pimper_torch.stage import Given

@@ -41,11 +41,9 @@ class CameraMistake:
     """One way in which cameras are commonly wrong.
 
     Attributes:
-        name: Short, for programs.
         remedy: What the user does about it.
     """
 
-    name: str
     meaning: str
     remedy: str
     undo: Callable[[Cameras], Cameras]
@@ -60,13 +58,11 @@ def camera_mistakes(cameras: Cameras) -> tuple[CameraMistake, ...]:
     return (*(_of_poses(*mistake) for mistake in _POSES), *_of_intrinsics(cameras))
 
 
-def _of_poses(
-    name: str, meaning: str, remedy: str, change: Callable[[Poses], Poses]
-) -> CameraMistake:
+def _of_poses(meaning: str, remedy: str, change: Callable[[Poses], Poses]) -> CameraMistake:
     def undo(cameras: Cameras) -> Cameras:
         return cameras.replace(cam_from_world=change(cameras.cam_from_world))
 
-    return CameraMistake(name, meaning, remedy, undo)
+    return CameraMistake(meaning, remedy, undo)
 
 
 def _signs(x: int, y: int, z: int, like: Poses) -> Float[Tensor, "4 4"]:
@@ -78,50 +74,38 @@ def _from_center(pose: Poses) -> Poses:
     return rigid(rotation, -(rotation @ pose[:, :3, 3:])[..., 0])
 
 
-# Names, meanings and remedies of mistakes in cam_from_world, and the functions that undo them.
-_POSES: tuple[tuple[str, str, str, Callable[[Poses], Poses]], ...] = (
+# Meanings and remedies of mistakes in cam_from_world, and the functions that undo them.
+_POSES: tuple[tuple[str, str, Callable[[Poses], Poses]], ...] = (
     (
-        "world_from_cam",
         "the poses take points from the camera to the world",
         "invert them: cam_from_world is world_from_cam to the power -1",
         invert_rigid,
     ),
     (
-        "opengl_axes",
         "camera axes are x right, y up, z backward, as in OpenGL",
         "multiply cam_from_world from the left by diag(1, -1, -1, 1)",
         lambda pose: _signs(1, -1, -1, pose) @ pose,
     ),
     (
-        "world_from_cam_opengl",
         "the poses go from camera to world, camera axes x right, y up, z backward, as in "
         "transforms.json",
         "multiply by diag(1, -1, -1, 1) from the right, then invert",
         lambda pose: invert_rigid(pose @ _signs(1, -1, -1, pose)),
     ),
     (
-        "transposed_rotation",
         "the rotations are transposed, the translations are not",
         "transpose the 3x3 block; row-major and column-major were confused",
         lambda pose: rigid(pose[:, :3, :3].mT, pose[:, :3, 3]),
     ),
     (
-        "center_for_translation",
         "the last column holds the camera's centre",
         "put t = -R c there",
         _from_center,
     ),
     (
-        "photographs_rotated",
         "the photographs are turned by 180 degrees, or both image axes of the cameras are",
         "negate the first two rows of cam_from_world, or turn the photographs",
         lambda pose: _signs(-1, -1, 1, pose) @ pose,
-    ),
-    (
-        "world_axes_flipped",
-        "y and z of the world run the other way for the cameras than for the truth",
-        "negate y and z of the mesh or points, or columns 2 and 3 of cam_from_world",
-        lambda pose: pose @ _signs(1, -1, -1, pose),
     ),
 )
 
@@ -136,7 +120,6 @@ def _of_intrinsics(cameras: Cameras) -> list[CameraMistake]:
     same = bool(((factors / factor - 1).abs() < _OTHER_SIZE).all()) if factor > 0 else False
     if same and abs(factor - 1) > _OTHER_SIZE:
         size = CameraMistake(
-            "intrinsics_of_another_size",
             f"K is for photographs of 1/{factor:.4g} the size",
             f"multiply its first two rows by about {factor:.4g}, or read the photographs at the "
             "size it is for",
@@ -148,7 +131,6 @@ def _of_intrinsics(cameras: Cameras) -> list[CameraMistake]:
     off = (center - half).norm(dim=1)
     if bool(((center.flip(-1) - half).norm(dim=1) < 0.5 * off).all()):
         swapped = CameraMistake(
-            "rows_and_columns_swapped",
             "K has the row of the principal point before its column",
             "exchange fx with fy and cx with cy",
             lambda cameras: cameras.replace(

@@ -19,10 +19,7 @@ def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = Non
     """Refuse a folder or file that does not have the layout of a data set.
 
     Args:
-        ok: Whether it does.
-        path: The folder or file looked at.
         kind: The data set, as its users call it.
-        needed: What should be there.
         found: What is there instead; by default what the folder holds.
     """
     if ok:

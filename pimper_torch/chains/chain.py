@@ -57,7 +57,6 @@ class Step(Record):
         last: Whether this step's surface is the result.
         scene: Cameras, undistorted photographs and the cloud.
         held_out: Photographs that took no part but in finding cameras; None without any.
-        silhouettes: Where every view shows the object.
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
         reports: One of each stage that ran for this step, in order.
@@ -147,7 +146,6 @@ class Chain(Stage):
 
         Args:
             call: A stage of the chain, or a function.
-            inputs: What it is called with.
             derived: What it is called with by name, which follows from the inputs.
         """
         names = [name for name, module in self.named_children() if module is call]
@@ -218,7 +216,6 @@ class Chain(Stage):
         Args:
             mesh: If any. With photographs, in the frame of their cameras' model, with a scene in
                 that of the scene.
-            views: What the chain was called with.
 
         Raises:
             InputError: The mesh is no surface, or in another frame.

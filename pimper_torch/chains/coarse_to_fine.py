@@ -61,7 +61,8 @@ class CoarseToFineConfig:
     Attributes:
         chain: Which chain these are the settings of.
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface (torch).
+            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
+            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
             the first pass.

@@ -15,7 +15,7 @@ from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
-from pimper_torch.paper.integrate import Integrate, IntegrateConfig
+from pimper_torch.paper.integrate import Integrate
 from pimper_torch.paper.refinement.refine import Refine, RefineConfig
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -52,7 +52,8 @@ class PublishedConfig:
     Attributes:
         chain: Which chain these are the settings of.
         kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface (torch).
+            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
+            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """
@@ -68,7 +69,6 @@ class PublishedConfig:
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
-    integrate: IntegrateConfig = field(default_factory=IntegrateConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     extract: ExtractConfig = field(default_factory=ExtractConfig)
@@ -100,7 +100,7 @@ class Published(Chain):
         self.decompose = Decompose(config.decompose)
         self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
         self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
-        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate(config.integrate)
+        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
         self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
         self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
         self.extract = Extract(config.extract)

@@ -32,7 +32,6 @@ class Option:
         section: What it belongs to: a name and a dot for a setting of a stage, else a title.
         names: As they are written; a positional argument has one without dashes.
         value: What follows the name; empty where nothing does.
-        meaning: What it does.
         default: What holds where it is not given; :data:`REQUIRED` where it must be.
     """
 

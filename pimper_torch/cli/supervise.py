@@ -65,9 +65,7 @@ class _Watch:
     """What the watcher knows.
 
     Attributes:
-        worker: The process that does the work.
         first: Number of the first signal that told to stop; 0 before.
-        since: When that was.
         killed: Whether the worker was ended at once.
     """
 

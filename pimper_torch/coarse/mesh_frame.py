@@ -47,7 +47,6 @@ class Rays(Record):
     Attributes:
         directions: To a point, with its distance for length; through a pixel.
         inside: Whether a pixel's mask has it; true for points.
-        to_point: Whether it goes to a point.
     """
 
     origins: Float[Tensor, "ray 3"]

@@ -29,7 +29,6 @@ class Split(Record):
 
     Attributes:
         faces: Old vertices keep their indices; the new ones follow, one for each of ``halved``.
-        halved: The edges whose midpoints they are.
         parent: The face that each face is a part of, ascending.
         corners: Barycentric coordinates of each face's corners in its parent, row by row.
     """
@@ -45,7 +44,6 @@ class Split(Record):
         """Return the child that each point of a face lies in or nearest to, and its coordinates.
 
         Args:
-            parent: The face before it was split.
             barycentric: Coordinates in that; may be outside.
         """
         inverse = torch.linalg.inv(self.corners).to(barycentric)

@@ -25,9 +25,6 @@ def write_alicevision(result: Result, folder: Path) -> None:
     ``normalMaps.sfm``, ``albedoMaps.sfm`` and ``masks.sfm`` have the same views with other paths.
     Normals are EXR in OpenGL's camera axes (x right, y up, z to the viewer), as Open-RNb turns
     them to the world; albedo is EXR, linear, scaled into [0, 1]. Photographs are undistorted.
-
-    Args:
-        folder: Made if it is not there.
     """
     views, cameras = result.masked_views, result.cameras
     files, scale = file_names(views.names), albedo_scale(result.mesh)

@@ -35,7 +35,6 @@ def write_colmap(
 
     Args:
         views: Undistorted.
-        folder: Made if it is not there.
         points_world: A cloud to put in the model, without tracks and black.
 
     Raises:
@@ -66,9 +65,6 @@ def write_workspace(result: Result, folder: Path) -> None:
     ``images/`` and ``masks/`` are as in :func:`write_colmap`, ``sparse/`` is the model with its
     tracks. Depths are along the camera's z, normals in its frame (x right, y down, z forward),
     both 0 where a view does not see the surface: ``stereo_fusion`` and the meshers run on them.
-
-    Args:
-        folder: Made if it is not there.
     """
     scene = result.scene
     files = _write_pictures(result.masked_views, folder)

@@ -21,9 +21,6 @@ def write_lights(result: Result, folder: Path) -> None:
     direction, or is unknown, is in ``lights.json`` alone. Blanks in names become ``_`` in
     ``lights.lp``.
 
-    Args:
-        folder: Made if it is not there.
-
     Raises:
         InputError: No view's light has a direction.
     """

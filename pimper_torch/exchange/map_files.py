@@ -23,7 +23,6 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
     NaN for depth. ``README.json`` tells what the files hold.
 
     Args:
-        folder: Made if it is not there.
         axes: Of the camera, that normals have.
     """
     for kind in ("normals", "depth", "albedo", "arrays"):

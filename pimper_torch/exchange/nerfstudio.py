@@ -32,7 +32,6 @@ def write_transforms(
 
     Args:
         views: Undistorted.
-        folder: Made if it is not there.
         points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
         albedo: Its colours, linear.
 

@@ -1,6 +1,6 @@
-"""Aggregates and prolongation of algebraic multigrid: twin of ``linalg/aggregation.py``.
+"""Aggregates and prolongation of algebraic multigrid, for ``linalg/aggregation.py``.
 
-Matrices are compressed rows, both triangles. Names and constants are those of that module.
+Matrices are compressed rows, both triangles.
 Functions with ``first`` and ``last`` work on the rows from ``first`` up to ``last`` alone.
 """
 
@@ -126,7 +126,6 @@ def strong_connections(
         coupled: Sum of each row's couplings over its diagonal.
         min_strength: Of an entry over the largest coupling of both rows.
         min_coupled: Of an unknown; below it, smoothing alone solves for it.
-        strong: Written.
     """
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):

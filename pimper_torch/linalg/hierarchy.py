@@ -1,8 +1,8 @@
 """The multigrid hierarchy of a matrix, and its V-cycle as a preconditioner.
 
-Levels are built on the CPU, once; cycles run in torch on the device of the system, or in compiled
-kernels on the CPU. Without kernels, products on the CPU are scipy's: torch's compressed rows take
-up to 4 times as long there for less than a million unknowns.
+Levels are built on the CPU, once, by compiled kernels: they are constant to autograd. Cycles run in
+compiled kernels, too, or in torch on another device. On the CPU torch's compressed rows take up to
+4 times as long for less than a million unknowns.
 
 Vectors have one row per unknown, and may have one column per right-hand side.
 """
@@ -17,7 +17,6 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
-from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.aggregation import (
     coarser,
     dominant_diagonal,
@@ -217,18 +216,6 @@ class Hierarchy:
         """Apply the approximate inverse; the next cycle may overwrite the result."""
         return self._cycle(0, residual)
 
-    def with_product(self, product: Product, dominant: Float[Tensor, " unknown"]) -> "Hierarchy":
-        """Return a copy for a similar matrix: only the finest level is new.
-
-        Args:
-            dominant: As :func:`dominant_diagonal` gives it for the new matrix.
-        """
-        other = object.__new__(Hierarchy)
-        finest, *coarse = self._levels
-        finest = Level(product, 1 / dominant, finest.prolong, finest.restrict)
-        other._levels, other._coarsest = [finest, *coarse], self._coarsest
-        return other
-
     def _cycle(
         self, depth: int, residual: Float[Tensor, "unknown ..."]
     ) -> Float[Tensor, "unknown ..."]:
@@ -253,7 +240,7 @@ def _level(
     dtype: torch.dtype,
 ) -> Level:
     diagonal = torch.from_numpy(1 / dominant_diagonal(matrix)).to(device)
-    if product is None and compiled_for(diagonal):
+    if product is None and device.type == "cpu":
         return CompiledLevel(matrix, diagonal.to(dtype), prolong_matrix, restrict_matrix)
     return Level(
         product=product or sparse_product(matrix, device),
@@ -267,9 +254,7 @@ def sparse_product(matrix: csr_array, device: torch.device) -> Product:
     """Return the fastest product of a sparse matrix with vectors on a device."""
     if device.type != "cpu":
         return torch_product(matrix, device)
-    if compiled_for():
-        return lambda vectors: with_product(matrix, vectors)
-    return lambda vectors: torch.from_numpy(matrix @ vectors.numpy())
+    return lambda vectors: with_product(matrix, vectors)
 
 
 def with_product(

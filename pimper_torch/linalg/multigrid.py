@@ -50,7 +50,6 @@ def solve_with_hierarchy(
         rhs: ``b``, one column a right-hand side if there are several.
         tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
             the solution.
-        what: Names the system in errors.
         start: Where to begin; zero if not given.
 
     Raises:

@@ -45,7 +45,6 @@ def prepare(
     Args:
         rows: Row of each entry; duplicate entries add up.
         values: Of the entries; solutions are differentiable in them.
-        what: Names the system in errors.
         tolerance: Of multigrid: of the error, in the energy norm, relative.
 
     Raises:

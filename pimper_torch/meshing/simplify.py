@@ -43,7 +43,6 @@ class Simplified(Record):
 
     Attributes:
         mesh: Its vertices are former ones, with all their values.
-        kept: Their former indices.
         face: The face of ``mesh`` that every former vertex is nearest to among those that
             replaced its own; -1 for vertices that are kept.
         spacing: Median edge of the former mesh, scene units.

@@ -1,51 +1,24 @@
 """Integration: normals of every patch become its height field."""
 
 import math
-from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import Range, require_ranges
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
 from pimper_torch.paper.filling import fill_smoothly
-from pimper_torch.paper.poisson import integrate_weighted
+from pimper_torch.paper.poisson import integrate_steps
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
 from pimper_torch.records.patches import Photometry, Templates
 from pimper_torch.stage import Stage
 
-# What filled slopes weigh next to measured ones. Small enough to leave the measured ones
-# alone, large enough to decide where nothing else does.
-_FILLED_WEIGHT = 1e-4
-
-# Standard error of the slopes besides that of noise, which makes weights of 0 to 1 of their
-# information, and the least of these: a sample's neighbours are hardly better. Choices.
-_MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
-
 # Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
 # sample lies on the contour or is wrong, and one alone can bend its whole patch.
 _MAX_TILT_DEG = 75.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IntegrateConfig:
-    """How slopes become heights.
-
-    Attributes:
-        iterations: Rounds of weighted least squares after the published integration, so
-            that filled slopes stop pulling at measured ones and uncertain ones count less.
-            0 is the published method.
-    """
-
-    iterations: Annotated[int, Range(least=0, most=1000)] = 8  # a solve each
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Integrate(Stage):
@@ -56,15 +29,11 @@ class Integrate(Stage):
     the samples around them; a patch without any normals stays its facet's plane. The free
     constant is chosen so that the height field passes, on average, through the facet's corners.
 
-    Differentiable in normals and information.
+    Differentiable in normals.
 
     Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
     algorithms, PAMI 10(4), 1988.
     """
-
-    def __init__(self, config: IntegrateConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or IntegrateConfig()
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
         """Give every patch its height field; ``valid`` inside enlarged triangles that have data."""
@@ -75,10 +44,8 @@ class Integrate(Stage):
             height_field = integrate_normals(
                 photometry.normals_patch,
                 photometry.valid,
-                photometry.information,
                 templates.spacing,
                 steepest,
-                self.config.iterations,
             )
             depth = through_corners(height_field, templates, photometric.patches.coarse)
             buckets.append(_depths(depth, templates, photometry))
@@ -88,17 +55,13 @@ class Integrate(Stage):
 def integrate_normals(
     normals: Float[Tensor, "patch height width 3"],
     valid: Bool[Tensor, "patch height width"],
-    information: Float[Tensor, "patch height width"],
     spacing: Float[Tensor, " patch"],
     steepest: float,
-    iterations: int,
 ) -> Float[Tensor, "patch height width"]:
     """Find the height field, of mean zero over its raster, whose slopes are the normals'.
 
     Args:
         normals: Unit, ``n_z < 0``; anything where not valid.
-        information: Inverse variance of the normals, one over squared radians. They weigh
-            ``1 / (1 + (sigma / 8°)^2)``, if ``iterations`` is not 0.
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
     """
@@ -107,16 +70,7 @@ def integrate_normals(
     # Half-way between samples the mean of the two is right to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
-    certain = math.radians(_MODEL_ERROR_DEG) ** 2 * information.double()
-    weight = torch.where(valid, (certain / (1 + certain)).clamp_min(_MIN_WEIGHT), _FILLED_WEIGHT)
-    height_field = integrate_weighted(
-        right,
-        down,
-        torch.minimum(weight[:, :, 1:], weight[:, :, :-1]),
-        torch.minimum(weight[:, 1:], weight[:, :-1]),
-        iterations,
-    )
-    return height_field.to(normals)
+    return integrate_steps(right, down).to(normals)
 
 
 def _slopes(

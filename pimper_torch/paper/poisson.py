@@ -1,22 +1,18 @@
 r"""From slopes to heights on batches of small rasters.
 
-All of it is the least-squares problem :math:`\min_z \sum w |\nabla z - g|^2` with forward
-differences and nothing fixed at the border. With equal weights the cosine basis (the Fourier
-basis of the mirrored raster) turns it into a division, frequency by frequency; with weights
-that division is the preconditioner of conjugate gradients.
+All of it is the least-squares problem :math:`\min_z \sum |\nabla z - g|^2` with forward
+differences and nothing fixed at the border. The cosine basis (the Fourier basis of the mirrored
+raster) turns it into a division, frequency by frequency.
 
 The transforms are products with the basis: on rasters of 30 to 120 samples a side, the size
 of templates, they are 3 to 10 times faster than FFTs, and at 500 still within a factor 1.6.
 """
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
 
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
@@ -83,96 +79,6 @@ def integrate_steps(
     return solve_poisson(differences_transposed(right, down))
 
 
-def integrate_weighted(
-    right: Float[Tensor, "patch height steps_right"],
-    down: Float[Tensor, "patch steps_down width"],
-    weight_right: Float[Tensor, "patch height steps_right"],
-    weight_down: Float[Tensor, "patch steps_down width"],
-    iterations: int,
-    tolerance: float = 1e-7,
-) -> Float[Tensor, "patch height width"]:
-    """Find the heights, of mean zero, whose steps come nearest where the weights are large.
-
-    Conjugate gradients start at :func:`integrate_steps` and are preconditioned by it. Only
-    the ratios of the weights matter; where they vary by more than some 1e4, what lies in the
-    light part is left near the start.
-
-    Args:
-        weight_right: Of ``right``, not negative.
-        weight_down: Of ``down``.
-        iterations: Limit; 0 gives :func:`integrate_steps`.
-        tolerance: Stops when all residuals are this small next to the source.
-
-    Differentiable in steps and weights by one more solve with the same limit, so gradients
-    are as exact as the solution.
-    """
-    start = integrate_steps(right, down)
-    if iterations == 0:
-        return start
-    source = differences_transposed(weight_right * right, weight_down * down)
-    found: Tensor = _Weighted.apply(  # type: ignore[no-untyped-call]
-        weight_right, weight_down, source, start.detach(), iterations, tolerance
-    )
-    return found
-
-
 def _stiffness(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"]:
     frequency = torch.arange(size, device=like.device, dtype=like.dtype)
     return 4 * (math.pi / (2 * size) * frequency).sin() ** 2
-
-
-class _Weighted(torch.autograd.Function):
-    """Solve D^T W D z = s; differentiable through the adjoint equation."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
-        weight_right: Float[Tensor, "patch height steps_right"],
-        weight_down: Float[Tensor, "patch steps_down width"],
-        source: Float[Tensor, "patch height width"],
-        start: Float[Tensor, "patch height width"],
-        iterations: int,
-        tolerance: float,
-    ) -> Float[Tensor, "patch height width"]:
-        heights = _solve_weighted(weight_right, weight_down, source, start, iterations, tolerance)
-        ctx.save_for_backward(weight_right, weight_down, heights)
-        ctx.limits = (iterations, tolerance)
-        return heights
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(
-        ctx: Any,  # noqa: ANN401
-        upstream: Float[Tensor, "patch height width"],
-    ) -> tuple[Float[Tensor, "..."] | None, ...]:
-        weight_right, weight_down, heights = ctx.saved_tensors
-        wanted = upstream - upstream.mean(dim=(-2, -1), keepdim=True)
-        start = solve_poisson(wanted)
-        adjoint = _solve_weighted(weight_right, weight_down, wanted, start, *ctx.limits)
-        right, down = differences(heights)
-        adjoint_right, adjoint_down = differences(adjoint)
-        return -right * adjoint_right, -down * adjoint_down, adjoint, None, None, None
-
-
-def _solve_weighted(
-    weight_right: Float[Tensor, "patch height steps_right"],
-    weight_down: Float[Tensor, "patch steps_down width"],
-    source: Float[Tensor, "patch height width"],
-    start: Float[Tensor, "patch height width"],
-    iterations: int,
-    tolerance: float,
-) -> Float[Tensor, "patch height width"]:
-    def product(heights: Float[Tensor, "patch height width"]) -> Float[Tensor, "..."]:
-        right, down = differences(heights)
-        return differences_transposed(weight_right * right, weight_down * down)
-
-    found, _, _ = conjugate_gradients(
-        product,
-        solve_poisson,
-        source,
-        start=start,
-        dims=(-2, -1),
-        tolerance=tolerance,
-        max_iterations=iterations,
-    )
-    return found

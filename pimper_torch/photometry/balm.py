@@ -53,7 +53,6 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
     """Factorize a batch of patches by augmented Lagrangian.
 
     Args:
-        max_iterations: Steps at most.
         tolerance: A patch has converged when both the last change of its shading vectors and
             their distance from the manifold are below this fraction of their length.
 

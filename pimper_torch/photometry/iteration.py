@@ -49,7 +49,6 @@ def iterate(
     Args:
         advance: One step of the remaining patches: from problem, state and index of the step
             to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
-        max_iterations: Steps at most.
 
     Returns:
         Every patch's last lights, shading and weights, its number of steps, and its stop cause.

@@ -78,7 +78,6 @@ def solve_variable_projection(
     Args:
         problem: With its initial values. Low-rank factorization uses the lights only, which must
             be of full rank.
-        max_iterations: Steps at most.
         tolerance: A step that lowers a patch's objective by less than this fraction is small.
         small_steps: A patch has converged after so many small steps in a row: one alone may be
             followed by longer ones.

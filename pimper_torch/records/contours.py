@@ -33,7 +33,6 @@ class ContourPoints(Record):
     """Points where the surface touches contour rays.
 
     Attributes:
-        points_world: Where.
         normals_world: Of the surface there, unit, outward.
         variance: Along the normal, scene units squared.
         view: Whose silhouette each belongs to.

@@ -13,10 +13,8 @@ class Failure(Record):
     """One patch, view, point or solver that failed, while the rest went on.
 
     Attributes:
-        stage: Where.
         what: ``view``, ``points``, ``patch``, ``solver`` or ``memory``.
         name: Of the view, the system or the work; the facet's number for a patch.
-        reason: Why it failed.
         done: What was done in its place.
     """
 
@@ -34,9 +32,6 @@ class LeftOut(Record):
     Attributes:
         guard: Room and name, such as ``extract.borders``.
         what: Was left out; samples of photographs are pixels.
-        count: How many.
-        total: Of how many.
-        reason: In a few words.
         names: Of photographs, where they are known.
     """
 

@@ -164,8 +164,6 @@ class PatchSet(OverPatches):
     """The decomposition: every facet of the coarse mesh has one template.
 
     Attributes:
-        coarse: The facets.
-        buckets: Their templates.
         surface: What the templates carry, and what hides what; ``None`` for the facets
             themselves.
     """
@@ -281,7 +279,6 @@ class Convergence(Record):
     Attributes:
         iterations: Taken until it stopped.
         residual: Root mean square over what was observed, in the units of the data.
-        cause: A :class:`StopCause` each.
     """
 
     iterations: Int[Tensor, " patch"]
@@ -339,7 +336,6 @@ class Photometry(Record):
             one over squared radians, 0 where not valid.
         status: A :class:`PatchStatus` each. The normals of a patch that is not determined
             are those of the coarse mesh, and none of its samples is valid.
-        convergence: Of the factorization.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
@@ -517,11 +513,7 @@ def _given(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPhotometry(OverPatches):
-    """What is known of all patches beyond their photometry.
-
-    Attributes:
-        photometric: Normals, albedo and light.
-    """
+    """What is known of all patches beyond their photometry."""
 
     photometric: PhotometricPatches
 
@@ -573,7 +565,6 @@ class SweptPatches(OverPhotometry):
     """Heights of all patches, with the photometry they were swept under.
 
     Attributes:
-        buckets: The heights.
         averaged: Samples in the window that costs were averaged over.
     """
 
@@ -582,15 +573,12 @@ class SweptPatches(OverPhotometry):
 
 
 class AlignStatus(IntEnum):
-    """Whether neighbours bear a patch's height field out."""
+    """Whether a patch's height field meets a neighbour's."""
 
     ALIGNED = 0
-    """Moved to where it agrees with a neighbour at least."""
+    """Moved to where it agrees best with its neighbours."""
     ALONE = 1
     """No neighbour's height field lies over its own: it stays on the mesh."""
-    DISPUTED = 2
-    """Every neighbour that it meets lies elsewhere, even after all was tried: it stays on
-    the mesh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -624,7 +612,7 @@ class Depths(Record):
 
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
-        """Whether a neighbour bears the height field out; false before alignment."""
+        """Whether the height field meets a neighbour's; false before alignment."""
         if self.status is None:
             return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
         return self.status == int(AlignStatus.ALIGNED)
@@ -635,7 +623,6 @@ class DepthPatches(OverPhotometry):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
-        buckets: The height fields.
         mismatch: Root mean square distance of neighbouring height fields where they overlap, scene
             units: before alignment, then after each of its rounds. ``None`` before it.
     """

@@ -15,8 +15,6 @@ class StageReport(Record):
     """What one stage cost and found.
 
     Attributes:
-        name: Of the stage.
-        seconds: Wall clock.
         peak_memory_mb: Highest resident memory of the process up to the stage's end.
         figures: Counts and shares worth telling, such as ``samples`` or ``missing_fraction``.
         kept: Whether an earlier run found the record; time and memory are that run's.
@@ -36,8 +34,6 @@ class Reconstruction(Record):
     Attributes:
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
-        silhouettes: Where every view shows the object.
-        coarse: The facets.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
         report: One entry a stage, in the order they ran.
         failures: What was left out, as it failed.

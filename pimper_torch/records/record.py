@@ -59,9 +59,6 @@ class Record:
     def check(self, where: str) -> None:
         """Refuse values that no stage can use, such as normals that are not unit.
 
-        Args:
-            where: Who asks, for the message.
-
         Raises:
             InputError: Names the field, what was found and what was needed.
         """

@@ -49,7 +49,6 @@ class SparseScene(Record):
     Attributes:
         views: The registered photographs, undistorted to the pinholes in ``cameras``.
         cameras: Pinholes, one a registered view.
-        points_world: The cloud.
         reprojection_errors_px: Mean over each point's track.
         observation_point: Which point each observation sees.
         observation_view: Which view it is made in.
@@ -196,8 +195,7 @@ class CoarseMesh(Record):
     Attributes:
         mesh: The facets, with vertex normals smoothed over the mesh.
         reference: The view that the facets were triangulated in; the frontal one.
-        is_point: True for vertices that are points of the sparse cloud; the others were
-            filled in between them.
+        is_point: True for vertices that are points of the sparse cloud.
         covariance_world: Of each vertex that is a point, scene units squared; zero for the
             others. ``None`` for a mesh that comes from elsewhere.
         points: The cloud between the vertices; ``None`` for a mesh from elsewhere.

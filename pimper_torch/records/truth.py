@@ -28,7 +28,6 @@ class Truth(Record):
         highlight: True where a highlight adds noticeably to the matte part.
         lights_world: First-order light ``l`` at the object, radiance = albedo * l . (1, n),
             up to one scale for all views.
-        point_lights_world: Positions of point lights.
     """
 
     mesh: Mesh | None = None
@@ -54,9 +53,6 @@ class Capture(Record):
     Attributes:
         views: The photographs, linear radiance. Names are unique.
         cameras: That took them, world frame and unit of the data set; ``None`` if unknown.
-        truth: In the same frame.
-        position: Index of the camera's position.
-        light: Index of the light.
     """
 
     views: Views

@@ -34,7 +34,6 @@ def masking(
     Args:
         to_light: Cosine between light and normal, more than 0.
         to_eye: Cosine between eye and normal, more than 0.
-        alpha: As in :func:`facet_density`.
     """
     light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
     eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()

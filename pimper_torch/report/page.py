@@ -49,8 +49,6 @@ def write_page(
         headline: What went in and what came out, in a line.
         asset: The surface as a binary glTF, in the frame of ``scene``.
         layers: Of the asset's attributes; those that it lacks are not shown.
-        summary: What ``summary.json`` says.
-        settings: Of the run, as YAML.
     """
     data = {
         "title": title,

@@ -10,11 +10,7 @@ Summary = Mapping[str, Any]
 
 
 def section_entries(summary: Summary, settings: str) -> list[Json]:
-    """List the sections of a page, from what ``summary.json`` says.
-
-    Args:
-        settings: Of the run, as YAML.
-    """
+    """List the sections of a page, from what ``summary.json`` says."""
     found = [
         _warnings(summary),
         _relighting(summary),

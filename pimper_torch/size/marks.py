@@ -38,9 +38,6 @@ _MIN_ANGLE_DEG = 1.0
 def view_of(name: str, scene: SparseScene) -> int:
     """Find a photograph among those that have a camera.
 
-    Args:
-        name: With its suffix or without.
-
     Raises:
         InputError: It has no camera, or there is none of that name, or several.
     """

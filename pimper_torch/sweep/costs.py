@@ -30,7 +30,6 @@ def compiled_costs(
 
     Args:
         registered: Which views have which samples.
-        photometry: Normals and lights.
         rows: Where each camera's photograph is among the sources.
         poses: Number of each view's pose, where some have several.
         transferred: Normals that samples are swept along.

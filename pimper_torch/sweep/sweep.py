@@ -93,11 +93,7 @@ class _Swept(Record):
 
     Attributes:
         index: In the flattened rasters.
-        patch: Of each.
-        points_world: On the template.
         outward: Along which it is swept; unit, world.
-        chosen: Views that it is compared in.
-        seen: Which of these are no padding.
         shading: Of albedo 1 in these.
     """
 

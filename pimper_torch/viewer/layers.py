@@ -28,7 +28,6 @@ class Layer(Record):
     Attributes:
         colors: Linear, in [0, 1].
         lit: Whether light changes the colours.
-        legend: What they say.
     """
 
     colors: Float[Tensor, "vertex 3"]

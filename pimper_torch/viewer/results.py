@@ -11,11 +11,7 @@ COARSE, RESULT = "coarse surface", "result"
 
 
 def add_found(viewer: Viewer, found: SparseScene | Step, reference: int = 0) -> None:
-    """Show cameras, photographs and points, or the surface of a pass, as soon as it is there.
-
-    Args:
-        reference: View that the page begins in.
-    """
+    """Show cameras, photographs and points, or the surface of a pass, as soon as it is there."""
     if isinstance(found, Step):
         viewer.add_pass(f"pass at {found.scale:g} of the photographs", found.surface.mesh)
     else:

@@ -87,7 +87,6 @@ class Viewer:
 
         Args:
             names: Of the photographs, in the order of the cameras.
-            reference: View that the page begins in.
         """
         frame = self._frame = frame_of_cameras(cameras, reference, points_world)
         scene = self.server.scene

@@ -130,7 +130,6 @@ def surface_picture(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None =
 
     Args:
         mesh: Any; points without faces give a white picture.
-        cameras: Its world.
         hits: Of the view's rays on the mesh, if they are known already.
     """
     if not len(mesh.faces):

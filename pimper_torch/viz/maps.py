@@ -24,7 +24,6 @@ class ViewMaps(Record):
         depth: Along the camera's z; NaN where nothing is seen.
         normals_cam: Unit, camera frame, as the mesh carries them; zero where nothing is seen.
         albedo: As the mesh carries it; zero where nothing is seen.
-        confidence: The same.
         expected_error: The same, scene units; ``None`` where the mesh carries none.
     """
 
@@ -44,7 +43,6 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     autograd.
 
     Args:
-        cameras: Its world.
         hits: Of the view's rays on the mesh, if they are known already.
     """
     hits = hits or cast_view(mesh, cameras, view)

@@ -150,7 +150,6 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
     """Gather a number of every patch, in the order of the facets; NaN where there is no patch.
 
     Args:
-        patches: Whose buckets have the field.
         name: Of the field, such as ``status``, or of one inside, ``convergence.residual``; one
             value a patch.
 

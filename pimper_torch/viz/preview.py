@@ -21,7 +21,6 @@ def draw_preview(
     """Draw the reference photograph, and the coarse surface from there, left and right, as PNG.
 
     Args:
-        coarse: In its frame.
         path: A former file is replaced when the new one is complete.
         panel_px: Longer side of a picture of the surface, and height of the photograph.
     """

@@ -19,7 +19,6 @@ def thumbnails(
     Args:
         views: Linear radiance.
         silhouettes: Of the same views. Lines are yellow, and red where a view is not trusted.
-        width_px: Of all tiles beside one another.
 
     Returns:
         sRGB in [0, 1]; tiles that are left over are white.

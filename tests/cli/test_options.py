@@ -53,7 +53,7 @@ RUNS = {
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
         "--elevation-deg 40 --sway-deg 2 --light point --point-light-distance 3 --irradiance 0.5 "
-        "--ambient 0.2 --flash 0.1 --window 0.2 --lamp-colour 0.3 --bounces 1 --exposure 1.2 "
+        "--ambient 0.2 --flash 0.1 --window 0.2 --lamp-colour 0.3 --exposure 1.2 "
         "--read-noise 0.01 --shot-noise 0.01 --supersample 2 --bits 16 "
         "--encoding linear --up y --specular 0.1 --roughness 0.2",
         "{ball} --out {out} {tiny} --albedo 0.6 0.5 0.4 --table patterned --rotation-deg 30",
@@ -72,7 +72,7 @@ RUNS = {
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
-        "--trimmed-fraction 0.1 --icp-distance point",
+        "--trimmed-fraction 0.1",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
         "{told} {true_mesh} --samples 500 --calibration {out}.png --overwrite",
         "{result} {scene} --samples 500 --report {out}.html --overwrite",

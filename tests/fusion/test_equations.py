@@ -1,9 +1,9 @@
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.contacts import BaseSurface, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.equations import (
     Common,

@@ -1,9 +1,9 @@
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch.testing import assert_close
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
 from pimper_torch.kernels.switch import using

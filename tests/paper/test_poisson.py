@@ -8,7 +8,6 @@ from pimper_torch.paper.poisson import (
     differences,
     differences_transposed,
     integrate_steps,
-    integrate_weighted,
     solve_poisson,
 )
 
@@ -72,32 +71,3 @@ def test_contradicting_steps_are_met_in_the_least_squares_sense(generator):
     right, down = random(generator, 1, 5, 5), random(generator, 1, 4, 6)
     expected = dense_solution(right[0], down[0], torch.ones(5, 5), torch.ones(4, 6))
     assert_close(integrate_steps(right, down)[0], expected)
-
-
-def test_weighted_integration_equals_the_dense_weighted_least_squares(generator):
-    right, down = random(generator, 2, 5, 5), random(generator, 2, 4, 6)
-    weights = (10 ** random(generator, 2, 5, 5), 10 ** random(generator, 2, 4, 6))
-    found = integrate_weighted(right, down, *weights, iterations=100, tolerance=1e-12)
-    for patch in range(2):
-        expected = dense_solution(right[patch], down[patch], *(w[patch] for w in weights))
-        assert_close(found[patch], expected)
-
-
-def test_weights_without_any_size_leave_the_start(generator):
-    right, down = random(generator, 1, 5, 5), random(generator, 1, 4, 6)
-    found = integrate_weighted(right, down, 0 * right, 0 * down, iterations=5)
-    assert_close(found, integrate_steps(right, down))
-
-
-def test_gradients_go_through_the_weighted_solution(generator):
-    steps = random(generator, 1, 3, 3), random(generator, 1, 2, 4)
-    weights = (
-        0.5 + torch.rand(1, 3, 3, generator=generator, dtype=torch.float64),
-        0.5 + torch.rand(1, 2, 4, generator=generator, dtype=torch.float64),
-    )
-    inputs = [tensor.requires_grad_() for tensor in (*steps, *weights)]
-
-    def integrate(*inputs):
-        return integrate_weighted(*inputs, iterations=15, tolerance=1e-14)
-
-    assert torch.autograd.gradcheck(integrate, inputs)

@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.patches.decompose import Decompose
 from pimper_torch.patches.warp import Warp

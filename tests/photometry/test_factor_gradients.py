@@ -2,10 +2,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.manifolds import Cone

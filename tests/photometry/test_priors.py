@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.metrics.derivatives import check_derivatives
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.priors import (
     FactorPrior,

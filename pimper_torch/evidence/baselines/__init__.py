@@ -1,14 +1,6 @@
 """Baselines, run on the same scene as the method."""
 
-from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
-from pimper_torch.evidence.baselines.pmvs import Pmvs, PmvsConfig
+from pimper_torch.evidence.baselines.openmvs import OpenMvs
 from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
 
-__all__ = [
-    "OpenMvs",
-    "OpenMvsConfig",
-    "Pmvs",
-    "PmvsConfig",
-    "Smoothed",
-    "SmoothedConfig",
-]
+__all__ = ["OpenMvs", "Smoothed", "SmoothedConfig"]

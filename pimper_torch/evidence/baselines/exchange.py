@@ -10,41 +10,26 @@ from pathlib import Path
 from pimper_torch.errors import InputError, ReconstructionError
 from pimper_torch.evidence.baselines.external import last_lines
 from pimper_torch.exchange.colmap_workspace import write_pinholes
-from pimper_torch.exchange.pictures import write_mask, write_picture
+from pimper_torch.exchange.pictures import write_picture
 from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 
 
-def write_photographs(scene: SparseScene, folder: Path, suffix: str) -> tuple[str, ...]:
+def write_photographs(scene: SparseScene, folder: Path) -> tuple[str, ...]:
     """Write the undistorted photographs as 8-bit sRGB colour, saturated at 1.
 
     Args:
         scene: Any; padding is cut off.
-        folder: Made if it is not there.
-        suffix: Of a format without loss, ``.png`` or ``.ppm``.
 
     Returns:
         The files' names, ``00000000.png`` and so on, in the order of the views.
     """
-    names = tuple(f"{index:08d}{suffix}" for index in range(scene.views.num_views))
+    names = tuple(f"{index:08d}.png" for index in range(scene.views.num_views))
     colour = scene.views.replace(images=scene.views.images.expand(-1, 3, -1, -1))
     for index, name in enumerate(names):
         write_picture(colour, index, folder / name)
     return names
-
-
-def write_masks(scene: SparseScene, folder: Path, suffix: str) -> bool:
-    """Write the object's masks, white on the object, as ``00000000`` with the suffix.
-
-    Returns:
-        False, and nothing is written, where there are none.
-    """
-    if scene.views.masks is None:
-        return False
-    for index in range(scene.views.num_views):
-        write_mask(scene.views, index, folder / f"{index:08d}{suffix}")
-    return True
 
 
 def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path) -> None:

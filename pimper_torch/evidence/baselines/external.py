@@ -7,12 +7,11 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
+from pimper_torch.errors import MissingProgramError, ReconstructionError
 
 _LAST_LINES = 15
 
@@ -32,21 +31,15 @@ class Program:
     source: str
     folders: tuple[Path, ...] = ()
 
-    def find(self, given: Path | None = None) -> Path:
-        """Find the executable: as given, as the variable says, on the PATH, in its folders.
-
-        Args:
-            given: The executable itself, or the folder it lies in. If set, nowhere else is
-                looked.
-        """
-        named = given or (Path(os.environ[self.variable]) if self.variable in os.environ else None)
-        if named is not None:
+    def find(self) -> Path:
+        """Find the executable: as the variable says, on the PATH, in its folders."""
+        if self.variable in os.environ:
+            named = Path(os.environ[self.variable])
             found = _executable(named / self.name if named.is_dir() else named)
             if found is None:
                 raise MissingProgramError(
-                    f"{self.name} is not installed at {named}, where "
-                    f"{'the settings say' if given else self.variable + ' says'}; needed: the "
-                    f"executable, or the folder it lies in. {self._advice}"
+                    f"{self.name} is not installed at {named}, where {self.variable} says; "
+                    f"needed: the executable, or the folder it lies in. {self._advice}"
                 )
             return found
         on_path = shutil.which(self.name)
@@ -75,11 +68,7 @@ def _executable(path: Path) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """A limit of time that several programs share.
-
-    Attributes:
-        began: Set by itself.
-    """
+    """A limit of time that several programs share."""
 
     minutes: float
     began: float = field(default_factory=time.monotonic)
@@ -88,29 +77,6 @@ class Deadline:
     def seconds_left(self) -> float:
         """Time until then; negative after it."""
         return 60 * self.minutes - (time.monotonic() - self.began)
-
-
-@contextmanager
-def workspace(method: str, keep_in: Path | None) -> Iterator[Path]:
-    """Return an empty folder to exchange files in; it is removed at the end, come what may.
-
-    Args:
-        method: Begins the folder's name.
-        keep_in: Folder in which to make it, and to leave it for a look at its files.
-    """
-    if keep_in is None:
-        with tempfile.TemporaryDirectory(prefix=f"pimper-{method}-") as folder:
-            yield Path(folder).resolve()
-        return
-    try:
-        keep_in.mkdir(parents=True, exist_ok=True)
-        kept = Path(tempfile.mkdtemp(prefix=f"{method}-", dir=keep_in)).resolve()
-    except OSError as error:
-        raise InputError(
-            f"keep_in is {keep_in}, where no folder can be made ({error.strerror}). Choose a "
-            "folder that may be written, or leave it out."
-        ) from error
-    yield kept
 
 
 def run_program(

@@ -1,12 +1,10 @@
 """OpenMVS, if the user has it: depth maps, Delaunay and graph cut, refinement."""
 
-from dataclasses import dataclass
+import tempfile
 from pathlib import Path
-from typing import Annotated
 
 import torch
 
-from pimper_torch.config import Range, require_ranges
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.evidence.baselines.exchange import (
@@ -15,12 +13,7 @@ from pimper_torch.evidence.baselines.exchange import (
     write_photographs,
     write_pinhole_model,
 )
-from pimper_torch.evidence.baselines.external import (
-    Deadline,
-    Program,
-    run_program,
-    workspace,
-)
+from pimper_torch.evidence.baselines.external import Deadline, Program, run_program
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
@@ -44,40 +37,15 @@ REFINE = _program("RefineMesh")
 # versions, which those after ``-o`` are not.
 _SCENE, _DENSE, _MESH = "scene.mvs", "scene_dense.mvs", "scene_dense_mesh.ply"
 _REFINED = ("scene_dense_refine.ply", "scene_dense_mesh_refine.ply")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OpenMvsConfig:
-    """OpenMVS's settings under its defaults.
-
-    Attributes:
-        folder: With its programs; else PIMPER_OPENMVS, the PATH or its usual folder say.
-        resolution_level: How often the photographs are halved for the depth maps.
-        min_resolution_px: Photographs whose longer side would be less are halved less often.
-        refine: Refine the mesh by the photographs at the end; takes long.
-        threads: 0 for all cores.
-        max_minutes: For all its programs together; then they are stopped.
-        keep_in: Folder to leave their files in; else they are removed.
-    """
-
-    folder: Path | None = None
-    resolution_level: Annotated[int, Range(least=0, most=16)] = 1  # halvings: a pixel is left
-    min_resolution_px: Annotated[int, Range(least=1, most=65_535)] = 640
-    refine: bool = True
-    threads: Annotated[int, Range(least=0, most=1024)] = 0
-    max_minutes: Annotated[float, Range(above=0)] = 120.0
-    keep_in: Path | None = None
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
+# For all the programs together; then they are stopped.
+_MAX_MINUTES = 120.0
 
 
 class OpenMvs(Stage):
-    """Depth maps by patch match, a mesh that explains their visibility, refined."""
+    """Depth maps by patch match, a mesh that explains their visibility, refined.
 
-    def __init__(self, config: OpenMvsConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or OpenMvsConfig()
+    All under the programs' own defaults.
+    """
 
     @torch.no_grad()
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
@@ -91,42 +59,34 @@ class OpenMvs(Stage):
         Returns:
             A mesh in the scene's frame.
         """
-        config = self.config
-        wanted = [INTERFACE, DENSIFY, RECONSTRUCT] + [REFINE] * config.refine
-        found = {program: program.find(config.folder) for program in wanted}
-        with workspace("openmvs", config.keep_in) as folder:
-            names = write_photographs(scene, folder / "images", ".png")
+        found = {program: program.find() for program in (INTERFACE, DENSIFY, RECONSTRUCT, REFINE)}
+        with tempfile.TemporaryDirectory(prefix="pimper-openmvs-") as temporary:
+            folder = Path(temporary).resolve()
+            names = write_photographs(scene, folder / "images")
             write_pinhole_model(scene, names, folder / "sparse")
-            mesh = _Run(found, folder, config).surface()
+            mesh = _Run(found, folder).surface()
         return estimate_of(mesh, scene, coarse)
 
 
 class _Run:
     """The chain of programs in one folder."""
 
-    def __init__(self, found: dict[Program, Path], folder: Path, config: OpenMvsConfig) -> None:
-        self._found, self._folder, self._config = found, folder, config
-        self._deadline = Deadline(config.max_minutes)
-        self._threads = config.threads or usable_cores()
+    def __init__(self, found: dict[Program, Path], folder: Path) -> None:
+        self._found, self._folder = found, folder
+        self._deadline = Deadline(_MAX_MINUTES)
+        self._threads = usable_cores()
         self._done = 0
 
     def surface(self) -> Mesh:
         """Run them all and read the last one's mesh."""
-        config = self._config
         self._call(INTERFACE, "-i", str(self._folder), leaves=(_SCENE,))
-        self._call(
-            DENSIFY,
-            *("-i", _SCENE),
-            *("--resolution-level", str(config.resolution_level)),
-            *("--min-resolution", str(config.min_resolution_px)),
-            leaves=(_DENSE,),
-        )
+        self._call(DENSIFY, "-i", _SCENE, leaves=(_DENSE,))
         # Since version 2.3 the dense points are not in the scene's file, and must be named;
         # before, the option did not exist.
         points = ("-p", "scene_dense.ply") if self._names_points() else ()
         path, printed = self._call(RECONSTRUCT, "-i", _DENSE, *points, leaves=(_MESH,))
         last = RECONSTRUCT
-        if config.refine and path.is_file():
+        if path.is_file():
             path, printed = self._call(REFINE, "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
             last = REFINE
         return read_surface(path, last.name, printed)

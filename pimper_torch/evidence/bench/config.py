@@ -11,7 +11,7 @@ from pimper_torch.evidence.scenes.config import SceneConfig
 SCENES = ("mug", "jar", "balls", "potatoes")
 METHODS = {
     "quick": ("default", "smoothed"),
-    "full": ("default", "paper", "smoothed", "pmvs", "openmvs"),
+    "full": ("default", "paper", "smoothed", "openmvs"),
 }
 """What each scale runs by default."""
 
@@ -24,7 +24,7 @@ class BenchConfig:
         scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
         scenes: Names of rendered scenes, or folders that `pimper render` wrote.
         methods: Presets, YAML files of settings, and baselines. By default those of the scale:
-            quick runs default and smoothed; full also paper, pmvs and openmvs.
+            quick runs default and smoothed; full also paper and openmvs.
         masks: Give the methods the true masks of the object; without, they see the table too.
         cameras: found by structure from motion, once a scene and the same for all methods; by
             its features alone (``reconstruct.track_iterations: 0``); or the true ones with a true

@@ -9,7 +9,6 @@ from torch import nn
 from pimper_torch.chains.presets import load_config, make_chain
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.baselines.openmvs import OpenMvs
-from pimper_torch.evidence.baselines.pmvs import Pmvs
 from pimper_torch.evidence.baselines.smoothed import Smoothed
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.records import (
@@ -25,7 +24,6 @@ class Outcome(Record):
     """A method's estimate, and its cost.
 
     Attributes:
-        estimate: Surface, cameras, lights.
         seconds: Wall clock without structure from motion.
         mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
         samples: Samples of all templates times views, missing ones included.
@@ -43,11 +41,7 @@ class Outcome(Record):
 
 Method = Callable[[SparseScene, CoarseMesh], Outcome]
 
-_BASELINES: dict[str, Callable[[], nn.Module]] = {
-    "smoothed": Smoothed,
-    "pmvs": Pmvs,
-    "openmvs": OpenMvs,
-}
+_BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs": OpenMvs}
 
 
 def method_named(name: str) -> Method:
@@ -90,7 +84,7 @@ def _baseline(module: nn.Module) -> Method:
         return Outcome(
             estimate=estimate,
             seconds=time.perf_counter() - began,
-            external=isinstance(module, Pmvs | OpenMvs),
+            external=isinstance(module, OpenMvs),
         )
 
     return run

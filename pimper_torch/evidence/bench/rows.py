@@ -7,13 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pimper_torch.config import build, to_mapping
-from pimper_torch.errors import ConfigError, InputError, MissingProgramError, OutputError
+from pimper_torch.config import to_mapping
+from pimper_torch.errors import MissingProgramError, OutputError
 from pimper_torch.evidence.bench.machine import Machine
 from pimper_torch.records import Record
-
-_FORMAT = "pimper-bench"
-_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,28 +20,20 @@ class Row(Record):
     Percentages are of 100. Lengths are percentages of the true bounding box's diagonal.
 
     Attributes:
-        scene: Name.
-        method: Preset or baseline.
         mesh_points: Vertices of the coarse mesh.
-        triangles: Its facets.
         samples: Samples of all templates times views, missing ones included.
-        missing_percent: Of the samples.
         minutes: Wall clock of this method alone.
         sfm_minutes: Wall clock of the structure from motion that all methods share.
         relative_error: The published 3D error, along the rays of the reference view, per cent.
         coverage_percent: Of the true pixels, those whose ray meets the surface, and not where
             it shows the table; the 3D error is over these.
         mean_normal_deg: Error of the normals that the vertices carry.
-        median_normal_deg: The same.
         mean_shape_normal_deg: Error of the normals of the surface's own shape.
-        median_shape_normal_deg: The same.
         common_percent: Of the true pixels, those that all methods of the table cover that gave
             a surface.
         common_relative_error: The 3D error over these.
         common_mean_normal_deg: Of the normals that the vertices carry, over these.
-        common_median_normal_deg: The same.
         common_mean_shape_normal_deg: Of the surface's own shape, over these.
-        common_median_shape_normal_deg: The same.
         pitted_percent: Rays where these are far further off than around: pimples and pits.
         chamfer: Mean of accuracy and completeness of what three views or more see.
         accuracy: Mean distance from the surface to the truth.
@@ -166,8 +155,8 @@ def with_published(rows: Sequence[Row]) -> tuple[Row, ...]:
 def write_json(table: Table, path: Path) -> None:
     """Write a table with all its digits; figures that are not finite become ``null``."""
     report = {
-        "format": _FORMAT,
-        "version": _VERSION,
+        "format": "pimper-bench",
+        "version": 1,
         "date": table.date,
         "scale": table.scale,
         "machine": to_mapping(table.machine),
@@ -181,40 +170,6 @@ def write_json(table: Table, path: Path) -> None:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror}). Write elsewhere."
         ) from error
-
-
-def read_json(path: Path | str) -> Table:
-    """Read a table that :func:`write_json` wrote."""
-    try:
-        report = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}).") from error
-    if not isinstance(report, dict) or report.get("format") != _FORMAT:
-        raise InputError(f"{path}: is no table of `pimper bench`; needed: its JSON file.")
-    if report.get("version") != _VERSION:
-        raise InputError(
-            f"{path}: is of version {report.get('version')}; this pimper reads version "
-            f"{_VERSION}. Run the bench again."
-        )
-    try:
-        return Table(
-            rows=tuple(
-                build(Row, _mapping(row, f"{path}, row {index}"), f"{path}, row {index}")
-                for index, row in enumerate(report["rows"])
-            ),
-            machine=build(Machine, _mapping(report["machine"], f"{path}"), f"{path}"),
-            date=str(report["date"]),
-            scale=str(report["scale"]),
-            settings=_mapping(report["settings"], f"{path}, settings"),
-        )
-    except (ConfigError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: is no whole table ({error}). Run the bench again.") from error
-
-
-def _mapping(value: object, where: str) -> dict[str, object]:
-    if not isinstance(value, dict):
-        raise InputError(f"{where}: holds {value!r}; needed: an object with fields.")
-    return value
 
 
 def _finite(value: object) -> object:

@@ -17,7 +17,6 @@ from pimper_torch.cli.output import Output
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import (
     read_colmap,
-    read_diligent,
     read_diligent_mv,
     read_dtu_mvs,
     read_dtu_points,
@@ -33,12 +32,10 @@ from pimper_torch.evidence.datasets import (
 )
 from pimper_torch.evidence.datasets.posed import assemble
 from pimper_torch.exchange.nerfstudio import thinned
-from pimper_torch.geometry.pixels import scale_intrinsics
-from pimper_torch.io.radiance import resized_mask, resized_radiance
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
-from pimper_torch.records import Cameras, Capture, Truth, Views
+from pimper_torch.records import Capture, Truth
 from pimper_torch.reporting import stage
 
 Source = Literal[
@@ -51,7 +48,6 @@ Source = Literal[
     "dtu-points",
     "dtu-mvs",
     "diligent-mv",
-    "diligent",
     "rendered",
 ]
 Target = Literal["colmap", "idr", "transforms"]
@@ -164,32 +160,9 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
         "dtu-points": read_dtu_points,
         "dtu-mvs": read_dtu_mvs,
         "diligent-mv": read_diligent_mv,
-        "diligent": read_diligent,
-        "rendered": read_scene,
+        # Without its maps, which no layout has a place for.
+        "rendered": lambda folder: read_rendered(folder, maps=False),
     }
-
-
-def read_scene(folder: Path, *, max_size_px: int = 0) -> Capture:
-    """Read a rendered scene without its maps, which no layout has a place for."""
-    if max_size_px < 0:
-        raise InputError(f"--max-size-px is {max_size_px}; needed: 0, or the longest side.")
-    capture = read_rendered(folder, maps=False)
-    assert capture.cameras is not None
-    views, whole = capture.views, capture.cameras.sizes_px[0].tolist()
-    if not 0 < max_size_px < max(whole):
-        return capture
-    width, height = (max(1, round(side * max_size_px / max(whole))) for side in whole)
-    small = torch.tensor([[width, height]] * views.num_views)
-    images = torch.stack([resized_radiance(image, width, height) for image in views.images])
-    masks = views.masks
-    if masks is not None:
-        masks = torch.stack([resized_mask(mask.float(), width, height) for mask in masks])
-    factors = width / whole[0], height / whole[1]
-    intrinsics = scale_intrinsics(capture.cameras.intrinsics, *factors)
-    return capture.replace(
-        views=views.replace(images=images, masks=masks, sizes_px=small),
-        cameras=capture.cameras.replace(intrinsics=intrinsics, sizes_px=small),
-    )
 
 
 def read(job: Job) -> Capture:
@@ -231,13 +204,10 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
             "this data set says nothing about its cameras; needed: cameras to export. Use its "
             "photographs as they are."
         )
-    writers: Mapping[str, Callable[[Views, Cameras, Path, Tensor | None], None]] = {
-        "colmap": lambda *given: write_colmap(*given[:3], points_world=given[3]),
-        "idr": lambda *given: write_idr(*given[:3], points_world=given[3]),
-        "transforms": lambda *given: write_transforms(*given[:3], points_world=given[3]),
-    }
+    writers = {"colmap": write_colmap, "idr": write_idr, "transforms": write_transforms}
     folder.mkdir(parents=True, exist_ok=True)
-    writers[target](capture.views, capture.cameras, folder, cloud(capture.truth))
+    points = cloud(capture.truth)
+    writers[target](capture.views, capture.cameras, folder, points_world=points)
 
 
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:

@@ -19,14 +19,12 @@ from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics.alignment import Method
 from pimper_torch.evidence.metrics.evaluate import (
     EvaluateConfig,
     Evaluation,
     chosen_views,
     evaluate,
 )
-from pimper_torch.evidence.metrics.icp import IcpConfig
 from pimper_torch.evidence.metrics.page import write_compared_page
 from pimper_torch.evidence.metrics.report import report, rows
 from pimper_torch.io.estimates import read_estimate
@@ -46,55 +44,7 @@ _THUMBNAIL_PX = 200
 FORMAT = "pimper_torch evaluation"
 # Columns that the explanation of a figure needs to stand beside it.
 _ROOM = 72
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvaluateOptions:
-    """What is measured, against what.
-
-    Attributes:
-        truth_layout: What TRUTH is. `mesh`: a mesh file or point cloud in the result's frame;
-            `rendered`: a folder that `pimper render` wrote; `dtu-mvs`: the folder of the
-            DTU multi-view stereo set, with its protocol if ObsMask is there;
-            `diligent-mv`: an object's folder. `auto` distinguishes the first two.
-        scan: Number of the scan of `dtu-mvs`.
-        alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
-            `icp` (trimmed similarity between the surfaces, from the cameras on), or `auto`:
-            cameras if there are two on both sides, else none.
-        views: Names of the photographs to compare normals, albedo and relative error in; the
-            result's reference view unless given.
-        thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
-            the true object's bounding box.
-        seen_from: Completeness is given once more over the truth that this many positions of the
-            camera see.
-        samples: Points drawn on each surface.
-        seed: Of every draw.
-        trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
-        icp_distance: What `icp` makes small: the distance to the true `plane` or `point`.
-    """
-
-    truth_layout: Layout = "auto"
-    scan: int | None = None
-    alignment: Method = "auto"
-    views: tuple[str, ...] = ()
-    thresholds_percent: tuple[float, ...] = (0.25, 0.5, 1.0)
-    seen_from: int = 3
-    samples: int = 200_000
-    seed: int = 0
-    trimmed_fraction: float = 0.2
-    icp_distance: Literal["plane", "point"] = "plane"
-
-    def config(self) -> EvaluateConfig:
-        """Return the settings of the evaluation."""
-        return EvaluateConfig(
-            alignment=self.alignment,
-            views=self.views,
-            thresholds_percent=self.thresholds_percent,
-            seen_from=self.seen_from,
-            samples=self.samples,
-            seed=self.seed,
-            icp=IcpConfig(trimmed_fraction=self.trimmed_fraction, distance=self.icp_distance),
-        )
+_DEFAULT = EvaluateConfig()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +60,12 @@ class Job:
         report: HTML file that shows the result in a browser with its errors; the photographs that
             it was made from must be where they were.
         overwrite: Replace files that a former evaluation wrote, and no others.
-        options: The measuring.
+        truth_layout: What TRUTH is. `mesh`: a mesh file or point cloud in the result's frame;
+            `rendered`: a folder that `pimper render` wrote; `dtu-mvs`: the folder of the
+            DTU multi-view stereo set, with its protocol if ObsMask is there;
+            `diligent-mv`: an object's folder. `auto` distinguishes the first two.
+        scan: Number of the scan of `dtu-mvs`.
+        config: The measuring.
     """
 
     result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")]
@@ -119,13 +74,15 @@ class Job:
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     report: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     overwrite: Flag = False
-    options: Annotated[EvaluateOptions, tyro.conf.arg(name="")] = EvaluateOptions()
+    truth_layout: Layout = "auto"
+    scan: int | None = None
+    config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = _DEFAULT
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``evaluate``."""
     job = checked(command, arguments)
-    config = job.options.config()
+    config = job.config
     estimate = read_estimate(job.result)
     if job.calibration is not None and estimate.mesh.expected_error is None:
         raise InputError(
@@ -156,7 +113,6 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 def checked(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments, and check what can be checked without reading RESULT and TRUTH."""
     job = read_arguments(Job, command, arguments)
-    job.options.config()
     for path in (job.result, job.truth):
         if not path.exists():
             raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
@@ -184,7 +140,7 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
     Of a rendered scene no more maps are read than will be compared, so that memory does not
     grow with the number of its views.
     """
-    layout, truth = job.options.truth_layout, job.truth
+    layout, truth = job.truth_layout, job.truth
     if layout == "auto":
         layout = "rendered" if (truth / "truth").is_dir() else "mesh"
         if layout == "mesh" and truth.is_dir():
@@ -200,7 +156,7 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
         return TruthRead(capture=bare, maps=read_rendered(truth, views=chosen, photographs=False))
     if layout == "diligent-mv":
         return TruthRead(capture=named_as(read_diligent_mv(truth, lights=[1]), estimate))
-    scan = job.options.scan
+    scan = job.scan
     if scan is None:
         raise InputError(f"{truth}: holds many scans; needed: --scan with the number of one.")
     capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
@@ -295,7 +251,11 @@ def write_report(
         "pimper_torch": installed_version(),
         "result": str(job.result),
         "truth": str(job.truth),
-        "settings": to_mapping(job.options),
+        "settings": {
+            "truth_layout": job.truth_layout,
+            "scan": job.scan,
+            **to_mapping(job.config),
+        },
         **report(evaluation),
         "relighting": relighting,
     }

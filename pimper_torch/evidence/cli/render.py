@@ -32,7 +32,6 @@ _RARE = tuple(
             "flash",
             "window",
             "lamp-colour",
-            "bounces",
             "read-noise",
             "shot-noise",
             "supersample",

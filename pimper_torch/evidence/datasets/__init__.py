@@ -1,6 +1,5 @@
 """Readers of public data sets, and their layouts as formats to write."""
 
-from pimper_torch.evidence.datasets.check import check_capture
 from pimper_torch.evidence.datasets.colmap import read_colmap
 from pimper_torch.evidence.datasets.diligent import read_diligent
 from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
@@ -15,7 +14,6 @@ from pimper_torch.exchange.colmap_workspace import write_colmap
 from pimper_torch.exchange.nerfstudio import write_transforms
 
 __all__ = [
-    "check_capture",
     "one_light_per_position",
     "read_colmap",
     "read_diligent",

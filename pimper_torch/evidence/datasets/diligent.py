@@ -45,7 +45,6 @@ def read_diligent(
     lights: Sequence[int] | None = None,
     light_seed: int | None = None,
     max_size_px: int = 0,
-    divide_by_intensity: bool = False,
 ) -> Capture:
     """Read an object of DiLiGenT: one viewpoint, 96 lights, true normals.
 
@@ -65,8 +64,6 @@ def read_diligent(
         lights: Read these lights only, from 1.
         light_seed: Read one light, chosen by this seed; ``None`` reads all.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        divide_by_intensity: Divide photographs by the intensity of their lights, colour by
-            colour, as the benchmark does. Then 1 is no longer the level of saturation.
 
     Raises:
         InputError: Another layout; names what was expected and what was found.
@@ -93,14 +90,13 @@ def read_diligent(
         encoding=LINEAR,
         max_size_px=max_size_px,
         masks=[root / "mask.png"] * len(kept),
-        divide_by=intensity if divide_by_intensity else None,
     )
     width, height = (int(side) for side in views.sizes_px[0])
     normals = read_normals(root, KIND)
     if normals is not None:
         rotated = nearest(normals, width, height)
         normals = rotated[None].expand(len(kept), -1, -1, -1)
-    strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
+    strength = intensity.mean(dim=1)
     return Capture(
         views=views,
         cameras=None,

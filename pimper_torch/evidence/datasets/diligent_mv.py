@@ -37,7 +37,6 @@ def read_diligent_mv(
     lights: Sequence[int] | None = None,
     light_seed: int | None = None,
     max_size_px: int = 0,
-    divide_by_intensity: bool = False,
 ) -> Capture:
     """Read an object of DiLiGenT-MV with its cameras, lights, normals and mesh.
 
@@ -60,12 +59,9 @@ def read_diligent_mv(
         light_seed: Read one light a view, chosen by this seed; ``None`` reads all, 20 x 96
             photographs. Decided before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        divide_by_intensity: Divide photographs by the intensity of their lights, colour by
-            colour, as photometric stereo with known lights does. Then 1 is no longer the
-            level of saturation.
 
     Returns:
-        ``truth.lights_world`` has the lights' mean intensity, or 1 after the division.
+        ``truth.lights_world`` has the lights' mean intensity.
 
     Raises:
         InputError: Another layout; names what was expected and what was found.
@@ -106,7 +102,6 @@ def read_diligent_mv(
         encoding=LINEAR,
         max_size_px=max_size_px,
         masks=[path.parent / "mask.png" for path in paths],
-        divide_by=intensity if divide_by_intensity else None,
     )
     width, height = (int(side) for side in views.sizes_px[0])
     header = read_header(paths[0])
@@ -116,7 +111,7 @@ def read_diligent_mv(
     )
     world_from_cam = pose[:, :3, :3].mT
     directions_world = (world_from_cam[index] @ (directions * FLIP)[..., None])[..., 0]
-    strength = torch.ones(len(kept)) if divide_by_intensity else intensity.mean(dim=1)
+    strength = intensity.mean(dim=1)
     normals = [
         _rotated(read_normals(folders[position], KIND), world_from_cam[row], width, height)
         for row, position in enumerate(order)

@@ -38,7 +38,6 @@ def dtu_capture(
 
     Args:
         named: Position, light and file of each photograph there is.
-        kind: The set's name, for messages.
         cameras: Reads intrinsics, whose pixels count from the centre of the first one, and poses
             of positions in ascending order.
 

@@ -87,7 +87,6 @@ def write_idr(
 
     Args:
         views: Undistorted.
-        folder: Made if it is not there.
         points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
             them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
 

@@ -16,9 +16,6 @@ from pimper_torch.io.matlab import read_variables
 def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.ndarray]:
     """Read numeric arrays of a MATLAB file (up to version 7).
 
-    Args:
-        kind: The data set, for messages.
-
     Raises:
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
             numbers; lists what the file holds.
@@ -68,7 +65,6 @@ def read_toolbox_projections(
 
     Args:
         path: ``Calib_Results.mat``.
-        kind: The data set, for messages.
 
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is

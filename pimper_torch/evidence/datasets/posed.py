@@ -80,7 +80,6 @@ def assemble(
 
     Args:
         photographs: All that the data set has.
-        path: Its file or folder, for messages.
         names: Keep these, in this order; ``None`` for all.
         mesh: File of the true surface, in the data set's frame.
         encoding: Response, saturation and black level of the files.

@@ -23,7 +23,6 @@ def read_photographs(
     encoding: Encoding,
     max_size_px: int = 0,
     masks: Sequence[Path] | None = None,
-    divide_by: Float[Tensor, "view channel"] | None = None,
 ) -> Views:
     """Read photographs of one size as linear radiance.
 
@@ -34,7 +33,6 @@ def read_photographs(
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         masks: One a path, brighter than half on the object; a mask that several
             photographs share is decoded once.
-        divide_by: Radiance is divided by this, colour by colour.
 
     Raises:
         InputError: Names files that are missing, damaged or of another size.
@@ -52,8 +50,6 @@ def read_photographs(
             )
     width, height = shrunk_size(headers[0], max_size_px)
     images = read_pictures(paths, headers, [(width, height)] * len(paths), encoding).images
-    if divide_by is not None:
-        images = images / divide_by[:, :, None, None].to(images)
     return Views(
         images=images,
         sizes_px=torch.tensor([[width, height]]).repeat(len(paths), 1),

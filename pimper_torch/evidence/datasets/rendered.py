@@ -105,7 +105,9 @@ def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
     assert isinstance(names, list)
     assert isinstance(settings, dict)
     try:
-        config = build(SceneConfig, settings, str(path))
+        # Settings that have gone since changed nothing that is read here.
+        known = {name: settings[name] for name in SceneConfig.__slots__ if name in settings}
+        config = build(SceneConfig, known, str(path))
     except ConfigError as error:
         raise InputError(f"{path}: {error}") from error
     expect(

@@ -68,8 +68,6 @@ def choose_photographs(
         positions: Keep these only; ``None`` keeps all.
         lights: Keep these only; ``None`` keeps all.
         light_seed: Keep one light a position, chosen by this seed; ``None`` keeps all.
-        path: The set's folder, for messages.
-        kind: The set's name, for messages.
 
     Returns:
         Indices of photographs, by position and then light.

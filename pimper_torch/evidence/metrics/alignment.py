@@ -16,7 +16,6 @@ from pimper_torch.evidence.metrics.similarity import (
     similarity_between_cameras,
     split_similarity,
 )
-from pimper_torch.evidence.metrics.turned_cameras import standing_as
 from pimper_torch.evidence.metrics.visible import joined
 from pimper_torch.geometry.frames import transform
 from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
@@ -33,7 +32,6 @@ class Alignment(Record):
         description: In words, with whatever tells it from its kin.
         truth_from_world: Upper left block is scale times rotation.
         scale: Scene units of the truth in one of the estimate.
-        rotation_deg: Angle of the rotation.
         cameras: How many pairs of cameras were used; 0 if none.
         trimmed_fraction: Fraction of the samples left out by ``icp``; ``None`` otherwise.
         residual: Root mean square distance of the samples ``icp`` kept, scene units.
@@ -108,15 +106,14 @@ def align_estimate(
 
 
 def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Cameras] | None:
-    """Return the cameras of the views that both have, turned alike; ``None`` if there are none."""
+    """Return the cameras of the views that both have; ``None`` if there are none."""
     if estimate.cameras is None or capture.cameras is None:
         return None
     try:
         ours, truth = pair_views(estimate.names, capture.views.names)
     except InputError:
         return None
-    cameras_true = capture.cameras.take(truth.tolist())
-    return standing_as(estimate.cameras.take(ours.tolist()), cameras_true), cameras_true
+    return estimate.cameras.take(ours.tolist()), capture.cameras.take(truth.tolist())
 
 
 def transfer(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:

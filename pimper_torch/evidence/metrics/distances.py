@@ -23,7 +23,6 @@ class DistanceFigures(Record):
         mean: Scene units.
         median: Scene units.
         mean_percent: Of the diagonal of the true object's bounding box.
-        median_percent: The same.
         samples: How many; each stands for the same area.
     """
 

@@ -26,10 +26,7 @@ class DtuFigures(Record):
 
     Attributes:
         mean_accuracy: From the result to the scan, inside the observability mask.
-        median_accuracy: The same.
         mean_completeness: From the scan above the table to the result.
-        median_completeness: The same.
-        overall: Mean of the two means.
         points: Of the result after thinning.
         evaluated: Of these, inside the mask.
         evaluated_true: Points of the scan above the table.

@@ -1,6 +1,6 @@
 """A result against the truth: every figure that the truth allows."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -43,16 +43,18 @@ class EvaluateConfig:
     """What is measured, and after which alignment.
 
     Attributes:
-        alignment: ``none``, ``cameras``, ``icp``, or ``auto``: cameras where both sides have
-            two, else none.
-        views: Names of the views that normals, albedo and the relative error are compared
-            in; if empty, the estimate's reference view, or the middle one if it has none.
-        thresholds_percent: Of the diagonal of the true object's bounding box, for precision,
-            recall and F-score.
-        seen_from: Places of the camera that must see a true point which is counted as seen.
-        samples: On each surface.
+        alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
+            `icp` (trimmed similarity between the surfaces, from the cameras on), or `auto`:
+            cameras if there are two on both sides, else none.
+        views: Names of the photographs to compare normals, albedo and relative error in; the
+            result's reference view unless given, or the middle one if it has none.
+        thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
+            the true object's bounding box.
+        seen_from: Completeness is given once more over the truth that this many positions of the
+            camera see.
+        samples: Points drawn on each surface.
         seed: Of every draw.
-        icp: How surfaces are brought together.
+        trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
     """
 
     alignment: Method = "auto"
@@ -61,7 +63,7 @@ class EvaluateConfig:
     seen_from: Annotated[int, Range(least=1, most=100_000)] = 3
     samples: Annotated[int, Range(least=1, most=10_000_000)] = 200_000  # 100 bytes each
     seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0  # 32 bits
-    icp: IcpConfig = field(default_factory=IcpConfig)
+    trimmed_fraction: Annotated[float, Range(least=0, below=1)] = 0.2
 
     def __post_init__(self) -> None:
         within = all(0 < percent <= 100 for percent in self.thresholds_percent)
@@ -116,7 +118,8 @@ def evaluate(
     """
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
-    alignment = align_estimate(estimate, capture, config.alignment, config.icp, generator=generator)
+    icp = IcpConfig(trimmed_fraction=config.trimmed_fraction)
+    alignment = align_estimate(estimate, capture, config.alignment, icp, generator=generator)
     moved = transfer(estimate.mesh, alignment.truth_from_world)
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture

@@ -1,7 +1,7 @@
 """Trimmed iterative closest points with scale: a similarity between two surfaces."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -28,9 +28,6 @@ class IcpConfig:
         trimmed_fraction: Fraction of the estimate's samples, those farthest from the truth, that
             each step leaves out. It must cover outliers and whatever the truth lacks; what
             the estimate lacks needs none, for only its own samples look for partners.
-        distance: ``plane`` measures along the true normals, which converges faster and
-            slides where the surfaces may; ``point`` measures to the nearest point. A truth
-            without faces has no normals and is always measured by ``point``.
         samples: Of the estimate.
         iterations: At most.
         tolerance: Stop when a step moves the samples by less than this fraction of their
@@ -38,7 +35,6 @@ class IcpConfig:
     """
 
     trimmed_fraction: Annotated[float, Range(least=0, below=1)] = 0.2
-    distance: Literal["plane", "point"] = "plane"
     samples: Annotated[int, Range(least=100, most=10_000_000)] = 8000  # 100 bytes each
     iterations: Annotated[int, Range(least=1, most=100_000)] = 60
     tolerance: Annotated[float, Range(above=0, most=1)] = 1e-7
@@ -53,7 +49,8 @@ class IcpResult(Record):
 
     Attributes:
         truth_from_world: Similarity.
-        distance: What was measured: ``plane`` or ``point``.
+        distance: Along true normals to the ``plane``, or to the nearest ``point`` of a truth
+            without faces.
         residual: Root mean square distance of the samples that were kept, scene units.
         converged: False where the limit of iterations stopped it.
     """
@@ -93,7 +90,7 @@ def trimmed_icp(
     config = config or IcpConfig()
     target = NearestSurface(truth)
     normals = face_normals(truth.vertices_world.cpu().double(), truth.faces.cpu())
-    by_plane = config.distance == "plane" and len(truth.faces) > 0
+    by_plane = len(truth.faces) > 0
     samples = sample_surface(mesh, config.samples, generator).points
     kept = max(3, round((1 - config.trimmed_fraction) * len(samples)))
     found = start.cpu().double()

@@ -17,10 +17,7 @@ class LightFigures(Record):
 
     Attributes:
         mean_deg: In the frame of the truth, after the estimate was aligned.
-        median_deg: The same.
         mean_rotated_deg: Up to the one rotation of all lights that brings them nearest.
-        median_rotated_deg: The same.
-        rotation_deg: Angle of that rotation.
         lights: How many have a direction in both.
     """
 
@@ -46,7 +43,6 @@ def compare_lights(
 
     Args:
         lights: World frame of the estimate; rows that are zero or not finite are unknown.
-        lights_true: The same views; the same.
         rotation: From the estimate's frame to that of the truth.
 
     Returns:

@@ -27,10 +27,7 @@ class CameraFigures(Record):
     Attributes:
         views: How many photographs there are in the truth.
         missing: How many of them the estimate has no camera for.
-        mean_rotation_deg: Angle between the cameras.
-        median_rotation_deg: The same.
         mean_center: Distance between the cameras' positions, scene units of the truth.
-        median_center: The same.
         mean_center_percent: Of each true camera's distance from the object's centre; NaN
             where the object is unknown.
         mean_center_percent_of_diagonal: Of the object's bounding box; NaN the same.

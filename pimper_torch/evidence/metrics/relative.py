@@ -41,7 +41,6 @@ class Meeting(Record):
         valid: True where a ray meets the truth.
         both: True where it meets the mesh too.
         points: Of the mesh, from the camera's centre, frame of the truth.
-        points_true: The same.
         center_world: Of the camera, frame of the truth.
     """
 

@@ -94,23 +94,11 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
             "views in the same order. Pair them by name first."
         )
     source, target = ours.centers_world.double(), truth.centers_world.double()
-    return _similarity(source, target, camera_correlation(ours, truth)).to(ours.cam_from_world)
-
-
-def camera_correlation(
-    ours: Cameras, truth: Cameras, chosen: slice = slice(0, 3)
-) -> Float[Tensor, "3 3"]:
-    """Correlate cameras' centres and axes; float64.
-
-    Args:
-        ours: World frame of the result.
-        truth: The same views in the same order.
-    """
-    source, target = ours.centers_world.double(), truth.centers_world.double()
-    axes = ours.cam_from_world[:, chosen, :3].double()  # rows are the axes in the world
-    axes_true = truth.cam_from_world[:, chosen, :3].double()
+    axes = ours.cam_from_world[:, :3, :3].double()  # rows are the axes in the world
+    axes_true = truth.cam_from_world[:, :3, :3].double()
     length = _spread(source).sqrt() * _spread(target).sqrt()
-    return _outer(target, source) + length * (axes_true.mT @ axes).mean(dim=0)
+    correlation = _outer(target, source) + length * (axes_true.mT @ axes).mean(dim=0)
+    return _similarity(source, target, correlation).to(ours.cam_from_world)
 
 
 def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

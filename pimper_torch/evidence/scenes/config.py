@@ -53,7 +53,6 @@ class SceneConfig:
             white facing it; 0 is none.
         lamp_colour: How much the point light's colour differs between photographs: the standard
             deviation of the logarithm of each channel; 0 is white.
-        bounces: Of light between surfaces, on its way to the one that is seen.
         exposure: Radiance is multiplied by it; what exceeds 1 saturates.
         read_noise: Standard deviation of the sensor in the dark; 1 is saturation.
         shot_noise: Variance that light adds, as a fraction of its radiance.
@@ -100,7 +99,6 @@ class SceneConfig:
     flash: Annotated[float, Range(least=0, most=1e12)] = 0.0
     window: Annotated[float, Range(least=0, most=1e12)] = 0.0
     lamp_colour: Annotated[float, Range(least=0, most=2)] = 0.0
-    bounces: Annotated[int, Range(least=0, most=8)] = 0
     exposure: float = 1.0
     read_noise: float = 0.002
     shot_noise: float = 0.0001

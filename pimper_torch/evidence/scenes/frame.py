@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.sensor import SensorConfig, expose
 from pimper_torch.evidence.scenes.stage import Spots, Stage
@@ -54,17 +53,13 @@ def render_frame(
     view: int,
     generator: torch.Generator,
     sensor: SensorConfig,
-    interreflection: Interreflection | None = None,
 ) -> Frame:
     """Ray trace one photograph; float32.
 
     One ray through each pixel's centre; where a pixel differs from its neighbours, a grid of
     rays over its area instead.
-
-    Args:
-        interreflection: Light that comes by way of other surfaces.
     """
-    look = _Look(stage, cameras, lights, view, sensor.exposure, interreflection)
+    look = _Look(stage, cameras, lights, view, sensor.exposure)
     width, height = (int(side) for side in cameras.sizes_px[view])
     centers = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
     seen = [look.at(pixels) for pixels in torch.split(centers, _BATCH)]
@@ -102,28 +97,19 @@ class _Look:
     """One camera under one light."""
 
     def __init__(
-        self,
-        stage: Stage,
-        cameras: Cameras,
-        lights: Lights,
-        view: int,
-        exposure: float,
-        interreflection: Interreflection | None,
+        self, stage: Stage, cameras: Cameras, lights: Lights, view: int, exposure: float
     ) -> None:
         self._stage, self._exposure = stage, exposure
         self._cam_from_world = cameras.cam_from_world[view]
         self._intrinsics = cameras.intrinsics[view]
         self._eye = cameras.centers_world[view].float()
         self._point_light = lights.point_light(view)
-        self._indirect = None
-        if interreflection is not None:
-            self._indirect = interreflection.light(stage, self._point_light)
 
     def at(self, pixels: Float[Tensor, "pixel 2"]) -> _Seen:
         """Look through positions in the image."""
         rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
         spots = self._stage.trace(self._eye, rays)
-        shaded = self._stage.shade(spots, self._eye, self._point_light, self._indirect)
+        shaded = self._stage.shade(spots, self._eye, self._point_light)
         hit = (spots.object_index >= 0)[:, None]
         beyond = self._point_light.surroundings(rays)
         radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)

@@ -136,7 +136,6 @@ def wandering_lights(
         spread_deg: Greatest angle from ``toward``.
         min_tilt_deg: Smallest angle from ``toward``.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        flash: The same for every view.
         toward: Axis of the cone the point light moves in.
     """
     axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
@@ -180,7 +179,6 @@ def lights_round(
         generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        flash: The same for every view.
         far: The point light is so far away that its light comes from one direction and does not
             fall off.
         sweep_deg: How far round the object the point light goes.

@@ -19,7 +19,6 @@ class OneView(Record):
     Attributes:
         images: Linear radiance, never negative.
         normals: Unit, of the pixels inside the mask in raster order.
-        albedo: Of the same pixels.
         lights: Direction times strength.
     """
 

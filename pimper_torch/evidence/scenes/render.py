@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.rendered import RenderedScene
 from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
@@ -69,8 +68,6 @@ def render_objects(
     lights: Lights,
     generator: torch.Generator,
     sensor: SensorConfig | None = None,
-    *,
-    bounces: int = 0,
 ) -> RenderedScene:
     """Ray trace meshes under point lights, all photographs in memory; float32.
 
@@ -83,9 +80,8 @@ def render_objects(
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = Stage(objects)
-    between = Interreflection(stage, bounces) if bounces else None
     frames = [
-        render_frame(stage, cameras, lights, view, generator, sensor, between)
+        render_frame(stage, cameras, lights, view, generator, sensor)
         for view in range(cameras.num_views)
     ]
     return RenderedScene(

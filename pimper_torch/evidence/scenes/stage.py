@@ -12,7 +12,6 @@ from pimper_torch.evidence.scenes.lights import PointLight
 from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.scene_object import (
     SceneObject,
-    albedo_at_vertices,
     normals_at_vertices,
 )
 from pimper_torch.evidence.scenes.shading import reflect
@@ -119,7 +118,6 @@ class Stage:
         spots: Spots,
         eye: Float[Tensor, "*origin 3"],
         point_light: PointLight,
-        indirect: Float[Tensor, "vertex channel"] | None = None,
         *,
         flash: Float[Tensor, " 3"] | None = None,
         bounces: int = _MIRRORS,
@@ -128,7 +126,6 @@ class Stage:
 
         Args:
             eye: Where it is, or where each ray comes from.
-            indirect: What other surfaces send to each vertex, as irradiance.
             flash: Where the flash is, and casts shadows from; by default at the eye, which sees
                 none of them.
             bounces: Of conductors that mirror one another.
@@ -160,14 +157,12 @@ class Stage:
             tint = self._tint(spots.object_index, (half * toward).sum(dim=-1))
             received = received + torch.where(reached, arriving * matte, 0)[:, None] * tone
             mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint * tone
-        if indirect is not None:
-            received = received + spots.hits.interpolate(indirect, self.mesh.faces)
         (metal,) = torch.nonzero(
             self._metal[spots.object_index] & (spots.object_index >= 0), as_tuple=True
         )
         if len(metal) and bounces > 0:
             seen = self._mirrored(
-                spots, metal, to_eye[metal], point_light, indirect, flash_position, bounces - 1
+                spots, metal, to_eye[metal], point_light, flash_position, bounces - 1
             )
             mirrored = mirrored.index_add(0, metal, seen)
         return Shaded(matte=spots.albedo * received, mirrored=mirrored, lit=lit)
@@ -178,7 +173,6 @@ class Stage:
         metal: Int[Tensor, " metal"],
         to_eye: Float[Tensor, "metal 3"],
         point_light: PointLight,
-        indirect: Float[Tensor, "vertex channel"] | None,
         flash: Float[Tensor, " 3"],
         bounces: int,
     ) -> Float[Tensor, "metal channel"]:
@@ -188,7 +182,7 @@ class Stage:
         along = normalize(2 * cosine * normals - to_eye, dim=-1)
         start = spots.points[metal] + self.clearance * normals
         there = self.trace(start, along)
-        shaded = self.shade(there, start, point_light, indirect, flash=flash, bounces=bounces)
+        shaded = self.shade(there, start, point_light, flash=flash, bounces=bounces)
         hit = (there.object_index >= 0)[:, None]
         radiance = torch.where(hit, shaded.matte + shaded.mirrored, point_light.surroundings(along))
         return self._tint(spots.object_index[metal], cosine[:, 0]) * radiance
@@ -203,15 +197,6 @@ class Stage:
                 own = (object_index == index)[:, None]
                 tint = torch.where(own, one.conductor.reflectance(cosine), tint)
         return tint
-
-    def vertex_albedo(self) -> Float[Tensor, "vertex channel"]:
-        """Evaluate every object's texture at its vertices."""
-        return torch.cat([albedo_at_vertices(one) for one in self.objects])
-
-    @property
-    def vertex_normals(self) -> Float[Tensor, "vertex 3"]:
-        """Unit, outward, in the order of ``mesh``."""
-        return self._normals
 
     def _albedo(
         self, hits: Hits, points: Float[Tensor, "ray 3"], object_index: Int[Tensor, " ray"]

@@ -36,7 +36,6 @@ from torch import Tensor
 from pimper_torch.config import require, to_mapping
 from pimper_torch.evidence.scenes.config import SceneConfig
 from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.maps import write_maps
 from pimper_torch.evidence.scenes.meshes import join
 from pimper_torch.evidence.scenes.scene import Scene, build_scene
@@ -131,31 +130,19 @@ class _Studio:
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         self._scene, self._folder = scene, folder
-        self._set = _stage_in(scene, 0)
+        self._stage = Stage(scene.objects_in(0))
 
     def take(self, view: int) -> None:
         """Render one photograph and write it with its truth."""
         scene, name = self._scene, self._scene.names[view]
-        stage, between = _stage_in(scene, view) if scene.fixed else self._set
+        stage = Stage(scene.objects_in(view)) if scene.fixed else self._stage
         frame = render_frame(
-            stage,
-            scene.cameras,
-            scene.lights,
-            view,
-            scene.noise(view),
-            scene.config.sensor,
-            between,
+            stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
         )
         _write_photograph(frame.image, scene.config, self._folder / "photos" / name)
         mask = Image.fromarray(255 * frame.foreground.numpy().astype(np.uint8))
         mask.save(self._folder / "masks" / name)
         write_maps(frame, (self._folder / "truth" / "maps" / name).with_suffix(".npz"))
-
-
-def _stage_in(scene: Scene, view: int) -> tuple[Stage, Interreflection | None]:
-    stage = Stage(scene.objects_in(view))
-    bounces, seed = scene.config.bounces, scene.config.seed
-    return stage, Interreflection(stage, bounces, seed=seed) if bounces else None
 
 
 _studio: _Studio | None = None  # of this process

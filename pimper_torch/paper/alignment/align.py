@@ -9,27 +9,15 @@ from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.linalg.sums import average
-from pimper_torch.paper.alignment.anchors import (
-    Anchors,
-    anchor_certainty,
-    point_anchors,
-    vertex_anchors,
-)
+from pimper_torch.paper.alignment.anchors import Anchors, anchor_certainty, vertex_anchors
 from pimper_torch.paper.alignment.overlaps import (
     Seams,
     find_seams,
     meet_overlaps,
     transformed,
 )
-from pimper_torch.paper.alignment.reliability import (
-    common_distance,
-    judge_patches,
-    overlapping_seams,
-    reliable_seams,
-    trust_by_distance,
-)
+from pimper_torch.paper.alignment.reliability import common_distance, patch_status
 from pimper_torch.paper.alignment.system import (
-    PointPulls,
     Pulls,
     curvature_along,
     mismatches,
@@ -44,8 +32,8 @@ from pimper_torch.stage import Stage
 # height fields are not told apart.
 _FLAT = 3e-3
 
-# Vertices that were filled in between points of the cloud are guesses.
-_FILLED_VERTEX = 0.1
+# Vertices that are no points of the cloud, as those of a given mesh, are guesses.
+_GUESSED_VERTEX = 0.1
 
 # Solves within the first round, so that weights that depend on the answer settle; later
 # rounds begin nearer to it and take one less.
@@ -62,31 +50,20 @@ class AlignConfig:
     """How patches are brought together.
 
     Attributes:
-        offset: Also let each patch move along its normal: 4 unknowns a patch instead of the
-            published 3.
-        curvature: Weight seams by the published ``k``; without it all weigh alike.
         iterations: How often the overlaps are met anew, as transformed so far, and solved.
         anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
             agreement of a seam. Vertices that are points of the cloud count the less the
             less certain they are next to the disagreement at the seams.
-        points: The same of each further point of the cloud that lies on a facet; one far
-            off, as an outlier, counts less.
         prior: Weight that holds each transform at the identity. Where neighbours agree but
             for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
             4 %; where they agree in nothing, 1e-4 lets them be flattened.
         scale_limit: No height field is flattened or stretched by more than this factor.
-        outlier: Samples that disagree by this many times the median lose three quarters of
-            their weight, and quickly more beyond; depth edges run through some overlaps.
     """
 
-    offset: bool = True
-    curvature: bool = True
     iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
     anchor: Annotated[float, Range(least=0, most=1e12)] = 1.0
-    points: Annotated[float, Range(least=0, most=1e12)] = 1.0
     prior: Annotated[float, Range(above=0, most=1e12)] = 3e-4
     scale_limit: Annotated[float, Range(above=1)] = 4.0
-    outlier: Annotated[float, Range(above=0)] = 5.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -99,7 +76,6 @@ class _Problem(Record):
     patches: PatchSet
     seams: Seams
     vertices: Anchors
-    points: Anchors
     unit: Float[Tensor, ""]
 
     @property
@@ -111,7 +87,7 @@ class _Problem(Record):
 class Align(Stage):
     r"""Undo the bas-relief transform that photometry leaves each patch with.
 
-    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z, 1)`
+    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z)`
     in its own frame, without contradicting its photographs. All h are found together, from
     what neighbours say about the strip around the edge they share. Rays along the bisector
     of the two normals meet both height fields, as transformed so far, and
@@ -135,26 +111,23 @@ class Align(Stage):
     any common affine change, :math:`h_z` and all, of their height fields leaves them in agreement,
     and :math:`h = 0` is a solution without error: the flattening one. Between facets at an
     angle the foot points differ, which no multiple of the height fields but the right one bridges:
-    folds tell scales, the better the sharper they are. Anchors fix what tilts and shifts the
-    surface: each height field is to pass through its facet's vertices, and through the points of
-    the cloud on the facet, with weights by their uncertainty. Vertices say nothing of scales,
-    points off the plane do. The prior toward the identity decides what nothing else does:
-    without folds and points, the common scale of coplanar facets. Without anchors it also
-    holds the common tilt and shift; without a prior, ``scale_limit`` alone would stop the
+    folds tell scales, the better the sharper they are. Anchors fix what tilts the
+    surface: each height field is to pass through its facet's vertices, with weights by their
+    uncertainty, which say nothing of scales. The prior toward the identity decides what nothing
+    else does: without folds, the common scale of coplanar facets. Without anchors it also
+    holds the common tilt; without a prior, ``scale_limit`` alone would stop the
     flattening where height fields have nothing in common.
 
     *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
-    alone put it, and so does one whose height field lies elsewhere than that of every neighbour it
-    meets even after all; their statuses tell, an :class:`~pimper_torch.records.AlignStatus`
-    each. One without height field stays as it is.
+    alone put it; statuses tell, an :class:`~pimper_torch.records.AlignStatus` each. One without
+    height field stays as it is.
 
     Rigid motions and the scale of the world change nothing. Differentiable in the depths
-    through all rounds; which samples meet, and what they and the anchors weigh by distance,
+    through all rounds; which samples meet, and what the anchors weigh by distance,
     is decided along the way like the rest, statuses without gradient.
 
-    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; Milano, Chung,
-    Blum, Siegwart, Ott: continuous components of normal integration, 2025, for joint relative
-    scales with robust weights; offset, anchors and rounds are ours.
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
+    ours.
     """
 
     def __init__(self, config: AlignConfig | None = None) -> None:
@@ -180,7 +153,6 @@ class Align(Stage):
             patches=patches,
             seams=seams,
             vertices=vertex_anchors(patches, depths.buckets),
-            points=point_anchors(patches, depths.buckets),
             unit=seams.edge_lengths.median(),
         )
         # h_0 is in units of the edge length here, so that no term of the system has a unit.
@@ -196,11 +168,11 @@ class Align(Stage):
             report(done + 1, config.iterations)
         with torch.no_grad():
             pulls = self._met(problem, depths, transforms)
-            status = self._judged(pulls, transforms)
-        borne_out = (status == int(AlignStatus.ALIGNED))[:, None]
-        if not bool(borne_out.all()):
+            status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
+        aligned = (status == int(AlignStatus.ALIGNED))[:, None]
+        if not bool(aligned.all()):
             on_mesh = self._on_mesh(problem, pulls, transforms)
-            transforms = torch.where(borne_out, transforms, on_mesh)
+            transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
                 pulls = self._met(problem, depths, transforms)
         with torch.no_grad():
@@ -210,12 +182,6 @@ class Align(Stage):
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _judged(self, pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Int[Tensor, " face"]:
-        met = pulls.weight > 0
-        distance = mismatches(pulls, transforms).norm(dim=-1)
-        reliable = reliable_seams(trust_by_distance(distance, met, self.config.outlier), met)
-        return judge_patches(pulls.facets, overlapping_seams(met), reliable, len(transforms))
-
     def _on_mesh(
         self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
     ) -> Float[Tensor, "face 4"]:
@@ -224,12 +190,9 @@ class Align(Stage):
         everyone = torch.ones_like(transforms[:, 0])
         held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
         nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
-        found = torch.zeros_like(transforms).index_fill(1, everyone.new_tensor([2]).long(), 1)
-        for solve in range(_REWEIGHTINGS):
-            believed = held if solve == 0 else self._believed(held, found, distance)
-            found = solve_transforms(believed, found, *nothing)
-            found = _limit_scales(found, self.config.scale_limit)
-        return found
+        identity = transforms.new_tensor([0, 0, 1, 0]).expand_as(transforms)
+        found = solve_transforms(held, identity, *nothing)
+        return _limit_scales(found, self.config.scale_limit)
 
     def _met(
         self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
@@ -241,10 +204,9 @@ class Align(Stage):
         )
         met = overlaps.met.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
-        if not self.config.offset:
-            prior[3] = torch.inf
+        prior[3] = torch.inf  # patches do not move along their normals
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
-        corners = _with_one(problem.vertices.samples / unit).reshape(-1, 3, 4)
+        corners = _with_one(problem.vertices.samples / unit)
         pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
@@ -268,73 +230,38 @@ class Align(Stage):
         noise: Float[Tensor, ""],
         moves: Float[Tensor, " face"],
     ) -> Pulls:
-        """Add what holds height fields to vertices and points, for the patches that may move."""
-        unit, vertices, points = problem.unit, problem.vertices, problem.points
-        coarse = problem.patches.coarse
-        is_point = coarse.is_point[coarse.mesh.faces.flatten()]
-        certain = anchor_certainty(vertices.variance / unit.square(), noise)
-        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
-        variance = points.variance / unit.square()
-        return pulls.replace(
-            corner_weight=self.config.anchor * weight.reshape(-1, 3) * moves[:, None],
-            points=PointPulls(
-                facet=points.facet,
-                samples=_with_one(points.samples / unit),
-                heights=points.heights / unit,
-                weight=self.config.points
-                * anchor_certainty(variance, noise)
-                * points.known
-                * moves[points.facet],
-                spread=(noise.square() + variance).sqrt(),
-            ),
-        )
+        """Add what holds height fields to vertices, for the patches that may move."""
+        vertices, coarse = problem.vertices, problem.patches.coarse
+        is_point = coarse.is_point[coarse.mesh.faces]
+        certain = anchor_certainty(vertices.variance / problem.unit.square(), noise)
+        weight = torch.where(is_point, certain, _GUESSED_VERTEX) * vertices.known
+        return pulls.replace(corner_weight=self.config.anchor * weight * moves[:, None])
 
     def _solve_round(
         self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
     ) -> Float[Tensor, "face 4"]:
         for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
-            # Before scales have been tried no disagreement is an outlier's fault.
-            system = pulls if fresh and solve < 2 else self._believed(pulls, transforms, distance)
-            terms = self._curvature_terms(system, transforms, distance)
+            terms = _curvature_terms(pulls, transforms, distance)
             # What tilts and shifts can repair says nothing about scales.
             only_level = fresh and solve == 0
             transforms = solve_transforms(
-                _with_scales_held(system) if only_level else system, transforms, *terms
+                _with_scales_held(pulls) if only_level else pulls, transforms, *terms
             )
             limited = _limit_scales(transforms, self.config.scale_limit)
             if not torch.equal(limited, transforms):
-                transforms = solve_transforms(_with_scales_held(system), limited, *terms)
+                transforms = solve_transforms(_with_scales_held(pulls), limited, *terms)
         return transforms
 
-    def _believed(
-        self,
-        pulls: Pulls,
-        transforms: Float[Tensor, "face 4"],
-        distance: Float[Tensor, "seam ray"],
-    ) -> Pulls:
-        """Lower the weight of samples and points that the transforms so far contradict."""
-        config, met = self.config, pulls.weight > 0
-        reliability = trust_by_distance(distance, met, config.outlier)
-        points = pulls.points
-        if points is not None:
-            missed = (points.samples * transforms[points.facet]).sum(dim=-1) - points.heights
-            held = (1 + (missed / config.outlier / points.spread).square()) ** -2
-            points = points.replace(weight=points.weight * held)
-        return pulls.replace(weight=pulls.weight * reliability, points=points)
 
-    def _curvature_terms(
-        self,
-        pulls: Pulls,
-        transforms: Float[Tensor, "face 4"],
-        distance: Float[Tensor, "seam ray"],
-    ) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
-        if not self.config.curvature:
-            return torch.ones_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
-        scales = transforms[pulls.facets, 2]
-        stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
-        apart = (pulls.weight * distance.square()).sum(dim=1)
-        return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
+def _curvature_terms(
+    pulls: Pulls, transforms: Float[Tensor, "face 4"], distance: Float[Tensor, "seam ray"]
+) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
+    """Return k of every seam, and what its derivative adds to the right-hand sides."""
+    scales = transforms[pulls.facets, 2]
+    stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
+    apart = (pulls.weight * distance.square()).sum(dim=1)
+    return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
 
 
 def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:

@@ -16,23 +16,6 @@ from pimper_torch.records import Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class PointPulls(Record):
-    """Points that height fields are to pass through.
-
-    Attributes:
-        samples: ``S`` of that height field over the point.
-        heights: Where along the facet's normal the point lies.
-        spread: How far height field and point may well be apart.
-    """
-
-    facet: Int[Tensor, " point"]
-    samples: Float[Tensor, "point 4"]
-    heights: Float[Tensor, " point"]
-    weight: Float[Tensor, " point"]
-    spread: Float[Tensor, " point"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pulls(Record):
     """What asks the transforms to change.
 
@@ -45,7 +28,6 @@ class Pulls(Record):
         corners: ``S`` of every height field at its facet's corners.
         corner_weight: How strongly each corner is to stay where it is.
         prior_weight: How strongly each component of h is held at the identity.
-        points: Further points that height fields are to pass through.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -57,7 +39,6 @@ class Pulls(Record):
     corners: Float[Tensor, "face 3 4"]
     corner_weight: Float[Tensor, "face 3"]
     prior_weight: Float[Tensor, " 4"]
-    points: PointPulls | None = None
 
 
 def mismatches(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, "seam ray 3"]:
@@ -117,7 +98,7 @@ def solve_transforms(
 
     .. math::
         \sum_{seams} k \sum_{rays} w |r|^2 + \sum_{corners} w (h^T S)^2
-        + \sum_{points} w (h^T S - z)^2 + \sum_{patches} \sum_c w_c (h_c - e_c)^2
+        + \sum_{patches} \sum_c w_c (h_c - e_c)^2
 
     Args:
         pulls: The terms; components whose ``prior_weight`` is infinite are not free.
@@ -151,13 +132,6 @@ def solve_transforms(
     prior = pulls.prior_weight[free]
     diagonal = diagonal + torch.diag(prior)
     rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", held, given)
-    points = pulls.points
-    if points is not None:
-        kept = points.samples[:, free]
-        wanted_z = points.heights - (points.samples * fixed[points.facet]).sum(dim=-1)
-        heavy = points.weight[:, None] * kept
-        diagonal = diagonal.index_add(0, points.facet, heavy[:, :, None] * kept[:, None, :])
-        rhs = rhs.index_add(0, points.facet, heavy * wanted_z[:, None])
     first, second = pulls.facets.unbind(dim=1)
     diagonal = diagonal.index_add(0, first, own[:, 0]).index_add(0, second, own[:, 1])
     rhs = rhs.index_add(0, first, wanted[:, 0]).index_add(0, second, wanted[:, 1])

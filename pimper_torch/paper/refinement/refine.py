@@ -16,14 +16,14 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.linalg.sums import average
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.paper.refinement.energy import assemble, facet_trends, plane_regularization
+from pimper_torch.paper.refinement.energy import assemble
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.stage import Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineConfig:
-    """How finely the patches are joined, and how much seams are smoothed.
+    """How much seams are smoothed.
 
     Attributes:
         smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
@@ -33,15 +33,9 @@ class RefineConfig:
             the centre of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
             centre of a facet. Twice the radius is a quarter of lambda. The notebook
             ``08_refinement`` shows it.
-        keep_planes: Cancel what the energy's tension does to flat data, which it would
-            shrink at the open rim and shift where G changes. False is the published energy.
-        outlier_samples: How far, in samples, a patch may lie from the others before they
-            outvote it, where three or more meet; infinite for the plain mean.
     """
 
-    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 1.0
-    keep_planes: bool = True
-    outlier_samples: Annotated[float, Range(above=0)] = 4.0
+    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 2.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -52,10 +46,9 @@ class Refine(Stage):
 
     Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the subdivided
     mesh of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
-    sides. See :mod:`~pimper_torch.paper.refinement.energy` for the discretisation and for what
-    ``keep_planes`` adds to the published energy, and :mod:`~pimper_torch.fusion.blend` for the
-    union. Vertices that no patch supports are
-    filled by the smoothness term and have information 0.
+    sides. See :mod:`~pimper_torch.paper.refinement.energy` for the discretisation, and
+    :mod:`~pimper_torch.fusion.blend` for the union. Vertices that no patch supports are filled by
+    the smoothness term and have information 0.
 
     Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
     the templates are constants.
@@ -79,11 +72,12 @@ class Refine(Stage):
         spacing = vertex_spacing(patches, 1.0)
         subdivision = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
         directions = ray_directions(subdivision, patches.coarse).detach()
-        blend = blend_patches(depths, subdivision, directions, self.config.outlier_samples)
+        blend = blend_patches(depths, subdivision, directions, torch.inf)
         if not bool(blend.supported.any()):
             blend = blend.replace(supported=torch.ones_like(blend.supported))
         points = subdivision.points + blend.heights[:, None] * directions
-        refined = smooth_seams(subdivision, points, blend.supported, spacing, self.config)
+        radius = self.config.smoothing_radius_samples
+        refined = smooth_seams(subdivision, points, blend.supported, spacing, radius)
         vertices = refined.to(points)
         apart = (refined - points.double())[blend.supported].detach()
         return Surface(
@@ -108,27 +102,24 @@ def smooth_seams(
     points: Float[Tensor, "vertex 3"],
     supported: Bool[Tensor, " vertex"],
     spacing: Float[Tensor, " facet"],
-    config: RefineConfig,
+    radius: float,
 ) -> Float[Tensor, "vertex 3"]:
     """Minimise the energy over the subdivided mesh.
 
     Args:
         points: The union: where the patches have each vertex.
         supported: Where they have it anywhere.
-        spacing: Of each facet's vertices, scene units; the radius is counted in it.
-        config: Radius and whether planes are held.
+        spacing: Of each facet's vertices, scene units.
+        radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
 
     Returns:
         The places in float64.
 
     Differentiable in ``points``; see :class:`Refine`.
     """
-    fidelity = (config.smoothing_radius_samples * spacing.double()) ** -2
+    fidelity = (radius * spacing.double()) ** -2
     system = assemble(subdivision, fidelity, supported)
     rhs = system.mass[:, None] * points.double()
-    if config.keep_planes:
-        trends, fitted = facet_trends(subdivision, points, supported, len(spacing))
-        rhs = rhs + plane_regularization(subdivision, trends, fitted)
     (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
     return found
 

@@ -50,6 +50,12 @@ _MAX_UNCERTAIN = 0.1
 # Maximum residual: a choice, four levels of 255; more is shadows, highlights, or another curve.
 _MAX_RESIDUAL = 0.015
 
+# Encoded value up to which shading is not first-order.
+_DARK = 0.1
+
+# Samples; more are subsampled evenly.
+_MAX_SAMPLES = 300
+
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
 # Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
@@ -114,9 +120,6 @@ def estimate_gamma(
     seen: Bool[Tensor, "view sample"],
     *,
     rank: int = 4,
-    dark_level: float = 0.1,
-    saturation_level: float = SATURATED,
-    max_samples: int = 300,
 ) -> GammaEstimate:
     """Estimate gamma from the same surface samples under several lights.
 
@@ -134,9 +137,6 @@ def estimate_gamma(
         encoded: As the files hold them, 1 being full scale.
         seen: False where missing. Dark and saturated values may be seen.
         rank: 3 for distant point lights alone, 4 with ambient light.
-        dark_level: Encoded value up to which shading is not first-order.
-        saturation_level: Encoded value from which the sensor saturates.
-        max_samples: More are subsampled evenly.
 
     Raises:
         InputError: Values outside [0, 1] or not finite, an impossible rank, or fewer
@@ -160,12 +160,9 @@ def estimate_gamma(
             "needed: fractions of the files' full scale, 0 to 1."
         )
     with torch.no_grad():
-        limits = (dark_level, saturation_level)
-        problem = _problem(encoded, seen, rank, limits, max_samples)
+        problem = _problem(encoded, seen, rank)
         for _ in range(_CHOICES):
-            problem = _chosen_by_fit(
-                problem, _grid_search(problem, iterations=0)[1].predicted, limits
-            )
+            problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
         return _estimate_of(_consistent_minimum(problem))
 
 
@@ -174,8 +171,6 @@ def gamma_of_photographs(
     *,
     mask: Bool[Tensor, "height width"] | None = None,
     rank: int = 4,
-    channel: int | None = None,
-    max_samples: int = 300,
 ) -> GammaEstimate:
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
@@ -184,8 +179,6 @@ def gamma_of_photographs(
             own values; of one size. Pixels that any of their masks leaves out are left out.
         mask: True on the object, for all photographs.
         rank: 3 for distant point lights alone, 4 with ambient light.
-        channel: Which colour; by default the middle one, green.
-        max_samples: More are subsampled evenly.
 
     Raises:
         InputError: As :func:`estimate_gamma`, for photographs or a mask of unlike sizes, and where
@@ -210,11 +203,8 @@ def gamma_of_photographs(
             "the object moved; needed: photographs of one fixed camera and object, under several "
             "lights. Gamma cannot be found from these: take such a series."
         )
-    colour = views.images.shape[1] // 2 if channel is None else channel
-    encoded = views.images[:, colour][:, where]
-    return estimate_gamma(
-        encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank, max_samples=max_samples
-    )
+    encoded = views.images[:, views.images.shape[1] // 2][:, where]
+    return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -223,7 +213,6 @@ class _Minimum(Record):
 
     Attributes:
         inner: Whether it is not at an end of the range.
-        error: Standard error of gamma.
     """
 
     problem: EncodedMatrix
@@ -237,11 +226,9 @@ def _problem(
     encoded: Float[Tensor, "view sample"],
     seen: Bool[Tensor, "view sample"],
     rank: int,
-    limits: tuple[float, float],
-    max_samples: int,
 ) -> EncodedMatrix:
     """Subsample, and use entries that are neither dark nor saturated."""
-    used = enough(seen & (encoded > limits[0]) & (encoded < limits[1]), rank)
+    used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
     if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
         raise InputError(
@@ -249,7 +236,7 @@ def _problem(
             f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
             "other lights, expose so that less is dark or saturated, or lower the rank."
         )
-    count = min(max_samples, len(samples))
+    count = min(_MAX_SAMPLES, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
     chosen = samples[spaced.to(samples.device)]
     return EncodedMatrix(
@@ -262,14 +249,13 @@ def _problem(
 
 
 def _chosen_by_fit(
-    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"], limits: tuple[float, float]
+    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"]
 ) -> EncodedMatrix:
     """Use entries that the fit predicts to be lit and not saturated, with outlier weights."""
-    dark, saturated = limits
     encoded = problem.encoded
     known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
-    lit = (predicted > dark) & (encoded > dark / 2)  # far below: a cast shadow
-    lit = lit & (predicted < saturated - dark / 2) & (encoded < saturated)
+    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: a cast shadow
+    lit = lit & (predicted < SATURATED - _DARK / 2) & (encoded < SATURATED)
     used = enough(known & lit, problem.rank)
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used

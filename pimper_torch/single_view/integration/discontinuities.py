@@ -11,7 +11,7 @@ system is solved to convergence, so that the result does not depend on the solve
 At a crease, and at an occlusion boundary, the slope along a step changes by more than on the
 steps beside it, and the predicted step is wrong by up to that change. Where the slope across a
 step changes so, both sides meet in one point at most. Such steps are not tested: they, and all
-rejected ones, keep a small weight, ``tie``. Components that are connected by such weights alone,
+rejected ones, keep a small weight. Components that are connected by such weights alone,
 whose relative depth normals do not determine, are so aligned in the mean of their border.
 
 Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the partition into
@@ -20,13 +20,11 @@ components follow from the weights and are never fixed. Kinks and twists are our
 """
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import Range, require_ranges
 from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.progress import report
@@ -40,9 +38,20 @@ _FIRST_SCALE, _NARROWER = 3.0, 3.0
 # Of the linear systems' solutions, in their energy: a choice, far below any scale.
 _TOLERANCE = 1e-6
 
-# At the final scale weights change little, and a hierarchy is kept until it needs more cycles than
-# this: a choice.
-_MANY_CYCLES = 25
+# The final scale: residual at which a step keeps a quarter of its weight, in widths of a pixel at
+# the surface's depth, and the least in deviations of the residuals, so that noisy normals make no
+# discontinuities.
+_SCALE_PX, _NOISE_SCALES = 0.3, 6.0
+
+# Maximum kink of a step that is tested, about the tangent of a crease's angle; likewise of the
+# slope across the step, which no crease along the raster has.
+_KINK, _TWIST = 2.0, 1.0
+
+# Weight of steps that are rejected or not tested.
+_TIE = 1e-4
+
+# Mean change of the weights at convergence, and linear systems at most.
+_CHANGE, _MAX_ITERATIONS = 5e-4, 40
 
 # Standard deviation of Gaussian noise over its median absolute value.
 _PER_MEDIAN = 1.4826
@@ -50,42 +59,13 @@ _PER_MEDIAN = 1.4826
 Pair = tuple[Tensor, Tensor]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiscontinuityConfig:
-    """When a step is rejected.
-
-    Attributes:
-        scale_px: Residual at which a step keeps a quarter of its weight, in widths of a
-            pixel at the surface's depth.
-        noise_scales: Minimum scale in deviations of the residuals, so that noisy normals make no
-            discontinuities.
-        kink: Maximum kink of a step that is tested; about the tangent of a crease's angle.
-        twist: Likewise of the slope across the step, which no crease along the raster has.
-        tie: Weight of steps that are rejected or not tested.
-        tolerance: Mean change of the weights at convergence.
-        max_iterations: Linear systems at most.
-    """
-
-    scale_px: Annotated[float, Range(above=0, most=1e12)] = 0.3
-    noise_scales: Annotated[float, Range(above=0, most=1e12)] = 6.0
-    kink: Annotated[float, Range(above=0, most=1e12)] = 2.0
-    twist: Annotated[float, Range(above=0, most=1e12)] = 1.0
-    tie: Annotated[float, Range(above=0, below=1)] = 1e-4
-    tolerance: Annotated[float, Range(above=0, most=1)] = 5e-4
-    max_iterations: Annotated[int, Range(least=1, most=100_000)] = 40
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Continuity(Record):
     """Which steps are continuous.
 
     Attributes:
-        right: Weight in [0, 1] of each step to the right: 1 continuous, ``tie`` rejected, 0
+        right: Weight in [0, 1] of each step to the right: 1 continuous, 1e-4 rejected, 0
             outside.
-        down: Likewise.
         convergence: Of the weights; the residual is that of continuous steps, in pixels.
     """
 
@@ -100,7 +80,6 @@ def find_discontinuities(
     weight_down: Float[Tensor, "steps_down width"],
     anchor: Float[Tensor, "height width"] | None,
     heights: Float[Tensor, "height width"] | None,
-    config: DiscontinuityConfig,
     method: Method = "auto",
 ) -> Continuity:
     """Find the continuous steps.
@@ -114,40 +93,36 @@ def find_discontinuities(
     with torch.no_grad():
         inside = weight_right > 0, weight_down > 0
         smooth = (
-            (steps.kink_right < config.kink) & (steps.twist_right < config.twist),
-            (steps.kink_down < config.kink) & (steps.twist_down < config.twist),
+            (steps.kink_right < _KINK) & (steps.twist_right < _TWIST),
+            (steps.kink_down < _KINK) & (steps.twist_down < _TWIST),
         )
         tested = (
             steps.reliable_right & smooth[0] & inside[0],
             steps.reliable_down & smooth[1] & inside[1],
         )
         fraction = (
-            torch.where(tested[0], 1.0, config.tie) * inside[0],
-            torch.where(tested[1], 1.0, config.tie) * inside[1],
+            torch.where(tested[0], 1.0, _TIE) * inside[0],
+            torch.where(tested[1], 1.0, _TIE) * inside[1],
         )
-        system, solution = None, None
+        solution = None
         scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
-        for taken in range(1, config.max_iterations + 1):
+        for taken in range(1, _MAX_ITERATIONS + 1):
             weights = weight_right * fraction[0], weight_down * fraction[1]
-            if system is None or solution is None:
-                system = RasterSystem(
-                    *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
-                )
-            else:
-                keep = narrowed and solution.iterations <= _MANY_CYCLES
-                system = system.refreshed(*weights, anchor, keep=keep)
+            system = RasterSystem(
+                *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
+            )
             solution = _solved(system, steps, weights, anchor, heights, solution)
             residuals = _residuals(steps, solution.values.reshape(steps.inside.shape))
-            smallest = _final_scale(residuals, tested, config)
+            smallest = _final_scale(residuals, tested)
             narrowed = scale <= smallest
             scale = max(scale, smallest)
             before = fraction
             fraction = (
-                _robust_weight(residuals[0], tested[0], inside[0], scale, config.tie),
-                _robust_weight(residuals[1], tested[1], inside[1], scale, config.tie),
+                _robust_weight(residuals[0], tested[0], inside[0], scale),
+                _robust_weight(residuals[1], tested[1], inside[1], scale),
             )
-            report(taken, config.max_iterations)
-            if narrowed and _mean_change(before, fraction, inside) < config.tolerance:
+            report(taken, _MAX_ITERATIONS)
+            if narrowed and _mean_change(before, fraction, inside) < _CHANGE:
                 cause = StopCause.CONVERGED
                 break
             scale = max(scale / _NARROWER, smallest)
@@ -188,19 +163,16 @@ def _robust_weight(
     tested: Bool[Tensor, "row column"],
     inside: Bool[Tensor, "row column"],
     scale: float,
-    tie: float,
 ) -> Float[Tensor, "row column"]:
     """Return each step's robust weight."""
     geman_mcclure = (1 + (residual / scale).square()) ** -2
-    return torch.where(tested, geman_mcclure, 0).clamp_min(tie) * inside
+    return torch.where(tested, geman_mcclure, 0).clamp_min(_TIE) * inside
 
 
-def _final_scale(
-    residuals: Pair, tested: tuple[Tensor, Tensor], config: DiscontinuityConfig
-) -> float:
+def _final_scale(residuals: Pair, tested: tuple[Tensor, Tensor]) -> float:
     some = torch.cat([residuals[0][tested[0]], residuals[1][tested[1]]])
     deviation = _PER_MEDIAN * float(some.abs().median()) if len(some) else 0.0
-    return max(config.scale_px, config.noise_scales * deviation)
+    return max(_SCALE_PX, _NOISE_SCALES * deviation)
 
 
 def _mean_change(before: Pair, after: Pair, inside: tuple[Tensor, Tensor]) -> float:

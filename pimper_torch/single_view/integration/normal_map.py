@@ -16,7 +16,6 @@ from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
 from pimper_torch.single_view.integration.discontinuities import (
     Continuity,
-    DiscontinuityConfig,
     find_discontinuities,
 )
 from pimper_torch.single_view.integration.rasters import Method as Solver
@@ -62,7 +61,6 @@ def integrate_normal_map(
     known_depth: Raster | None = None,
     known_weight: Raster | None = None,
     method: Integration = "discontinuities",
-    config: DiscontinuityConfig | None = None,
     solver: Solver = "auto",
 ) -> IntegratedMap:
     """Integrate a normal map to depth.
@@ -112,7 +110,6 @@ def integrate_normal_map(
         known_depth,
         known_weight,
         method,
-        config,
         solver,
     )
 
@@ -126,7 +123,6 @@ def _integrated(
     known_depth: Float[Tensor, "height width"] | None,
     known_weight: Float[Tensor, "height width"] | None,
     method: Integration,
-    config: DiscontinuityConfig | None,
     solver: Solver,
 ) -> IntegratedMap:
     box = _box(mask)
@@ -142,7 +138,6 @@ def _integrated(
             None if known_depth is None else known_depth[box],
             None if known_weight is None else known_weight[box],
             method,
-            config,
             solver,
         )
         return _placed(part, box, *mask.shape)
@@ -155,8 +150,7 @@ def _integrated(
     anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
-        settings = config or DiscontinuityConfig()
-        continuity = find_discontinuities(steps, *weights, anchor, unknown, settings, solver)
+        continuity = find_discontinuities(steps, *weights, anchor, unknown, solver)
         weights = weights[0] * continuity.right, weights[1] * continuity.down
     system = RasterSystem(*weights, anchor, method=solver, what="the integration")
     found = system.fit_steps(*steps.target, unknown)

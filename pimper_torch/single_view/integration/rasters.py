@@ -18,7 +18,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
 from pimper_torch.paper.poisson import differences, differences_transposed
-from pimper_torch.single_view.integration.free_components import FreeComponents, free_components
+from pimper_torch.single_view.integration.free_components import free_components
 from pimper_torch.single_view.integration.stencil import (
     CholeskyRaster,
     CosineRaster,
@@ -70,7 +70,19 @@ class RasterSystem:
         what: str = "the raster",
     ) -> None:
         self._requested, self._tolerance, self._what = method, tolerance, what
-        self._take(weight_right, weight_down, anchor, None)
+        if anchor is None:
+            anchor = weight_right.new_zeros(weight_right.shape[0], weight_down.shape[1])
+        self._given = (weight_right, weight_down, anchor)
+        self._refuse_unusable()
+        with torch.no_grad():
+            right, down, anchors = (part.detach().double().contiguous() for part in self._given)
+            row_sum = _row_sums(right, down) + anchors
+            self._inside = row_sum > 0
+            self._components = free_components(right > 0, down > 0, anchors > 0)
+            diagonal = torch.where(self._inside, row_sum, 1).reshape(-1)
+            diagonal = self._components.pinned(diagonal).view(row_sum.shape)
+            self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
+            self._solver = self._prepared(anchors)
 
     @property
     def method(self) -> str:
@@ -139,54 +151,6 @@ class RasterSystem:
             found = self._solver.iterate(rhs, initial)
             return dataclasses.replace(found, values=groups.centered(found.values))
 
-    def refreshed(
-        self,
-        weight_right: Float[Tensor, "height steps_right"],
-        weight_down: Float[Tensor, "steps_down width"],
-        anchor: Float[Tensor, "height width"] | None = None,
-        *,
-        keep: bool = False,
-    ) -> "RasterSystem":
-        """Prepare the same raster with other weights.
-
-        The coarse levels of multigrid are kept, as a slightly worse preconditioner, while
-        no weight changes by more than a factor two: the usual case in late iterations of
-        reweighting. Otherwise a new system is prepared; free components are searched again if
-        other weights are positive.
-
-        Args:
-            keep: Keep the coarse levels whatever the weights. The solution is the same, but may
-                take many more cycles.
-        """
-        other = object.__new__(RasterSystem)
-        other._requested = self._requested
-        other._tolerance, other._what = self._tolerance, self._what
-        other._take(weight_right, weight_down, anchor, self, keep)
-        return other
-
-    def _take(
-        self,
-        weight_right: Float[Tensor, "height steps_right"],
-        weight_down: Float[Tensor, "steps_down width"],
-        anchor: Float[Tensor, "height width"] | None,
-        former: "RasterSystem | None",
-        keep: bool = False,
-    ) -> None:
-        if anchor is None:
-            anchor = weight_right.new_zeros(weight_right.shape[0], weight_down.shape[1])
-        self._given = (weight_right, weight_down, anchor)
-        self._refuse_unusable()
-        with torch.no_grad():
-            right, down, anchors = (part.detach().double().contiguous() for part in self._given)
-            row_sum = _row_sums(right, down) + anchors
-            self._inside = row_sum > 0
-            self._components = _components(right, down, anchors, former)
-            diagonal = torch.where(self._inside, row_sum, 1).reshape(-1)
-            diagonal = self._components.pinned(diagonal).view(row_sum.shape)
-            self._stencil = Stencil(right=right, down=down, diagonal=diagonal)
-            kept = former._solver.refreshed(self._stencil, keep) if former else None
-            self._solver: RasterSolver = kept or self._prepared(anchors)
-
     def _refuse_unusable(self) -> None:
         right, down, anchor = (tuple(part.shape) for part in self._given)
         height, width = anchor
@@ -224,22 +188,6 @@ class RasterSystem:
         if self._requested == "cholesky" or (self._requested == "auto" and small):
             return CholeskyRaster(stencil, self._what)
         return MultigridRaster(stencil, self._tolerance, self._what)
-
-
-def _components(
-    right: Float[Tensor, "height steps_right"],
-    down: Float[Tensor, "steps_down width"],
-    anchor: Float[Tensor, "height width"],
-    former: RasterSystem | None,
-) -> FreeComponents:
-    """Find the free components; those of the former weights where the same are positive."""
-    pattern = (right > 0, down > 0, anchor > 0)
-    if former is not None:
-        stencil, (_, _, anchors) = former._stencil, former._given
-        before = (stencil.right > 0, stencil.down > 0, anchors.detach() > 0)
-        if all(torch.equal(new, old) for new, old in zip(pattern, before, strict=True)):
-            return former._components
-    return free_components(*pattern)
 
 
 def _row_sums(

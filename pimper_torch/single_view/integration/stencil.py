@@ -18,11 +18,6 @@ from pimper_torch.linalg.multigrid import Iterate, solve_with_hierarchy
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.paper.poisson import solve_poisson
 
-# Coarse levels are kept if no entry has changed by more than this factor. Measured: noise of a
-# factor 1.26 (one sigma) on weights over 8 decades takes 27 cycles instead of 16; with one new
-# strong connection in a thousand the former levels are useless.
-_KEPT_FACTOR = 2.0
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stencil:
@@ -74,16 +69,9 @@ class RasterSolver(Protocol):
     ) -> Iterate:
         """Solve in float64 on the device of the stencil."""
 
-    def refreshed(self, stencil: Stencil, keep: bool) -> "RasterSolver | None":
-        """Solve with another stencil on the same edges; None if nothing can be kept."""
-
 
 class CholeskyRaster:
-    """A sparse factor, on the CPU.
-
-    Args:
-        what: Names the system in errors.
-    """
+    """A sparse factor, on the CPU."""
 
     method = "cholesky"
 
@@ -103,10 +91,6 @@ class CholeskyRaster:
         """Substitute; the start is ignored."""
         found = self._factor.solve_values(rhs.reshape(-1))
         return Iterate(values=found, iterations=1)
-
-    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
-        """Keep nothing."""
-        return None
 
 
 class CosineRaster:
@@ -128,24 +112,18 @@ class CosineRaster:
         found = solve_poisson(rhs, self._right, self._down, self._anchor)
         return Iterate(values=found.reshape(-1), iterations=1)
 
-    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
-        """Keep nothing."""
-        return None
-
 
 class MultigridRaster:
     """Conjugate gradients with a hierarchy, on the stencil's device.
 
     Args:
         tolerance: Of the error, in the energy norm, relative.
-        what: Names the system in errors.
     """
 
     method = "multigrid"
 
     def __init__(self, stencil: Stencil, tolerance: float, what: str) -> None:
-        self._stencil = self._origin = stencil
-        self._tolerance, self._what = tolerance, what
+        self._stencil, self._tolerance, self._what = stencil, tolerance, what
         self._hierarchy = Hierarchy(stencil.matrix(), stencil.diagonal.device, stencil.product)
 
     def iterate(
@@ -161,25 +139,3 @@ class MultigridRaster:
             self._what,
             None if start is None else start.reshape(-1),
         )
-
-    def refreshed(self, stencil: Stencil, keep: bool) -> RasterSolver | None:
-        """Keep the coarse levels if ``keep``, or if the weights have changed little."""
-        pairs = (
-            (getattr(stencil, name), getattr(self._origin, name)) for name in stencil.__slots__
-        )
-        if not (keep or all(may_keep(new, old) for new, old in pairs)):
-            return None
-        other = object.__new__(MultigridRaster)
-        other._origin, other._stencil = self._origin, stencil
-        other._tolerance, other._what = self._tolerance, self._what
-        other._hierarchy = self._hierarchy.with_product(
-            stencil.product, stencil.diagonal.reshape(-1)
-        )
-        return other
-
-
-def may_keep(new: Float[Tensor, "..."], old: Float[Tensor, "..."]) -> bool:
-    """Return whether a hierarchy of ``old`` entries preconditions ``new`` ones."""
-    ordered = torch.minimum(new.abs(), old.abs()), torch.maximum(new.abs(), old.abs())
-    same_signs = bool((new.sign() == old.sign()).all())
-    return same_signs and bool((ordered[1] <= _KEPT_FACTOR * ordered[0]).all())

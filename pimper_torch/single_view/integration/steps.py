@@ -41,16 +41,11 @@ class Steps(Record):
         right: From each pixel to the next in its row; 0 outside.
         down: From each pixel to that below.
         reliable_right: True where both pixels are inside and their normals are usable.
-        reliable_down: Likewise.
         kink_right: Change of the slope along the step, less that of the steps before and after:
             0 on a smooth surface, the size of the kink at a crease or a depth discontinuity.
-        kink_down: Likewise.
         twist_right: Likewise of the slope across the step, which changes at a depth
             discontinuity: sides of different slope meet in one point at most.
-        twist_down: Likewise.
         unit_right: Change of the unknown on a step of slope 1.
-        unit_down: Likewise.
-        inside: The pixels.
         valid: Those of them with a usable normal.
     """
 

@@ -148,8 +148,6 @@ class Method:
 
     Attributes:
         resolvers: Of its ambiguity; the first is the default.
-        calibrated: Whether it needs lights.
-        perspective: Whether it needs intrinsics.
     """
 
     solve: Callable[[Problem, str], Solution]

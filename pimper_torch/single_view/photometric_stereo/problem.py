@@ -19,7 +19,6 @@ class Problem(Record):
         weight: 0 where missing.
         mask: True at the pixels.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
-        robust: Whether shadows and highlights lose weight.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -60,7 +59,6 @@ class Surfaced(Record):
 
     Attributes:
         shading: Albedo times normal.
-        lights: Of the same factorization.
         reliability: Of each pixel; 0 leaves it out.
     """
 

@@ -50,7 +50,6 @@ def calibrated_stereo(
         radiance: Linear. Samples without weight are ignored.
         weight: Not negative; 0 where missing.
         lights: Direction to the point light times its irradiance.
-        robust: Whether shadows and highlights lose weight.
 
     Underdetermined, giving one of the minima, where a pixel has fewer lit samples than unknowns
     or lights in one plane; see :func:`.determined`. Constant to autograd.

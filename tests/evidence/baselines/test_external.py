@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
-from pimper_torch.evidence.baselines.external import Deadline, Program, run_program, workspace
+from pimper_torch.errors import MissingProgramError, ReconstructionError
+from pimper_torch.evidence.baselines.external import Deadline, Program, run_program
 
 TOOL = Program(name="tool", variable="PIMPER_TOOL", source="https://tool.example")
 
@@ -30,10 +30,8 @@ def test_a_missing_program_is_named_with_its_source():
         TOOL.find()
 
 
-def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_folders(
-    monkeypatch, tmp_path
-):
-    for name in ("usual", "named", "given"):
+def test_the_variable_goes_before_the_path_before_usual_folders(monkeypatch, tmp_path):
+    for name in ("usual", "named"):
         (tmp_path / name).mkdir()
     tool = Program(
         name="tool", variable="PIMPER_TOOL", source="a shop", folders=(tmp_path / "usual",)
@@ -45,24 +43,28 @@ def test_what_is_given_goes_before_the_variable_before_the_path_before_usual_fol
     named = script(tmp_path / "named" / "tool", "")
     monkeypatch.setenv("PIMPER_TOOL", str(tmp_path / "named"))
     assert tool.find() == named
-    given = script(tmp_path / "given" / "tool-2.1", "")
-    assert tool.find(given) == given
+    named = script(tmp_path / "named" / "tool-2.1", "")
+    monkeypatch.setenv("PIMPER_TOOL", str(named))
+    assert tool.find() == named
 
 
-def test_a_program_that_is_not_where_the_settings_say_is_not_looked_for_elsewhere(tmp_path):
+def test_a_program_that_is_not_where_the_variable_says_is_not_looked_for_elsewhere(
+    monkeypatch, tmp_path
+):
     script(tmp_path / "bin" / "tool", "")
-    with pytest.raises(MissingProgramError, match="where the settings say"):
-        TOOL.find(tmp_path / "nowhere")
     (tmp_path / "text").write_text("not executable")
-    with pytest.raises(MissingProgramError, match="where the settings say"):
-        TOOL.find(tmp_path / "text")
+    for name in ("nowhere", "text"):
+        monkeypatch.setenv("PIMPER_TOOL", str(tmp_path / name))
+        with pytest.raises(MissingProgramError, match="where PIMPER_TOOL says"):
+            TOOL.find()
 
 
 def test_a_program_found_by_a_relative_path_runs_in_another_folder(monkeypatch, tmp_path):
     script(tmp_path / "bin" / "tool", "print('here')")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
-    found = TOOL.find(Path("bin"))
+    monkeypatch.setenv("PIMPER_TOOL", "bin")
+    found = TOOL.find()
     assert run_program([found], tmp_path / "elsewhere", Deadline(1.0), threads=1) == "here\n"
 
 
@@ -125,33 +127,6 @@ def test_a_file_that_is_no_program_for_this_machine_counts_as_missing(tmp_path):
     (tmp_path / "tool").chmod(0o755)
     with pytest.raises(MissingProgramError, match="cannot be started"):
         run_program([tmp_path / "tool"], tmp_path, Deadline(1.0), threads=1)
-
-
-def test_the_workspace_is_removed_also_when_something_fails():
-    made = []
-
-    def work():
-        with workspace("tool", None) as folder:
-            (folder / "file").touch()
-            made.append(folder)
-            raise ValueError("oops")
-
-    with pytest.raises(ValueError, match="oops"):
-        work()
-    assert not made[0].exists()
-
-
-def test_a_workspace_to_keep_stays_beside_those_of_other_runs(tmp_path):
-    kept = []
-    for _ in range(2):
-        with workspace("tool", tmp_path / "new" / "keep") as folder:
-            (folder / "file").touch()
-            kept.append(folder)
-    assert kept[0] != kept[1]
-    assert all((folder / "file").exists() for folder in kept)
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="keep_in"), workspace("tool", tmp_path / "file"):
-        pass
 
 
 def test_programs_find_no_terminal_to_ask(tmp_path):

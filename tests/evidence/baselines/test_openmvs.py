@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
-from pimper_torch.evidence.baselines.openmvs import OpenMvs, OpenMvsConfig
+from pimper_torch.evidence.baselines.openmvs import OpenMvs
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import write_ply
@@ -19,7 +19,7 @@ import pathlib, shutil, sys
 name, points = pathlib.Path(sys.argv[0]).name, {points}
 known = {{"-i", "-w", "--max-threads"}} | {{
     "InterfaceCOLMAP": set(),
-    "DensifyPointCloud": {{"--resolution-level", "--min-resolution"}},
+    "DensifyPointCloud": set(),
     "ReconstructMesh": {{"-p"}} if points else set(),
     "RefineMesh": {{"--mesh-file"}},
 }}[name]
@@ -35,7 +35,6 @@ if name == "InterfaceCOLMAP":
     shutil.copytree(given, {copy!r})
     (given / "scene.mvs").touch()
 if name == "DensifyPointCloud":
-    print("level", options["--resolution-level"])
     (here / "scene_dense.mvs").touch()
     (here / "scene_dense.ply").touch()
 if name == "ReconstructMesh":
@@ -89,19 +88,12 @@ def install(tmp_path, triangle, *, points=False, finds=True, names=PROGRAMS):
 @pytest.mark.parametrize("points", [False, True], ids=["old version", "new version"])
 def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_path, points):
     install(tmp_path, triangle, points=points)
-    plain = OpenMvs(OpenMvsConfig(refine=False))
-    estimate = plain(reconstruction.scene, reconstruction.coarse)
-    assert_close(estimate.mesh.vertices_world, triangle.vertices_world)
+    estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
+    assert_close(estimate.mesh.vertices_world, triangle.vertices_world + 1)
     assert torch.equal(estimate.mesh.faces, triangle.faces)
     assert estimate.names == ("a.png", "b.png", "c.png")
     assert estimate.reference == "b.png"
     assert not list(tmp_path.glob("pimper-*"))
-
-
-def test_the_refined_mesh_comes_back_unless_it_was_refused(reconstruction, triangle, tmp_path):
-    install(tmp_path, triangle)
-    estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
-    assert_close(estimate.mesh.vertices_world, triangle.vertices_world + 1)
 
 
 def test_the_written_model_is_the_undistorted_scene(reconstruction, triangle, tmp_path):
@@ -151,11 +143,11 @@ def test_every_missing_program_is_named_before_anything_runs(reconstruction, tri
     assert not copy.exists()
 
 
-def test_the_programs_folder_may_be_given(reconstruction, triangle, tmp_path, monkeypatch):
+def test_the_variable_may_name_the_programs_folder(reconstruction, triangle, tmp_path, monkeypatch):
     install(tmp_path, triangle)
     monkeypatch.setenv("PATH", "")
-    config = OpenMvsConfig(folder=tmp_path / "bin")
-    assert len(OpenMvs(config)(reconstruction.scene, reconstruction.coarse).mesh.faces) == 1
+    monkeypatch.setenv("PIMPER_OPENMVS", str(tmp_path / "bin"))
+    assert len(OpenMvs()(reconstruction.scene, reconstruction.coarse).mesh.faces) == 1
 
 
 def test_a_step_that_leaves_nothing_is_named(reconstruction, triangle, tmp_path):

@@ -10,14 +10,14 @@ import pytest
 import torch
 from rich.console import Console
 
+from pimper_torch.config import build
 from pimper_torch.cores import usable_cores
-from pimper_torch.errors import InputError, MissingProgramError, OutputError, ReconstructionError
+from pimper_torch.errors import MissingProgramError, OutputError, ReconstructionError
 from pimper_torch.evidence.bench.machine import Machine, this_machine
 from pimper_torch.evidence.bench.rows import (
     PUBLISHED,
     Row,
     Table,
-    read_json,
     row_of_failure,
     with_published,
     write_json,
@@ -239,10 +239,13 @@ def test_the_terminal_says_in_full_why_figures_are_missing():
     assert text.count("word") == 30
 
 
-def test_a_table_survives_json(tmp_path):
+def test_json_holds_every_field(tmp_path):
     before = table(FULL, EMPTY, *PUBLISHED, seed=3, scenes=["mug", "jar"])
     write_json(before, tmp_path / "bench.json")
-    assert read_json(tmp_path / "bench.json") == before
+    report = json.loads((tmp_path / "bench.json").read_text())
+    assert report["settings"] == {"seed": 3, "scenes": ["mug", "jar"]}
+    assert [build(Row, row, "row") for row in report["rows"]] == [*before.rows]
+    assert build(Machine, report["machine"], "machine") == MACHINE
 
 
 def test_what_is_no_number_becomes_null_in_json(tmp_path):
@@ -251,39 +254,10 @@ def test_what_is_no_number_becomes_null_in_json(tmp_path):
     report = json.loads((tmp_path / "bench.json").read_text())
     assert report["rows"][0]["minutes"] is None
     assert report["rows"][0]["relative_error"] == 1.234567  # all digits
-    (row,) = read_json(tmp_path / "bench.json").rows
-    assert row == FULL.replace(minutes=None, chamfer=None)
+    assert report["rows"][0]["chamfer"] is None
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda report: report.update(format="else"), "is no table"),
-        (lambda report: report.update(version=99), "version 99"),
-        (lambda report: report["rows"][0].update(minutes="long"), "minutes"),
-        (lambda report: report["rows"][0].update(minute=1.0), "minute"),
-        (lambda report: report["rows"][0].pop("scene"), "scene"),
-        (lambda report: report.pop("machine"), "machine"),
-        (lambda report: report.update(rows=3), "whole table"),
-        (lambda report: report.update(rows=[3]), "row 0"),
-    ],
-)
-def test_a_file_that_is_no_such_table_is_refused(tmp_path, change, said):
-    path = tmp_path / "bench.json"
-    write_json(table(FULL), path)
-    report = json.loads(path.read_text())
-    change(report)
-    path.write_text(json.dumps(report))
-    with pytest.raises(InputError, match=said):
-        read_json(path)
-
-
-def test_files_that_cannot_be_read_or_written_are_refused(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_json(tmp_path / "none.json")
-    (tmp_path / "text").write_text("{")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_json(tmp_path / "text")
+def test_a_file_that_cannot_be_written_is_refused(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"):
         write_json(table(FULL), tmp_path / "none" / "bench.json")
 

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.cli import convert
-from pimper_torch.evidence.cli.convert import Source, cloud, read_scene, readers
+from pimper_torch.evidence.cli.convert import Source, cloud, readers
 from pimper_torch.evidence.datasets import read_colmap, read_idr, read_transforms
 from pimper_torch.geometry.frames import transform
 from pimper_torch.radiometry import LINEAR, Encoding
@@ -168,18 +168,11 @@ def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
     assert read_colmap(tmp_path / "out").views.num_views == 3
 
 
-def test_a_rendered_scene_is_read_without_maps_and_shrunk(data, monkeypatch):
+def test_a_rendered_scene_is_read_without_maps(data, monkeypatch):
     asked = {}
-
-    def stand_in(folder, **options):
-        asked.update(options)
-        return read_transforms(folder)
-
-    monkeypatch.setattr(convert, "read_rendered", stand_in)
-    capture = read_scene(data, max_size_px=6)
+    monkeypatch.setattr(convert, "read_rendered", lambda folder, **options: asked.update(options))
+    readers()["rendered"](data)
     assert asked == {"maps": False}
-    assert capture.views.sizes_px.tolist() == [[6, 4]] * 3
-    assert_close(float(capture.cameras.intrinsics[0, 0, 2]), 3.25)
 
 
 def test_a_set_without_cameras_is_not_exported(data, tmp_path, monkeypatch, capsys):

@@ -93,15 +93,6 @@ def test_lights_and_normals_are_turned_into_the_world(turntable, rig):
     assert capture.views.masks[0].sum() == 80
 
 
-def test_photographs_are_divided_by_intensity_when_asked(turntable):
-    capture = read_diligent_mv(turntable, positions=[1], divide_by_intensity=True)
-    expected = torch.tensor([[6000.0, 3000, 1000], [12000, 6000, 1000], [18000, 9000, 1000]])
-    assert_close(
-        capture.views.images[:, :, 0, 0], expected / 65535 / torch.tensor(INTENSITIES).float()
-    )
-    assert_close(capture.truth.lights_world[:, 1:].norm(dim=1), torch.ones(3))
-
-
 def test_one_light_a_view_shrunk(turntable):
     capture = read_diligent_mv(turntable, light_seed=2, max_size_px=10)
     assert capture.position.tolist() == [1, 2, 3]

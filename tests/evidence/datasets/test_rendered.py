@@ -131,6 +131,14 @@ def test_an_account_that_cannot_be_is_refused(copy, change, words):
         read_rendered(copy)
 
 
+def test_settings_that_have_gone_are_passed_over(copy):
+    path = copy / "truth" / "scene.json"
+    account = json.loads(path.read_text())
+    account["settings"]["bounces"] = 0
+    path.write_text(json.dumps(account))
+    assert read_rendered(copy, maps=False).views.num_views == 3
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -4,7 +4,6 @@ from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.interreflection import Interreflection
 from pimper_torch.evidence.scenes.lights import Lights
 from pimper_torch.evidence.scenes.meshes import moved, potato, table
 from pimper_torch.evidence.scenes.noise import random_speckle
@@ -29,7 +28,7 @@ def stage(objects):
     return Stage(objects)
 
 
-def shot(stage, sensor, seed=0, between=None, **changes):
+def shot(stage, sensor, seed=0, **changes):
     cameras = arc_cameras(1, width=60, height=45, focal_px=80.0, distance=3.0, span_deg=1.0)
     settings = {
         "positions_world": torch.tensor([[1.5, 1.0, 3.0]], dtype=torch.float64),
@@ -40,7 +39,7 @@ def shot(stage, sensor, seed=0, between=None, **changes):
     }
     generator = torch.Generator().manual_seed(seed)
     lights = Lights(**(settings | changes))
-    return render_frame(stage, cameras, lights, 0, generator, sensor, between)
+    return render_frame(stage, cameras, lights, 0, generator, sensor)
 
 
 def sensor(**changes):
@@ -86,12 +85,3 @@ def test_maps_are_the_same_whatever_the_sensor(stage):
     for name in ("depth", "normals_world", "albedo", "foreground", "lit", "highlight"):
         assert_close(getattr(one, name), getattr(other, name))
     assert not torch.equal(one.image, other.image)
-
-
-def test_light_between_bodies_only_adds(stage):
-    alone = shot(stage, sensor(supersample=1))
-    between = Interreflection(stage, 1, num_rays=32)
-    together = shot(stage, sensor(supersample=1), between=between)
-    extra = together.image - alone.image
-    assert (extra >= 0).all()
-    assert extra[:, alone.foreground & ~alone.lit].mean() > 0.003

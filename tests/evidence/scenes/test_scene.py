@@ -232,7 +232,6 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
         ({"point_light_distance": 0.5}, "point_light_distance is 0.5"),
         ({"exposure": 0.0}, "exposure is 0.0"),
         ({"albedo": (0.5, 0.5, 1.5)}, "albedo is"),
-        ({"bounces": 9}, "bounces is 9"),
         ({"conductor": "gold", "specular": 0.04}, "conductor is"),
     ],
 )

@@ -5,7 +5,6 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.paper.alignment.align import Align, AlignConfig
-from pimper_torch.paper.alignment.reliability import trust_by_distance
 from pimper_torch.records import Mesh
 
 RADIUS = 2.0
@@ -16,10 +15,10 @@ def cap(x, y):
     return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
 
 
-def random_transforms(count, generator, offset=0.02):
-    draw = torch.randn(count, 4, generator=generator, dtype=torch.float64)
-    tilt, scale, shift = 0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), offset * draw[:, 3:]
-    return torch.cat([tilt, scale, shift], dim=1)
+def random_transforms(count, generator):
+    draw = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    tilt, scale = 0.15 * draw[:, :2], (0.35 * draw[:, 2:]).exp()
+    return torch.cat([tilt, scale, torch.zeros_like(scale)], dim=1)
 
 
 def spoiled(depths, transforms):
@@ -80,15 +79,9 @@ def test_alignment_undoes_random_bas_height_field_transforms(sphere, generator, 
     # Scales too, which no anchor tells: only neighbours and the folds between them do.
     scales = by_facet(found)[:, 2] * put_on[:, 2]
     assert (scales - 1).abs().mean() < 2 * left
+    assert (by_facet(found)[:, 3] == 0).all()  # patches do not move along their normals
     assert found.mismatch.shape == (5,)
     assert found.mismatch[-1] < 0.02 * found.mismatch[0]
-
-
-def test_the_published_three_numbers_undo_what_three_numbers_did(sphere, generator):
-    bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator, offset=0.0))
-    found = Align(AlignConfig(prior=1e-6, iterations=5, offset=False))(bad)
-    assert error(found, sphere) < 0.01 * error(bad, sphere)
-    assert (by_facet(found)[:, 3] == 0).all()
 
 
 def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
@@ -99,36 +92,17 @@ def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
     assert error(spoiled(bad, by_facet(twice)), twice) < 1e-12
 
 
-def test_the_curvature_term_keeps_disagreeing_patches_from_being_flattened(
-    facets_over, height_fields, noise
-):
-    flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
-    bad = noise(flat, 0.02)  # neighbours have nothing in common
-
-    def scales(**settings):
-        return by_facet(Align(AlignConfig(prior=1e-5, **settings))(bad))[:, 2]
-
-    assert scales(curvature=False, scale_limit=1e6).median() < 0.05
-    assert scales(scale_limit=1e6).median() > 0.25
-
-
 def test_no_patch_collapses_with_default_settings(facets_over, height_fields, noise):
     flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
     bad = noise(flat, 0.02)
-    for curvature in (True, False):
-        scales = by_facet(Align(AlignConfig(curvature=curvature))(bad))[:, 2]
-        assert scales.min() >= 0.25
-        assert scales.max() <= 4
+    scales = by_facet(Align()(bad))[:, 2]
+    assert scales.min() >= 0.25
+    assert scales.max() <= 4
 
 
-def test_noise_on_a_curved_surface_shrinks_it_without_the_curvature_term_only(sphere, noise):
+def test_noise_on_a_curved_surface_hardly_shrinks_it(sphere, noise):
     bad = noise(sphere, 0.01)  # half of the height field's own size
-
-    def mean_scale(curvature):
-        return by_facet(Align(AlignConfig(prior=1e-5, curvature=curvature))(bad))[:, 2].mean()
-
-    assert mean_scale(False) < 0.85
-    assert mean_scale(True) > 0.85
+    assert by_facet(Align(AlignConfig(prior=1e-5))(bad))[:, 2].mean() > 0.85
 
 
 def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
@@ -199,34 +173,6 @@ def test_a_single_facet_is_handed_back(facets_over, height_fields):
     assert Align()(depths) is depths
 
 
-def test_a_step_in_one_patch_is_left_standing_instead_of_tilting_it(sphere):
-    facet = 0
-    bucket = next(i for i, t in enumerate(sphere.patches.buckets) if facet in t.facet)
-    templates, height_field = sphere.patches.buckets[bucket], sphere.buckets[bucket]
-    row = int(torch.nonzero(templates.facet == facet)[0, 0])
-    depth = height_field.depth.clone()
-    beyond = templates.barycentric[row, ..., 0] > 0.8
-    depth[row] = depth[row] + 0.2 * beyond
-    buckets = list(sphere.buckets)
-    buckets[bucket] = height_field.replace(depth=depth)
-    stepped = sphere.replace(buckets=tuple(buckets))
-
-    def others(outlier):
-        found = Align(AlignConfig(outlier=outlier, anchor=0.0))(stepped)
-        away = by_facet(found) - torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
-        return float(away.abs().mean())
-
-    assert others(5.0) < 0.3 * others(1e9)
-
-
-def test_samples_lose_three_quarters_at_the_outlier_distance():
-    distance = torch.tensor([[1.0, 1.0, 1.0, 5.0, 1e3]])
-    met = torch.tensor([[True, True, True, True, False]])
-    reliability = trust_by_distance(distance, met, outlier=5.0)
-    assert_close(reliability[0, 3], torch.tensor(0.25))
-    assert reliability[0, 0] > 0.9
-
-
 def test_gradients_run_from_depths_to_aligned_depths(
     facets_over, height_fields, sphere_height_field, generator
 ):
@@ -258,7 +204,6 @@ def test_gradients_run_from_depths_to_aligned_depths(
         {"anchor": -1.0},
         {"prior": 0.0},
         {"scale_limit": 1.0},
-        {"outlier": 0.0},
     ],
 )
 def test_impossible_settings_are_refused(setting):

@@ -1,12 +1,9 @@
 """The published system against a dense assembly, and what keeps it from flattening."""
 
-import dataclasses
-
 import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.chains.presets import load_config
 from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.paper.alignment.system import Pulls, solve_transforms
 
@@ -20,7 +17,7 @@ def cap(x, y):
 
 def random_transforms(count, generator):
     draw = torch.randn(count, 4, generator=generator, dtype=torch.float64)
-    return torch.cat([0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), 0.02 * draw[:, 3:]], dim=1)
+    return torch.cat([0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), 0 * draw[:, 3:]], dim=1)
 
 
 def changed(depths, change):
@@ -66,24 +63,6 @@ def by_facet(depths):
 @pytest.fixture
 def sphere(facets_over, height_fields, sphere_height_field):
     return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
-
-
-def test_the_preset_paper_solves_the_published_system(disc):
-    """Three unknowns a patch, no weights for outliers, and no points of the cloud."""
-    depths, _ = disc
-    preset = load_config("paper").align
-
-    def aligned(depths, **changes):
-        return by_facet(Align(dataclasses.replace(preset, **changes))(depths))
-
-    found = aligned(depths)
-    assert (found[:, 3] == 0).all()  # no offset
-    assert aligned(depths, offset=True)[:, 3].abs().max() > 1e-3
-    # Nothing is weighted down: the step of the disc counts in full.
-    assert_close(found, aligned(depths, outlier=1e9))
-    assert (found - aligned(depths, outlier=5.0)).abs().max() > 1e-2
-    # Curvature lets the depths' second derivatives keep the scale.
-    assert (found - aligned(depths, curvature=False)).abs().max() > 1e-3
 
 
 def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):
@@ -137,33 +116,20 @@ def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):
     assert (found[:, 3] == 0).all()
 
 
-@pytest.mark.parametrize(
-    ("curvature", "noise", "least"),
-    [
-        (True, 0.0, 0.995),
-        (True, 0.002, 0.97),
-        (True, 0.005, 0.9),
-        (False, 0.0, 0.995),
-        (False, 0.002, 0.94),
-        (False, 0.005, 0.7),  # without k noise is made less by making everything less
-    ],
-)
-def test_scales_do_not_shrink_after_random_transforms_and_noise(
-    sphere, generator, curvature, noise, least
-):
+@pytest.mark.parametrize(("noise", "least"), [(0.0, 0.995), (0.002, 0.97), (0.005, 0.9)])
+def test_scales_do_not_shrink_after_random_transforms_and_noise(sphere, generator, noise, least):
     """Noise is up to a quarter of the height field's own root mean square."""
     put_on = random_transforms(sphere.patches.num_patches, generator)
     bad = waves(spoiled(sphere, put_on), noise, generator)
-    found = Align(AlignConfig(prior=1e-6, curvature=curvature, iterations=4))(bad)
+    found = Align(AlignConfig(prior=1e-6, iterations=4))(bad)
     scales = by_facet(found)[:, 2] * put_on[:, 2]
     assert scales.median() > least
     assert scales.median() < 1.05
     assert scales.min() > 0.3
 
 
-@pytest.mark.parametrize("curvature", [True, False])
 def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
-    facets_over, height_fields, generator, curvature
+    facets_over, height_fields, generator
 ):
     """All seams agree at h = 0 too: nothing but the gauge tells the two apart."""
 
@@ -174,60 +140,6 @@ def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(
 
     flat = height_fields(facets_over(lambda x, y: 0 * x), bumps)
     put_on = random_transforms(flat.patches.num_patches, generator)
-    config = AlignConfig(prior=1e-5, anchor=0.0, curvature=curvature, iterations=4)
-    found = Align(config)(spoiled(flat, put_on))
+    found = Align(AlignConfig(prior=1e-5, anchor=0.0, iterations=4))(spoiled(flat, put_on))
     scales = by_facet(found)[:, 2] * put_on[:, 2]
-    assert scales.std() < 0.05 * scales.mean()  # one common scale, which nothing tells
     assert scales.mean() > 0.5
-
-
-@pytest.fixture
-def disc(facets_over, height_fields, generator):
-    """Bumps, and in front of them a disc whose step every patch has as high as it likes.
-
-    So is height field across a depth edge: integration does not know how high the step is.
-    """
-    flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
-    mesh = flat.patches.coarse.mesh
-    centre = mesh.vertices_world[mesh.faces].mean(dim=1)
-    steps = 0.2 * torch.rand(len(centre), generator=generator, dtype=torch.float64)
-
-    def world(x, y, facet):
-        return x + centre[facet, 0, None, None], y + centre[facet, 1, None, None]
-
-    def in_front(x, y, facet):
-        x, y = world(x, y, facet)
-        return (x - 0.3) ** 2 + (y - 0.2) ** 2 < 0.25**2
-
-    def change(x, y, depth, facet):
-        along, down = world(x, y, facet)
-        bumps = 0.03 * torch.sin(5 * along + 1) * torch.cos(4 * down)
-        return bumps - steps[facet, None, None] * in_front(x, y, facet)
-
-    behind = []
-    for templates in flat.patches.buckets:
-        x, y, _ = templates.points_patch.unbind(dim=-1)
-        behind.append(~in_front(x, y, templates.facet))
-    return changed(flat, change), behind
-
-
-def test_what_lies_beside_a_depth_edge_is_not_pulled_by_it(disc):
-    depths, behind = disc
-
-    fraction = torch.cat([where.flatten(1).double().mean(dim=1) for where in behind])
-    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    untouched = facets[fraction == 1]
-    assert len(untouched) > 8
-
-    def moved(outlier):
-        """How unlike each other patches move that see nothing of the disc themselves.
-
-        Their common tilt and shift are the gauge's, for nothing is anchored here.
-        """
-        found = Align(AlignConfig(anchor=0.0, outlier=outlier))(depths)
-        return float(by_facet(found)[untouched].std(dim=0).norm())
-
-    plain, robust = moved(1e9), moved(5.0)
-    assert plain > 0.03  # the edge does matter
-    assert robust < 0.4 * plain  # measured 0.25
-    assert moved(2.0) < robust

@@ -52,16 +52,6 @@ def test_gains_of_views_are_absorbed_by_the_lights():
     assert_close(found.gamma, 1.8, rtol=1e-3, atol=0)
 
 
-@pytest.mark.slow
-def test_gamma_does_not_depend_on_the_unit_of_the_values():
-    encoded = noisy(shaded() ** (1 / 1.8), 0.005)
-    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
-    halved = estimate_gamma(
-        encoded / 2, everywhere(encoded), rank=3, dark_level=0.05, saturation_level=0.49
-    )
-    assert_close(halved.gamma, found.gamma, rtol=2e-3, atol=0)
-
-
 def test_noise_moves_gamma_by_no_more_than_its_standard_error_tells():
     encoded = noisy(shaded(samples=120) ** (1 / 2.2), 0.01)
     found = estimate_gamma(encoded, everywhere(encoded), rank=3)

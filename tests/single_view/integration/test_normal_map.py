@@ -5,8 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.single_view.integration.discontinuities import DiscontinuityConfig
+from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
 from pimper_torch.single_view.integration.rasters import RasterSystem
 from pimper_torch.single_view.integration.steps import orthographic_steps
@@ -376,15 +375,6 @@ def test_input_that_means_nothing_is_refused(change, text):
     normals = torch.tensor([0.0, 0, -1]).expand(6, 6, 3)
     with pytest.raises(InputError, match=text):
         integrate_normal_map(normals, **change)
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [{"scale_px": 0.0}, {"tie": 1.0}, {"kink": -1.0}, {"max_iterations": 0}, {"tolerance": 0.0}],
-)
-def test_impossible_settings_are_refused(setting):
-    with pytest.raises(ConfigError):
-        DiscontinuityConfig(**setting)
 
 
 def test_a_map_whose_normals_all_fail_is_flat_and_not_valid():

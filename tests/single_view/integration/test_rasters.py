@@ -12,7 +12,6 @@ from pimper_torch.linalg import hierarchy
 from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.paper.poisson import differences, differences_transposed
 from pimper_torch.single_view.integration.rasters import RasterSystem
-from pimper_torch.single_view.integration.stencil import may_keep
 
 
 @dataclass(frozen=True)
@@ -314,29 +313,6 @@ def test_float32_rasters_are_solved_in_float64(method, generator):
     assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_refreshed_weights_give_what_a_new_system_gives(generator):
-    weighted = masked(equal(60, 50), ragged(60, 50))
-    source = random(generator, 60, 50)
-    former = system(weighted, method="multigrid")
-    for spread in (0.03, 4.0):  # the hierarchy is kept, then not
-        factor = [
-            10 ** (spread * random(generator, *part.shape))
-            for part in (weighted.right, weighted.down)
-        ]
-        changed = weighted.right * factor[0], weighted.down * factor[1]
-        expected = RasterSystem(*changed, method="multigrid").solve(source)
-        assert_close(former.refreshed(*changed).solve(source), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_cuts_made_by_refreshing_are_seen(generator):
-    weighted = equal(30, 30)
-    cut = weighted.right.clone()
-    cut[:, 14] = 0
-    refreshed = system(weighted, method="multigrid").refreshed(cut, weighted.down)
-    found = refreshed.solve(random(generator, 30, 30))
-    assert_close(found[:, :15].mean(), torch.zeros((), dtype=torch.float64), atol=1e-12, rtol=0)
-
-
 def test_a_start_near_the_solution_saves_cycles(generator):
     weighted = terraced(120, 120)
     solver = system(weighted, method="multigrid")
@@ -398,12 +374,3 @@ def test_cuda_gives_what_the_cpu_gives(weighted, generator):
     moved = [part.cuda() for part in (weighted.right, weighted.down, weighted.anchor)]
     found = RasterSystem(*moved, method="multigrid").solve(source.cuda())
     assert_close(found.cpu(), expected, atol=1e-5, rtol=0)
-
-
-def test_levels_are_kept_only_for_values_near_those_they_were_made_from():
-    old = torch.tensor([1.0, -2.0, 0.0, 1e-8])
-    assert may_keep(torch.tensor([1.9, -1.1, 0.0, 1.5e-8]), old)
-    for place, value in ((0, 2.1), (1, -0.9), (1, 2.0), (2, 1e-9), (3, 0.0)):
-        new = old.clone()
-        new[place] = value
-        assert not may_keep(new, old)
