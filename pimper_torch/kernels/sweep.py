@@ -133,9 +133,9 @@ def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
 @compiled(
     "void(float32[:,::1], float32[:,::1], int64[:,::1], int64[::1], float64[:,:,::1],"
     "float64[:,::1], float64[::1], float64[:,::1], float64[::1], float32[:,:,::1],"
-    "float32[:,:,:,::1], float32[:,:,:,::1], float32[:,:,::1], boolean[:,:,:,::1],"
-    "boolean[:,:,::1], float32[::1], float64[::1], int64[::1], int64, int64, float64,"
-    "float32[:,:,:,::1], float32[:,:,::1])"
+    "float32[:,:,:,::1], float32[:,:,:,::1], float32[:,:,::1], float32[:,::1],"
+    "boolean[:,:,:,::1], boolean[:,:,::1], float32[::1], float64[::1], int64[::1], int64, int64,"
+    "float64, float32[:,:,:,::1], float32[:,:,::1])"
 )
 def costs(
     finest: Array,
@@ -151,6 +151,7 @@ def costs(
     outward: Array,
     normals: Array,
     lights: Array,
+    gains: Array,
     valid: Array,
     tested: Array,
     scale: Array,
@@ -173,6 +174,7 @@ def costs(
         outward: Unit, along which a sample is swept; patch frame.
         normals: That light shades, patch frame.
         lights: First-order harmonics of every patch and view.
+        gains: Factors of radiance, of every patch and view.
         valid: Where a view has the sample.
         tested: Samples that may be swept.
         scale: Of the robust loss, for every patch.
@@ -276,7 +278,7 @@ def costs(
                         move = spacing[patch] * ladder[step]
                         z_cam = w0 + move * dw
                         inverse_z = 1 / z_cam if z_cam != 0 else 1.0
-                        radiance[step, slot] = _gray(
+                        radiance[step, slot] = gains[patch, view] * _gray(
                             finest,
                             coarser,
                             levels,

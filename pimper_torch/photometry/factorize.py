@@ -209,7 +209,7 @@ class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
     First the light field of every view is fitted to the smoothed normals of the coarse mesh:
-    soft light, or a near point light, in a lit room where there is one; and its colour, which is
+    soft light, or a near point light, in a lit room where there is one; its colour and exposure are
     divided out. Then every patch is factorized, the field being the prior mean of its lights;
     samples in shadow of the point light are left out, or, where they are most of a patch in a lit
     room, those outside it. Each sample gets a last Gauss-Newton step, and albedo is fitted to
@@ -313,10 +313,7 @@ class Factorize(Stage):
         buckets = []
         for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
             own = light.replace(field=templates.own(light.field))
-            colour = own.field.colour
-            if colour is not None and not bool((colour == 1).all()):
-                balanced = registered.radiance / colour[..., None, None].to(registered.radiance)
-                registered = registered.replace(radiance=balanced)
+            registered = _balanced(registered, own.field)
             normals = transferred_normals(seen.patches.coarse, templates)
             bucket = _Bucket(templates=templates, registered=registered, normals=normals)
             found = over_patches(
@@ -326,6 +323,11 @@ class Factorize(Stage):
                 partial(_lost, bucket),
                 _COARSE_NORMALS,
             )
+            exposure = own.field.exposure
+            if exposure is not None:
+                exposure = exposure.to(found.lights_patch).expand(len(templates.facet), -1)
+                lights = found.lights_patch * exposure[..., None]
+                found = found.replace(lights_patch=lights, exposure=exposure)
             buckets.append(found)
         return PhotometricPatches(patches=seen.patches, buckets=tuple(buckets))
 
@@ -495,6 +497,18 @@ class Factorize(Stage):
 
 
 @torch.no_grad()
+def _balanced(registered: Observations, field: LightField) -> Observations:
+    """Divide radiance by each view's gain, and guessed lights by its exposure."""
+    gain, exposure, priors = field.gain, field.exposure, registered.priors
+    if gain is None or exposure is None or bool((gain == 1).all()):
+        return registered
+    if priors is not None and priors.lights_patch is not None:
+        lights = priors.lights_patch / exposure[:, None].to(priors.lights_patch)
+        registered = registered.replace(priors=priors.replace(lights_patch=lights))
+    balanced = registered.radiance / gain[..., None, None].to(registered.radiance)
+    return registered.replace(radiance=balanced)
+
+
 def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ _ _ 3"]]) -> float:
     """Return the median residual of normals under a light field, over what it predicts."""
     found = []

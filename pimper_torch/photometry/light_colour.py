@@ -1,7 +1,8 @@
-r"""The colour of each view's light, relative to that of all of them.
+r"""The colour and the strength of each view's light, relative to those of all of them.
 
 Chromaticity is that of the albedo times that of the light, whatever the shading: the logarithm of
-each channel over the channels' mean is a sum of one term a sample and one a view.
+each channel over the channels' mean is a sum of one term a sample and one a view. So is that of
+the brightness, but for the shading.
 """
 
 import torch
@@ -11,6 +12,10 @@ from torch import Tensor
 from pimper_torch.photometry.image_samples import MIN_SPREAD
 from pimper_torch.photometry.left_out import left_out, predicts_better
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+
+# Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
+# sensor's noise is most of its residuals. A choice.
+_MOST_STOPS = 3.0
 
 # Solutions, with Cauchy's weights from the residuals before: a choice.
 _ITERATIONS = 8
@@ -51,12 +56,37 @@ def light_colours(
     return (colour * share.sum() / (colour @ share)[:, None]).to(radiance)
 
 
+@torch.no_grad()
+def exposures(
+    radiance: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"]
+) -> Float[Tensor, " view"]:
+    """Find how bright each view is, in powers of two, relative to the median of them.
+
+    Radiance over it has residuals of like size in all views, so that an under-exposed photograph
+    counts as much as others. Views within half a stop of the median are left as they are.
+
+    Args:
+        radiance: Gray, linear. Entries that are not seen are ignored.
+        seen: False where missing.
+
+    A constant to autograd.
+    """
+    seen = seen & (radiance > 0)
+    if not seen.any():
+        return radiance.new_ones(radiance.shape[1])
+    brightness = radiance.double().where(seen, 1).log2()[..., None]
+    stops = _fit(brightness, seen, True)[0][:, 0]
+    stops = (stops - stops[seen.any(dim=0)].median()).round().clamp_min(-_MOST_STOPS)
+    return torch.where(seen.any(dim=0), stops.exp2(), 1).to(radiance)
+
+
 def _fit(
     chroma: Float[Tensor, "sample view channel"], seen: Bool[Tensor, "sample view"], free: bool
 ) -> tuple[Float[Tensor, "view channel"], Float[Tensor, "sample channel"]]:
     """Fit the terms of views, of zero mean, and of samples by robust least squares.
 
     Args:
+        chroma: Logarithms, of any number of channels.
         free: Whether views have terms at all.
     """
     colour, weight = chroma.new_zeros(chroma.shape[1:]), seen.to(chroma)

@@ -35,14 +35,17 @@ class LightField(Record):
         point_light: ``e``; zero for none.
         closeness: ``c``, the inverse distance; zero for a distant light.
         origin: World.
-        colour: Of all light; radiance over it is gray. White if ``None``.
+        gain: Of all light: colour times exposure. Radiance over it is gray, and of like strength in
+            all views. 1 if ``None``.
+        exposure: Factor of the lights here that makes them those of the photographs.
     """
 
     soft: Float[Tensor, "view 9"]
     point_light: Float[Tensor, "view 3"]
     closeness: Float[Tensor, " view"]
     origin: Float[Tensor, " 3"]
-    colour: Float[Tensor, "view channel"] | None = None
+    gain: Float[Tensor, "view channel"] | None = None
+    exposure: Float[Tensor, " view"] | None = None
 
     def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
         """Return ``E``, the direction to the point light times its irradiance."""

@@ -22,7 +22,7 @@ from pimper_torch.geometry.frames import invert_rigid, transform
 from pimper_torch.photometry.harmonics import harmonics, second_harmonics
 from pimper_torch.photometry.image_samples import ImageSamples
 from pimper_torch.photometry.left_out import left_out, predicts_better
-from pimper_torch.photometry.light_colour import light_colours
+from pimper_torch.photometry.light_colour import exposures, light_colours
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.photometry.light_fit import LightFit, fit_lights, with_gradients
 from pimper_torch.photometry.light_models import LightModel
@@ -72,6 +72,8 @@ def light_of_mesh(
 ) -> LightField:
     """Fit the light field to samples spread evenly over the facets, without their overlap.
 
+    Its lights are those of radiance over the views' colours and exposures.
+
     Args:
         seen: All views on all templates, :func:`thinned` or not.
         coarse: Normals of each bucket's templates, patch frame.
@@ -103,8 +105,10 @@ def light_of_mesh(
     every, shown = torch.cat(radiance), torch.cat(visible)
     colour = light_colours(every, shown) if colours else every.new_ones(every.shape[1:])
     gray = (every / colour).mean(dim=2)
+    exposure = exposures(gray, shown)
+    gray = gray / exposure
     field = fit_light_field(gray, shown, torch.cat(normals), torch.cat(points), model=model)
-    return field.replace(colour=colour)
+    return field.replace(gain=colour * exposure[:, None], exposure=exposure)
 
 
 def fit_light_field(

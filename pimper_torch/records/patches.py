@@ -336,6 +336,8 @@ class Photometry(Record):
             one over squared radians, 0 where not valid.
         status: A :class:`PatchStatus` each. The normals of a patch that is not determined
             are those of the coarse mesh, and none of its samples is valid.
+        convergence: Of the factorization; the residual is one of radiance over exposure.
+        exposure: Of each view, relative to the median; ``None`` where all are 1.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
@@ -345,6 +347,7 @@ class Photometry(Record):
     information: Float[Tensor, "patch height width"]
     status: Int[Tensor, " patch"]
     convergence: Convergence
+    exposure: Float[Tensor, "patch view"] | None = None
 
     @property
     def raster(self) -> tuple[int, ...]:

@@ -10,6 +10,17 @@ from pimper_torch.patches.sources import Sources
 from pimper_torch.records import Cameras, Observations, Photometry, Templates
 
 
+def balanced_lights(
+    photometry: Photometry,
+) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
+    """Return lights over the exposure of their views, and the factors of radiance beside them."""
+    lights = photometry.lights_patch
+    gains = torch.ones_like(lights[..., 0])
+    if photometry.exposure is not None:
+        gains = 1 / photometry.exposure
+    return lights * gains[..., None], gains
+
+
 def compiled_costs(
     templates: Templates,
     registered: Observations,
@@ -45,6 +56,7 @@ def compiled_costs(
     exact = cameras.to(torch.float64)
     image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
     image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
+    lights, gains = balanced_lights(photometry)
     shape = templates.depth.shape
     cost = torch.zeros(shape[0], len(ladder), *shape[1:])
     swept = torch.zeros(shape)
@@ -60,7 +72,8 @@ def compiled_costs(
         as_array(templates.depth, torch.float32),
         as_array(transferred, torch.float32),
         as_array(photometry.normals_patch, torch.float32),
-        as_array(photometry.lights_patch[..., :4], torch.float32),
+        as_array(lights, torch.float32),
+        as_array(gains, torch.float32),
         as_array(registered.valid),
         as_array(photometry.observed & templates.inside),
         as_array(scale, torch.float32),

@@ -35,7 +35,7 @@ from pimper_torch.records import (
 )
 from pimper_torch.stage import Stage
 from pimper_torch.sweep.consistency import inconsistency
-from pimper_torch.sweep.costs import compiled_costs
+from pimper_torch.sweep.costs import balanced_lights, compiled_costs
 from pimper_torch.sweep.minimum import parabola_minimum, posterior_variance
 from pimper_torch.sweep.selection import best_views, poses_first, view_scores
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
@@ -95,6 +95,7 @@ class _Swept(Record):
         index: In the flattened rasters.
         outward: Along which it is swept; unit, world.
         shading: Of albedo 1 in these.
+        gains: Factors of radiance in these.
     """
 
     index: Int[Tensor, " sample"]
@@ -104,6 +105,7 @@ class _Swept(Record):
     chosen: Int[Tensor, "sample chosen"]
     seen: Bool[Tensor, "sample chosen"]
     shading: Float[Tensor, "sample chosen"]
+    gains: Float[Tensor, "sample chosen"]
 
 
 class Sweep(Stage):
@@ -325,7 +327,8 @@ class Sweep(Stage):
         points, outward = points.reshape(-1, 3)[index], outward.reshape(-1, 3)[index]
         normals = photometry.normals_patch.reshape(-1, 3)[index]
         basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
-        shading = torch.einsum("sga,sa->sg", photometry.lights_patch[patch, :, :4], basis)
+        lights, gains = balanced_lights(photometry)
+        shading = torch.einsum("sga,sa->sg", lights[patch], basis)
         valid = registered.valid.movedim(1, -1).reshape(-1, views)[index]
         with torch.no_grad():
             away = cameras.centers_world - points[:, None]
@@ -347,6 +350,7 @@ class Sweep(Stage):
             chosen=chosen[enough],
             seen=seen[enough],
             shading=shading.gather(1, chosen)[enough],
+            gains=gains[patch].gather(1, chosen)[enough],
         )
 
     def _footprint(
@@ -391,7 +395,7 @@ class Sweep(Stage):
             level = level[:, None].expand(-1, moves.shape[1]).flatten()
             radiance = look_up(sources.gray.levels(int(images[view])), pixels, level)
             found = found.index_copy(0, slot, radiance.reshape(len(slot), -1).to(found))
-        return found.reshape(*rows.chosen.shape, moves.shape[1])
+        return rows.gains[..., None] * found.reshape(*rows.chosen.shape, moves.shape[1])
 
 
 def _spread_out(

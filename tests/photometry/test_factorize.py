@@ -216,6 +216,23 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
         assert angles_deg(two.normals_patch, one.normals_patch, one.valid).median() < 0.5
 
 
+def test_exposures_of_the_views_change_nothing_but_lights(scene):
+    true = scene()
+    exposure = torch.tensor([1.0, 4, 1, 0.25, 1, 1, 2, 1, 0.5, 1, 1, 1], dtype=torch.float64)
+    exposed = true.seen.replace(
+        buckets=tuple(
+            one.replace(radiance=one.radiance * exposure[:, None, None, None])
+            for one in true.seen.buckets
+        )
+    )
+    plain, found = Factorize()(true.seen), Factorize()(exposed)
+    for one, two in zip(plain.buckets, found.buckets, strict=True):
+        assert (two.normals_patch == one.normals_patch).all()
+        assert (two.albedo == one.albedo).all()
+        assert_close(two.lights_patch, one.lights_patch * exposure[:, None], rtol=0, atol=0)
+        assert (two.exposure == one.exposure * exposure).all()
+
+
 def spoil(seen: PatchViews, how: str) -> PatchViews:
     first = seen.buckets[0]
     radiance, valid = first.radiance.clone(), first.valid.clone()

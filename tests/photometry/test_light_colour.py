@@ -1,7 +1,8 @@
+import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.light_colour import light_colours
+from pimper_torch.photometry.light_colour import exposures, light_colours
 
 
 def scene(generator, views=8, samples=900):
@@ -49,3 +50,22 @@ def test_gross_outliers_and_black_samples_do_not_tint(generator):
     ratio = (found / colour).log()
     ratio = ratio - ratio.mean(dim=1, keepdim=True)
     assert (ratio - ratio.mean(dim=0)).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("most", [0.0, 0.4])
+def test_exposures_are_found_in_whole_stops_and_lights_of_like_strength_are_left(generator, most):
+    white, seen, _ = scene(generator)
+    unlike = torch.tensor([0.0, 1, -1, 0, 2, 0, -2, 0], dtype=torch.float64)
+    drawn = most * (2 * torch.rand(8, generator=generator, dtype=torch.float64) - 1)
+    found = exposures(white[..., 0] * (unlike + drawn).exp2(), seen)
+    assert_close(found, unlike.exp2())
+    assert (exposures(white[..., 0] * drawn.exp2(), seen) == 1).all()
+
+
+def test_exposures_of_views_that_see_nothing_are_one_and_the_darkest_are_bounded(generator):
+    white, seen, _ = scene(generator)
+    seen[:, 3] = False
+    dark = torch.tensor([1.0, 1, 1, 1, 1, 2.0**-6, 1, 1], dtype=torch.float64)
+    found = exposures(white[..., 0] * dark, seen)
+    assert found[3] == 1
+    assert found[5] == 2.0**-3
