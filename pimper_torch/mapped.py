@@ -12,6 +12,7 @@ from contextlib import suppress
 from itertools import chain
 from math import prod
 from pathlib import Path
+from threading import Lock
 from weakref import WeakSet
 
 import torch
@@ -23,6 +24,7 @@ from pimper_torch.errors import OutputError
 LARGE = 2**26
 
 _mapped: WeakSet[mmap.mmap] = WeakSet()
+_lock = Lock()  # of the set, which no thread may add to while another goes through it
 
 
 def zeros(
@@ -53,7 +55,8 @@ def zeros(
             "photographs that are large together are kept on disk. Free space, set TMPDIR to a "
             "folder of another disk, or shrink the photographs (`--max-size-px`)."
         ) from error
-    _mapped.add(pages)
+    with _lock:
+        _mapped.add(pages)
     return torch.frombuffer(pages, dtype=dtype).view(list(shape))
 
 
@@ -104,7 +107,9 @@ def stacked(tensors: Iterator[Tensor], count: int) -> Tensor:
 def drop_pages() -> None:
     """Let go of the pages of all files; what was written to them stays."""
     if hasattr(mmap, "MADV_DONTNEED"):
-        for pages in list(_mapped):
+        with _lock:
+            mapped = list(_mapped)
+        for pages in mapped:
             pages.madvise(mmap.MADV_DONTNEED)
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
@@ -100,14 +101,14 @@ def log_pictures(
         On the CPU, float32, a constant to autograd. Pixels that are padding, invalid, not finite
         or saturated in one channel are unusable.
     """
-    log = torch.zeros(raster)
-    unusable = torch.ones(raster, dtype=torch.uint8)
+    log, unusable = zeros(raster), zeros(raster, torch.uint8).fill_(1)
     for index, (image, valid) in enumerate(photographs):
         height, width = valid.shape
         radiance = image.detach()
         usable = valid & radiance.isfinite().all(dim=0) & (radiance.amax(dim=0) < SATURATED)
         log[index, :height, :width] = torch.where(usable, radiance.mean(dim=0), 0)
         unusable[index, :height, :width] = ~usable
+        drop_pages()
     some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
     some = some[some > 0]
     floor = _DARK * some.median() if len(some) else torch.ones(())
