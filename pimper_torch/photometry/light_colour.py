@@ -14,8 +14,9 @@ from pimper_torch.photometry.left_out import left_out, predicts_better
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
 # Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
-# sensor's noise is most of its residuals. A choice.
-_MOST_STOPS = 3.0
+# sensor's noise is most of its residuals. Views within this of the median are of one exposure: lamps
+# move and fall off. Choices.
+_MOST_STOPS, _SAME_STOPS = 3.0, 1.5
 
 # Solutions, with Cauchy's weights from the residuals before: a choice.
 _ITERATIONS = 8
@@ -63,7 +64,7 @@ def exposures(
     """Find how bright each view is, in powers of two, relative to the median of them.
 
     Radiance over it has residuals of like size in all views, so that an under-exposed photograph
-    counts as much as others. Views within half a stop of the median are left as they are.
+    counts as much as others. All are 1 where lights are of like strength.
 
     Args:
         radiance: Gray, linear. Entries that are not seen are ignored.
@@ -76,8 +77,11 @@ def exposures(
         return radiance.new_ones(radiance.shape[1])
     brightness = radiance.double().where(seen, 1).log2()[..., None]
     stops = _fit(brightness, seen, True)[0][:, 0]
-    stops = (stops - stops[seen.any(dim=0)].median()).round().clamp_min(-_MOST_STOPS)
-    return torch.where(seen.any(dim=0), stops.exp2(), 1).to(radiance)
+    shown = seen.any(dim=0)
+    stops = torch.where(shown, stops - stops[shown].median(), 0)
+    if bool((stops.abs() < _SAME_STOPS).all()):
+        return radiance.new_ones(radiance.shape[1])
+    return stops.round().clamp_min(-_MOST_STOPS).exp2().to(radiance)
 
 
 def _fit(

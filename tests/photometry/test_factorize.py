@@ -216,7 +216,7 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
         assert angles_deg(two.normals_patch, one.normals_patch, one.valid).median() < 0.5
 
 
-def test_exposures_of_the_views_change_nothing_but_lights(scene):
+def test_exposures_of_the_views_are_those_of_the_lights_and_leave_normals(scene):
     true = scene()
     exposure = torch.tensor([1.0, 4, 1, 0.25, 1, 1, 2, 1, 0.5, 1, 1, 1], dtype=torch.float64)
     exposed = true.seen.replace(
@@ -225,12 +225,13 @@ def test_exposures_of_the_views_change_nothing_but_lights(scene):
             for one in true.seen.buckets
         )
     )
-    plain, found = Factorize()(true.seen), Factorize()(exposed)
+    plain, found = Factorize(EXACT)(true.seen), Factorize(EXACT)(exposed)
     for one, two in zip(plain.buckets, found.buckets, strict=True):
-        assert (two.normals_patch == one.normals_patch).all()
-        assert (two.albedo == one.albedo).all()
-        assert_close(two.lights_patch, one.lights_patch * exposure[:, None], rtol=0, atol=0)
-        assert (two.exposure == one.exposure * exposure).all()
+        assert (one.exposure == 1).all()
+        assert two.exposure.max() >= 2 * two.exposure.min()
+        assert angles_deg(two.normals_patch, one.normals_patch, one.valid).median() < 0.05
+        ratio = two.lights_patch.norm(dim=2) / one.lights_patch.norm(dim=2) / exposure
+        assert_close(ratio, ratio.mean().expand_as(ratio), rtol=0.02, atol=0)
 
 
 def spoil(seen: PatchViews, how: str) -> PatchViews:

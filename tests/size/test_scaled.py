@@ -45,7 +45,7 @@ WITHOUT = {
     Silhouettes: {"inside"},
     Mesh: {"normals_world", "albedo", "confidence"},
     Templates: {"barycentric", "normals_patch"},
-    Photometry: {"normals_patch", "albedo", "lights_patch", "information"},
+    Photometry: {"normals_patch", "albedo", "lights_patch", "information", "exposure"},
     PatchPriors: {
         *("normals_patch", "normal_information", "albedo", "albedo_variance"),
         *("inlier", "lights_patch", "light_variance"),
