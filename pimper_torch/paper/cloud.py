@@ -24,8 +24,10 @@ def with_cloud(
 
     Args:
         reference: The view they were triangulated in.
-        source: The point of the cloud at each vertex.
+        source: The point of the cloud at each vertex, -1 for none.
     """
+    is_point = source >= 0
+    at_vertices = point_covariances(scene, source.clamp_min(0))
     between = reliable[~torch.isin(reliable, source)]
     camera = scene.cameras.cam_from_world[reference], scene.cameras.intrinsics[reference]
     pixels, _ = project(scene.points_world[between], *camera)
@@ -35,8 +37,8 @@ def with_cloud(
     return CoarseMesh(
         mesh=mesh,
         reference=reference,
-        is_point=torch.ones_like(source, dtype=torch.bool),
-        covariance_world=point_covariances(scene, source),
+        is_point=is_point,
+        covariance_world=torch.where(is_point[:, None, None], at_vertices, 0),
         points=FacetPoints(
             points_world=scene.points_world[between],
             covariance_world=point_covariances(scene, between),

@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -16,15 +14,17 @@ from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.geometry.projection import project, triangulation_angles
+from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.ledger import leave_out
 from pimper_torch.paper.cloud import with_cloud
+from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.filters import (
     behind_others,
     neighbours_agree,
     on_hull,
+    spread,
     spread_to_count,
     views_near,
     well_accompanied,
@@ -46,6 +46,9 @@ _NEIGHBOURS, _MAX_SLOPE, _MAX_DEVIATION, _MAX_ISOLATION = 12, 6.0, 0.5, 3.0
 # occlude a point.
 _OCCLUDING_SLOPE = 3.0
 
+# Of the spline, relative to the spread of the values: it passes through the points all but exactly.
+_SMOOTHING = 1e-6
+
 # A facet turned further from the reference bridges a depth discontinuity; so does one turned by
 # more than the second with an edge so many times the median facet's.
 _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
@@ -66,10 +69,12 @@ class TriangulateConfig:
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
         num_points: About how many vertices to spread over the visible side.
+        fill: Put vertices on a smooth surface where the cloud has none.
     """
 
     reference: str = ""
     num_points: Annotated[int, Range(least=4, most=1_000_000)] = 250  # the largest clouds
+    fill: bool = True
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -96,9 +101,19 @@ class Triangulate(Stage):
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
         quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
-        chosen = spread_to_count(pixels, quality, config.num_points)
-        vertices, source = points[chosen], index[chosen]
+        edge_px = _edge_for(config.num_points, pixels)
+        if config.fill:  # filled vertices count too: do not crowd where points are dense
+            chosen = spread(pixels, quality, 0.7 * edge_px)
+        else:
+            chosen = spread_to_count(pixels, quality, config.num_points)
+        vertices = points[chosen]
+        source = index[chosen]
         faces = self._facets(vertices, scene.views, cameras, reference)
+        if config.fill:
+            filled = self._filled(vertices, faces, points, cameras, reference, edge_px)
+            vertices = torch.cat([vertices, filled])
+            source = torch.cat([source, torch.full_like(source[:1], -1).expand(len(filled))])
+            faces = self._facets(vertices, scene.views, cameras, reference)
         connected = largest_component(faces)
         lost = len(faces) - len(connected)
         leave_out("triangulate.pieces", lost, total=len(faces))
@@ -172,6 +187,26 @@ class Triangulate(Stage):
         seen = observed[index, reference].to(quality)
         return index, quality + 3 * seen
 
+    def _filled(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        points: Float[Tensor, "point 3"],
+        cameras: Cameras,
+        reference: int,
+        edge_px: float,
+    ) -> Float[Tensor, "filled 3"]:
+        """Return new vertices between far-apart ones, on a spline through all reliable points."""
+        pixels, _ = _project(vertices, cameras, reference)
+        wanted = fill_pixels(pixels, faces, edge_px)
+        known, depth = _project(points, cameras, reference)
+        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, _SMOOTHING)
+        possible = inverse > 0.5 / depth.amax()
+        rays = rays_through(
+            wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
+        )
+        return cameras.centers_world[reference] + rays / inverse[possible, None]
+
     def _facets(
         self,
         vertices: Float[Tensor, "vertex 3"],
@@ -201,20 +236,6 @@ class Triangulate(Stage):
         thin = _altitude(pixels[faces]) < _MIN_ALTITUDE
         spikes = _sharp(pixels[faces], _MIN_TIP_DEG)
         return peel(faces, (shown < _MIN_COVERAGE) | thin, spikes)
-
-
-def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
-    """Triangulate points of an image, so that faces show their front to its camera.
-
-    v points down and z into the scene, so that a triangle which runs clockwise on the
-    screen runs counter-clockwise round the normal that points at the camera.
-    """
-    simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
-    faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
-    a, b, c = pixels[faces].unbind(dim=1)
-    ab, ac = b - a, c - a
-    rotated = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
-    return torch.where(rotated[:, None], faces.flip(1), faces)
 
 
 def peel(
@@ -254,6 +275,15 @@ def _project(
     points: Float[Tensor, "point 3"], cameras: Cameras, view: int
 ) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"]]:
     return project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+
+
+def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
+    """Return the edge of the triangular grid that puts ``num_points`` on the hull's area."""
+    faces = delaunay(pixels)
+    a, b, c = pixels[faces].unbind(dim=1)
+    ab, ac = b - a, c - a
+    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs().sum() / 2
+    return float((area / num_points * 2 / 3**0.5).sqrt())
 
 
 def _shown(

@@ -1,14 +1,15 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_pairs, half_edges
+from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.triangulate import (
     Triangulate,
     TriangulateConfig,
-    delaunay,
     largest_component,
     peel,
 )
@@ -35,6 +36,29 @@ def test_the_mesh_has_no_hole(dome_cloud):
     euler = len(torch.unique(faces)) - len(unique) + len(faces)
     assert counts.max() == 2
     assert euler == 1  # a disc
+
+
+def test_regions_without_points_are_filled_smoothly(dome_cloud):
+    cap = dome_cloud.points_world[:, :2].norm(dim=1) < 0.45
+    kept = (~cap).nonzero()[:, 0]
+    place = torch.full((len(cap),), -1).scatter(0, kept, torch.arange(len(kept)))
+    seen = ~cap[dome_cloud.observation_point]
+    bald = dome_cloud.replace(
+        points_world=dome_cloud.points_world[kept],
+        reprojection_errors_px=dome_cloud.reprojection_errors_px[kept],
+        observation_point=place[dome_cloud.observation_point[seen]],
+        observation_view=dome_cloud.observation_view[seen],
+        observation_pixels=dome_cloud.observation_pixels[seen],
+    )
+    filled = Triangulate()(bald)
+    flat = Triangulate(TriangulateConfig(fill=False))(bald)
+    assert filled.is_point.logical_not().sum() > 10
+    assert flat.is_point.all()
+    new = filled.mesh.vertices_world[~filled.is_point]
+    # A flat surface over the bald cap would lie 1 - sqrt(1 - 0.45^2) = 0.107 under its top.
+    assert (new.norm(dim=-1) - 1).abs().max() < 0.03
+    centre = flat.mesh.vertices_world[flat.mesh.faces].mean(dim=1).norm(dim=-1)
+    assert centre.min() < 0.92
 
 
 def test_outliers_do_not_become_vertices(dome_cloud):
@@ -87,10 +111,11 @@ def test_bridges_over_a_depth_discontinuity_are_dropped(dome_cloud):
     step = dome_cloud.points_world.clone()
     # Flatten the ball to two levels with a cliff at x = 0 that no facet may span.
     step[:, 2] = torch.where(step[:, 0] < 0, 0.0, 1.0)
+    config = TriangulateConfig(fill=False)
     flat = dome_cloud.replace(
         points_world=step, reprojection_errors_px=torch.zeros_like(step[:, 0])
     )
-    coarse = Triangulate()(flat)
+    coarse = Triangulate(config)(flat)
     levels = coarse.mesh.vertices_world[coarse.mesh.faces][..., 2]
     assert (levels.amax(dim=1) - levels.amin(dim=1) < 0.5).all()
 
@@ -100,6 +125,24 @@ def test_faces_show_their_front_to_the_camera():
     faces = delaunay(pixels)
     points_cam = torch.cat([pixels, torch.full((4, 1), 30.0)], dim=1)
     assert (face_normals(points_cam, faces)[:, 2] < 0).all()
+
+
+def test_inverse_depth_of_a_plane_is_reproduced_exactly():
+    generator = torch.Generator().manual_seed(6)
+    known = 300 * torch.rand(80, 2, generator=generator, dtype=torch.float64)
+    wanted = 300 * torch.rand(20, 2, generator=generator, dtype=torch.float64)
+    slope = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
+    found = interpolate_inverse_depth(known, 0.2 + known @ slope, wanted, smoothing=0.0)
+    assert_close(found, 0.2 + wanted @ slope, atol=1e-9, rtol=0)
+
+
+def test_filled_pixels_keep_away_from_points_and_inside_the_faces():
+    known = torch.tensor([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0], [100.0, 100.0]]).double()
+    faces = delaunay(known)
+    all_filled = fill_pixels(known, faces, 12.0)
+    half = fill_pixels(known, faces[:1], 12.0)
+    assert torch.cdist(all_filled, known).min() > 0.8 * 12
+    assert 0.4 < len(half) / len(all_filled) < 0.6
 
 
 def test_components_are_connected_by_edges_only():

@@ -46,13 +46,15 @@ class SmoothedConfig:
     Attributes:
         num_vertices: How many the smooth mesh has if its facets are of one size; about twice
             as many with those of a sparse cloud. It is smooth: more would show nothing more.
-        fidelity: ``w`` of vertices: the larger, the closer the surface passes. On a sphere, a wavy
-            plane and rendered potatoes 1000 came nearer to the truth than 100, and 10000 hardly
-            nearer than 1000.
+        fidelity: ``w`` of vertices that are points of the cloud: the larger, the closer the
+            surface passes. On a sphere, a wavy plane and rendered potatoes 1000 came nearer
+            to the truth than 100, and 10000 hardly nearer than 1000.
+        filled_fidelity: ``w`` of vertices that were filled in between.
     """
 
     num_vertices: Annotated[int, Range(least=4, most=10_000_000)] = 20_000  # half a kilobyte each
     fidelity: Annotated[float, Range(above=0, most=1e12)] = 1000.0
+    filled_fidelity: Annotated[float, Range(least=0, most=1e12)] = 1000.0
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -73,17 +75,20 @@ class Smoothed(Stage):
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
         """Smooth the mesh; its vertices carry its own normals."""
         mesh = coarse.mesh
-        if len(mesh.faces) == 0:
+        used = torch.unique(mesh.faces)
+        fixed = coarse.is_point[used].any() or self.config.filled_fidelity > 0
+        if len(mesh.faces) == 0 or not fixed:
             raise ReconstructionError(
-                "the coarse mesh has 0 facets; at least one is needed. Relax the filters of "
-                "`triangulate`, or bring a mesh of your own."
+                f"the coarse mesh has {len(mesh.faces)} facets and "
+                f"{int(coarse.is_point[used].sum())} sparse points; at least one of each is "
+                "needed. Relax the filters of `triangulate`, or bring a mesh of your own."
             )
         area = face_normals(mesh.vertices_world, mesh.faces).norm(dim=-1).sum() / 2
         # A triangular subdivided mesh with edges s has a vertex on every sqrt(3)/2 s^2.
         spacing = (area / self.config.num_vertices * 2 / 3**0.5).sqrt()
         subdivision = subdivide(mesh.vertices_world, mesh.faces, spacing.expand(len(mesh.faces)))
-        weights = torch.full_like(mesh.vertices_world[:, 0], self.config.fidelity)
-        vertices = thin_plate(subdivision, mesh, weights)
+        weights = torch.where(coarse.is_point, self.config.fidelity, self.config.filled_fidelity)
+        vertices = thin_plate(subdivision, mesh, weights.to(mesh.vertices_world))
         return Estimate(
             mesh=Mesh(
                 vertices_world=vertices,

@@ -32,8 +32,8 @@ from pimper_torch.stage import Stage
 # height fields are not told apart.
 _FLAT = 3e-3
 
-# Vertices that are no points of the cloud, as those of a given mesh, are guesses.
-_GUESSED_VERTEX = 0.1
+# Vertices that were filled in between points of the cloud are guesses.
+_FILLED_VERTEX = 0.1
 
 # Solves within the first round, so that weights that depend on the answer settle; later
 # rounds begin nearer to it and take one less.
@@ -234,7 +234,7 @@ class Align(Stage):
         vertices, coarse = problem.vertices, problem.patches.coarse
         is_point = coarse.is_point[coarse.mesh.faces]
         certain = anchor_certainty(vertices.variance / problem.unit.square(), noise)
-        weight = torch.where(is_point, certain, _GUESSED_VERTEX) * vertices.known
+        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
         return pulls.replace(corner_weight=self.config.anchor * weight * moves[:, None])
 
     def _solve_round(

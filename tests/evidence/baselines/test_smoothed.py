@@ -62,6 +62,9 @@ def test_more_fidelity_passes_closer_to_the_points(photographed, bumps):
 
 def test_a_mesh_without_anything_to_hold_it_is_refused(photographed, sphere):
     _, scene, coarse = photographed(sphere)
+    loose = coarse.replace(is_point=torch.zeros_like(coarse.is_point))
+    with pytest.raises(ReconstructionError, match="0 sparse points"):
+        few(filled_fidelity=0.0)(scene, loose)
     empty = coarse.replace(mesh=coarse.mesh.replace(faces=coarse.mesh.faces[:0]))
     with pytest.raises(ReconstructionError, match="0 facets"):
         few()(scene, empty)
