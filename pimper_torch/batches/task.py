@@ -54,8 +54,6 @@ class Task:
         out: Folder of the object's result.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
-        mem_gb: Memory that a run takes.
-        threads: Of a run.
         token: Of this try.
         avoid: Workers on which earlier tries were lost.
     """
@@ -89,10 +87,7 @@ class Outcome:
             another worker may not; ``kept``, as the result was whole before; ``waiting`` where no
             try was begun.
         message: Why there is no result.
-        place: Worker or host.
         stage: That was under way at the end.
-        seconds: Of this try.
-        tries: So far.
     """
 
     name: str

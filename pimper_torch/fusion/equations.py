@@ -30,7 +30,6 @@ class Common(Record):
     together count for what they know.
 
     Attributes:
-        variance: Of the error.
         count: Of the neighbours that have it, for each vertex.
     """
 

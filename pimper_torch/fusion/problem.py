@@ -46,7 +46,6 @@ class Problem(Record):
         directions: Along which heights count.
         blend: What the patches know at the vertices; offsets have one vertex's information.
         points: Where the vertices are now, on the surface that the templates carry.
-        normals: Of that surface.
         edges: Of the subdivided mesh.
         lit: Edges that photometric normals at both ends tell the slope of.
         known: Vertices with a photometric normal.

@@ -51,7 +51,6 @@ class Cuts(Record):
     """The object in every view, as the view itself and as all together have it.
 
     Attributes:
-        masks: Each view's own cut.
         margins_px: Inside the projection of the hull, pixels of the working size.
         exposed: Fraction of each cut that shows a background for certain.
         held: Fraction of the object's points that each cut holds.
