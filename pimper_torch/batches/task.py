@@ -51,7 +51,6 @@ class Task:
 
     Attributes:
         arguments: Of ``pimper reconstruct``, with absolute paths.
-        out: Folder of the object's result.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
         token: Of this try.

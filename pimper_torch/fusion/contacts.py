@@ -40,7 +40,6 @@ class BaseSurface(Record):
 
     Attributes:
         points: Of the subdivided mesh's vertices now.
-        faces: Of the subdivided mesh.
         facet: Each vertex lies in.
         directions: ``d``, unit.
         reach: Points further off are not of this surface.

@@ -134,7 +134,6 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " v
     1 at least here, and all others of 1 at most.
 
     Args:
-        fused: The solve without common errors.
         kinds: The same terms, in order; only information and correlation may differ.
         start: Heights that vertices keep without other terms.
 

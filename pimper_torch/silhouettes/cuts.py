@@ -54,7 +54,6 @@ class Cuts(Record):
         margins_px: Inside the projection of the hull, pixels of the working size.
         exposed: Fraction of each cut that shows a background for certain.
         held: Fraction of the object's points that each cut holds.
-        on_plane: Whether the object stands on a plane.
         doubted: Views whose soft mask was not used.
     """
 

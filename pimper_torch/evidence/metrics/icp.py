@@ -28,6 +28,8 @@ class IcpConfig:
         trimmed_fraction: Fraction of the estimate's samples, those farthest from the truth, that
             each step leaves out. It must cover outliers and whatever the truth lacks; what
             the estimate lacks needs none, for only its own samples look for partners.
+        samples: Of the estimate.
+        iterations: At most.
         tolerance: Stop when a step moves the samples by less than this fraction of their
             spread.
     """
