@@ -111,9 +111,7 @@ def runs_at_once(gigabytes: Sequence[float]) -> int:
 
 def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
     """Return the megapixels of all photographs by the size of the first, and their number."""
-    files = (
-        [path for path in sorted(photos.rglob("*")) if path.is_file()] if photos.is_dir() else []
-    )
+    files = [path for path in sorted(photos.rglob("*")) if path.is_file()]
     for path in files:
         try:
             with Image.open(path) as image:

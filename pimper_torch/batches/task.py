@@ -105,14 +105,9 @@ def carry_out(task: Task, place: str = "") -> Outcome:
         place: Name of the worker; the host's unless given.
     """
     began, place = time.monotonic(), place or node()
-    told = _result(task, place, began + task.limit_s)
-    return Outcome(
-        name=task.name,
-        status=told[0],
-        message=told[1],
-        place=place,
-        seconds=time.monotonic() - began,
-    )
+    status, message = _result(task, place, began + task.limit_s)
+    seconds = time.monotonic() - began
+    return Outcome(name=task.name, status=status, message=message, place=place, seconds=seconds)
 
 
 def is_whole(task: Task) -> bool:
