@@ -23,7 +23,6 @@ def read_npy(path: Path | str) -> np.ndarray:
 
     Raises:
         ValueError: It is none, is larger than its file or than 512 MB, or is cut short: says which.
-        OSError: Of the system.
     """
     path = Path(path)
     size = path.stat().st_size
@@ -41,7 +40,6 @@ def read_npz(
 
     Raises:
         ValueError: As :func:`read_npy`, and for what is no such archive.
-        OSError: Of the system.
     """
     try:
         with zipfile.ZipFile(path) as archive:

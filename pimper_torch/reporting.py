@@ -69,7 +69,6 @@ class _Recording:
     """The reports of a call, and who hears of them.
 
     Attributes:
-        reports: Of the stages that ended.
         open: When the stages began that are under way.
         aside: Seconds by line of what no stage does.
     """

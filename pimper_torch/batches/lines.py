@@ -59,9 +59,6 @@ class Lines:
     """Shows a line for every object that runs, and one that stays for each that ended.
 
     Where the output is no terminal, only the latter.
-
-    Args:
-        shown: Whether anything is to be shown.
     """
 
     def __init__(self, shown: bool) -> None:

@@ -26,7 +26,6 @@ class Object:
 
     Attributes:
         name: Of its folder in the folder of the batch.
-        photos: Folder of photographs.
         settings: Options of ``pimper reconstruct`` with their values, as on its command line.
         where: Place in a list, for messages.
     """

@@ -50,7 +50,6 @@ def planned_batch(
     """Check every object as ``pimper reconstruct`` would, and estimate what it takes.
 
     Args:
-        out: Folder of the batch.
         settings: Options of ``pimper reconstruct`` for every object; its own come after them.
         limit_s: Seconds that a try may take; by the estimate unless given.
         mem_gb: Memory that a run takes; the estimate unless given.
@@ -102,11 +101,7 @@ def planned_batch(
 
 
 def runs_at_once(gigabytes: Sequence[float]) -> int:
-    """Return how many runs fit the free memory and the cores of this machine, whichever they are.
-
-    Args:
-        gigabytes: Of each run.
-    """
+    """Return how many runs fit the free memory and the cores of this machine."""
     with absent():
         from pimper_torch.doctor.machine import available_gb
     most = available_gb()
@@ -116,9 +111,7 @@ def runs_at_once(gigabytes: Sequence[float]) -> int:
 
 def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
     """Return the megapixels of all photographs by the size of the first, and their number."""
-    files = (
-        [path for path in sorted(photos.rglob("*")) if path.is_file()] if photos.is_dir() else []
-    )
+    files = [path for path in sorted(photos.rglob("*")) if path.is_file()]
     for path in files:
         try:
             with Image.open(path) as image:

@@ -80,12 +80,10 @@ def batch(
         executor: What carries out the tasks; by default processes of this machine.
         settings: Options of ``pimper reconstruct`` for every object.
         overwrite: Replace results of other settings or files.
-        jobs: Objects at once.
         tries: How often an object is begun whose worker is lost.
         time_limit_min: Minutes that a try may take; ten times the estimate unless given, an hour at
             least.
         mem_gb: Memory that a run takes; an estimate unless given.
-        cpus_per_task: Threads of a run.
 
     Returns:
         How each object ended, in their order.

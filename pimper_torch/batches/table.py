@@ -32,11 +32,7 @@ img {{ width: 240px }} .failed, .lost {{ color: #b00 }}
 def rows_of(
     outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]
 ) -> list[dict[str, object]]:
-    """Return a row an object, by its columns: how it ended, and figures of its result.
-
-    Args:
-        photos: Folder of each object's photographs.
-    """
+    """Return a row an object, by its columns: how it ended, and figures of its result."""
     rows = []
     for one in outcomes:
         row: dict[str, object] = {}

@@ -51,11 +51,8 @@ class Task:
 
     Attributes:
         arguments: Of ``pimper reconstruct``, with absolute paths.
-        out: Folder of the object's result.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
-        mem_gb: Memory that a run takes.
-        threads: Of a run.
         token: Of this try.
         avoid: Workers on which earlier tries were lost.
     """
@@ -89,10 +86,7 @@ class Outcome:
             another worker may not; ``kept``, as the result was whole before; ``waiting`` where no
             try was begun.
         message: Why there is no result.
-        place: Worker or host.
         stage: That was under way at the end.
-        seconds: Of this try.
-        tries: So far.
     """
 
     name: str
@@ -111,14 +105,9 @@ def carry_out(task: Task, place: str = "") -> Outcome:
         place: Name of the worker; the host's unless given.
     """
     began, place = time.monotonic(), place or node()
-    told = _result(task, place, began + task.limit_s)
-    return Outcome(
-        name=task.name,
-        status=told[0],
-        message=told[1],
-        place=place,
-        seconds=time.monotonic() - began,
-    )
+    status, message = _result(task, place, began + task.limit_s)
+    seconds = time.monotonic() - began
+    return Outcome(name=task.name, status=status, message=message, place=place, seconds=seconds)
 
 
 def is_whole(task: Task) -> bool:

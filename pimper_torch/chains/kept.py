@@ -36,7 +36,6 @@ def kept_call(
 
     Args:
         store: Where records are; without, it is called.
-        call: The stage, or a function.
         derived: What it is called with by name, which follows from the inputs.
         settings: What else the record depends on.
     """

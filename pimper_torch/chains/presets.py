@@ -46,7 +46,6 @@ def make_chain(
     """Make the chain that settings are for.
 
     Args:
-        config: Of one of the chains.
         observer: Hears how a run is going.
         cache: Folder that keeps the record of every stage; nothing is kept without.
         stages: Modules in place of the chain's own, by the names of its attributes.

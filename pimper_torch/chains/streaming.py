@@ -59,12 +59,7 @@ class Prepares(Protocol):
 
 @dataclass(slots=True)
 class Prepared:
-    """Photographs as a warp prepares them, when they are first needed; not at all by some.
-
-    Attributes:
-        warp: Whose they are.
-        views: The photographs.
-    """
+    """Photographs as a warp prepares them, when they are first needed; not at all by some."""
 
     warp: "Warping"
     views: Views

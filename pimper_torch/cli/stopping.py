@@ -23,7 +23,6 @@ class Stopped(KeyboardInterrupt):
     """The process was told to stop.
 
     Attributes:
-        number: Of the signal.
         left: What is there now, for the message.
     """
 

@@ -41,10 +41,6 @@ def planned(
     Compilation, next to nothing but for an installation's first run, is none of them. Stages that
     look at photographs grow with all pixels, those on the surface with the pixels of one, in the
     scale's square.
-
-    Args:
-        cameras: Whether they are given.
-        masks: Whether they are given.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
     found = 1.2 * megapixels + 0.05 * pairs

@@ -37,7 +37,6 @@ def light_variation(
 
     Args:
         first: Radiance at the features of one photograph.
-        second: At those of the other.
         pixels: Where they are in the first.
 
     Returns:

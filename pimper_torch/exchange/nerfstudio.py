@@ -33,7 +33,6 @@ def write_transforms(
     Args:
         views: Undistorted.
         points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
-        albedo: Its colours, linear.
 
     Raises:
         InputError: A camera has a skew, which the format cannot represent.

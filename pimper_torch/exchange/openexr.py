@@ -61,7 +61,6 @@ def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
 
     Raises:
         ValueError: Says what the file is, or holds, that is not read.
-        OSError: Of the system.
     """
     data = Path(path).read_bytes()
     try:

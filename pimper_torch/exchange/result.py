@@ -145,11 +145,7 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
 def _silhouettes(
     folder: Path, views: Views, summary: Mapping[str, object], *, given: bool
 ) -> Silhouettes:
-    """Read the masks that were written; views whose silhouette was doubted stay so.
-
-    Args:
-        given: Photographs have masks of their own.
-    """
+    """Read the masks that were written; views whose silhouette was doubted stay so."""
     if not (folder / "masks").is_dir():
         return Silhouettes.everything(views)
     inside = torch.zeros_like(views.images[:, 0])

@@ -361,12 +361,11 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     total, seen = _sum_at(vertex, weight, count), _sum_at(vertex, seen_weight, count)
     supported = total > _MIN_WEIGHT
     per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
+    by = weight[:, None]
     certain, normals = _split(_sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
-    swept, offsets = _split(_sum_at(vertex, weight[:, None] * estimates.offset, count))
-    guessed, prior_normals = _split(
-        _sum_at(vertex, weight[:, None] * estimates.prior_normal, count)
-    )
-    told, prior_offsets = _split(_sum_at(vertex, weight[:, None] * estimates.prior_offset, count))
+    swept, offsets = _split(_sum_at(vertex, by * estimates.offset, count))
+    guessed, prior_normals = _split(_sum_at(vertex, by * estimates.prior_normal, count))
+    told, prior_offsets = _split(_sum_at(vertex, by * estimates.prior_offset, count))
     photometric = (seen > _MIN_WEIGHT) & (certain > 0)
     colours = _sum_at(vertex, weight[:, None] * estimates.albedo, count)
     observed = colours[:, 0] > _MIN_WEIGHT

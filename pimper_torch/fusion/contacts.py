@@ -26,7 +26,6 @@ class Contacts(Record):
         points: World.
         lines: Along which they are known, unit.
         variance: Of where they are along these; scene units squared.
-        facet: Nearest to each.
     """
 
     points: Float[Tensor, "point 3"]
@@ -41,9 +40,7 @@ class BaseSurface(Record):
 
     Attributes:
         points: Of the subdivided mesh's vertices now.
-        faces: Of the subdivided mesh.
         facet: Each vertex lies in.
-        heights: Of the vertices now.
         directions: ``d``, unit.
         reach: Points further off are not of this surface.
         finest: Least standard error of a point, as the surface is flat between its vertices.
@@ -103,9 +100,6 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
 
 def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equations:
     """State that the surface passes through points.
-
-    Args:
-        caster: Of rays on the surface.
 
     Differentiable; which face is nearest is constant.
     """

@@ -30,7 +30,6 @@ class Common(Record):
     together count for what they know.
 
     Attributes:
-        variance: Of the error.
         count: Of the neighbours that have it, for each vertex.
     """
 
@@ -44,7 +43,6 @@ class Equations(Record):
 
     Attributes:
         unknowns: Vertices that each equation ties together.
-        coefficients: Of their heights.
         targets: What these should add up to.
         information: Inverse variance of the target, as its source claims, or what is left of it
             where neighbours have a common error: together they must not count for more.

@@ -52,7 +52,6 @@ class Fused(Record):
     Attributes:
         heights: Of all vertices, float64.
         factors: What the variances that each kind claims were multiplied by.
-        kinds: Of terms.
         weights: Of every equation of each kind; outliers have less than 1.
         damping: Information of the heights that vertices start at.
     """
@@ -83,7 +82,6 @@ def fuse_terms(
     Args:
         kinds: Of terms; those without equations are skipped.
         start: Heights that vertices keep without other terms.
-        damping: Information of these.
         factors: Of the noise, where they are known.
 
     Differentiable in targets, coefficients, information, damping and start, through the weights and
@@ -136,7 +134,6 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " v
     1 at least here, and all others of 1 at most.
 
     Args:
-        fused: The solve without common errors.
         kinds: The same terms, in order; only information and correlation may differ.
         start: Heights that vertices keep without other terms.
 

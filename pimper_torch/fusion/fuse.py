@@ -95,7 +95,6 @@ class _Shared(Record):
         tilt: Of the normals of each facet; ``None`` if no position tells it.
         tilt_variance: Of what remains of it in the normals that it was added to.
         terms: With the variance of the errors that a facet's positions have in common.
-        coarse: The coarser subdivided mesh.
     """
 
     tilt: NormalBias | None

@@ -33,7 +33,6 @@ class NormalBias(Record):
     Attributes:
         tilt: To be added to the normals; world.
         count: Vertices with normals.
-        known: Where there are any.
     """
 
     tilt: Float[Tensor, "facet 3"]

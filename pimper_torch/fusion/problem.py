@@ -41,13 +41,9 @@ class Problem(Record):
     """Heights of the vertices of a subdivided mesh, which are unknown, and what patches know.
 
     Attributes:
-        subdivision: The facets, subdivided.
-        facets: The coarse mesh's faces.
         directions: Along which heights count.
         blend: What the patches know at the vertices; offsets have one vertex's information.
         points: Where the vertices are now, on the surface that the templates carry.
-        normals: Of that surface.
-        edges: Of the subdivided mesh.
         lit: Edges that photometric normals at both ends tell the slope of.
         known: Vertices with a photometric normal.
         sloped: Edges that terms tell the slope of.
@@ -146,7 +142,6 @@ def pose(
     Args:
         swept: Photometry and swept heights of all patches.
         samples_per_vertex: Template samples between neighbouring vertices.
-        slopes: Whether photometric normals take part.
         block: Of a mesh that is laid already; without, one is laid over all facets.
     """
     patches = swept.patches

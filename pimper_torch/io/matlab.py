@@ -50,7 +50,6 @@ def read_variables(
 
     Raises:
         ValueError: It is no such file, is cut short, or unpacks to more than 512 MB: says which.
-        OSError: Of the system.
     """
     data = Path(path).read_bytes()
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):

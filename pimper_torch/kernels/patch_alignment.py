@@ -35,7 +35,6 @@ def align(
 
     Args:
         homographies: From steps of the plane to pixels, one a point.
-        chosen: The template of each point.
         values: Of the templates, light taken out.
         offsets: Steps of the plane, homogeneous, one column a sample.
         light: Basis of changes of light, orthonormal columns.

@@ -48,7 +48,6 @@ def register(
         finest: Images, one in a row.
         unusable_finest: Fraction of every pixel that is unusable, in 255ths.
         levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
-        rows: Of each view's image.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         outward: Unit normals, patch frame.

@@ -168,7 +168,6 @@ def costs(
     Args:
         finest: Gray images, one in a row.
         levels: Height, width and offset of every level.
-        rows: Of each view's image.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
         outward: Unit, along which a sample is swept; patch frame.

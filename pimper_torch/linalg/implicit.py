@@ -74,7 +74,6 @@ def newton_solution(
     """Refine a solution to rounding by Newton's method with the exact derivative.
 
     Args:
-        equations: That vanish at the solution.
         start: Near it. Returned if no step reduces the equations' norm.
         precondition: See :func:`implicit_solution`.
 

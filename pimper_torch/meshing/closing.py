@@ -25,7 +25,6 @@ class Closed(Record):
     Attributes:
         mesh: The former faces first, in their order.
         measured: Faces that were there; the others are caps.
-        borders: How many were closed.
     """
 
     mesh: Mesh

@@ -155,7 +155,6 @@ def put_in_place(target: Path) -> None:
 
     Raises:
         OutputError: Files that we did not write are there; nothing is changed then.
-        OSError: The disk refuses.
     """
     stages = target / STAGES
     new = stages / NEW

@@ -54,7 +54,6 @@ def seal(folder: Path, kind: Kind) -> None:
     """Bring a folder's files to the disk, and list them in its marker.
 
     Raises:
-        OSError: The disk refuses.
         OutputError: The list cannot be written.
     """
     files = {}

@@ -28,7 +28,6 @@ def merged(
     Args:
         guesses: Maps, and what was looked up in them.
         hidden: Where a surface occludes a sample in a view.
-        lights: Of all views.
 
     Differentiable in the maps and lights.
     """
@@ -90,7 +89,6 @@ def _scattered(
     Args:
         information: Sum of those of single guesses.
         scatter: Sum of their squared differences from the mean, times their information.
-        count: Guesses.
 
     Source: Birge, The calculation of errors by the method of least squares, 1932.
     """

@@ -108,7 +108,6 @@ class PriorMaps(Record):
     """Guessed maps of some views, at several sizes.
 
     Attributes:
-        view: That each map is of.
         zoom: Width and height of each map over those of its photograph.
         sizes_px: Width and height of each map.
         kind: Of the prior.

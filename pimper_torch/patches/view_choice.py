@@ -79,7 +79,6 @@ def view_weights(
     Args:
         normals: Twice as long as the facet's area.
         spacing: Of samples, scene units.
-        caster: Of the surface that hides facets.
 
     Returns:
         0 where the facet is turned away, out of the frame, or its centre hidden.

@@ -55,7 +55,6 @@ class Bilinear(Record):
     Attributes:
         radiance: ``J``, zero where missing.
         weight: ``D``: how much each entry counts; 0 where missing.
-        lights: Where the lights start.
         anchor: What the lights are pulled to.
         shading: Where ``N`` starts, columns on the manifold.
         regularization: ``c_f`` per view.
@@ -93,7 +92,6 @@ class Factors(Record):
         lights: ``L``.
         shading: ``N``, columns on the manifold.
         weight: ``D`` times the final robust weights.
-        convergence: Of each patch.
     """
 
     lights: Float[Tensor, "patch view rank"]

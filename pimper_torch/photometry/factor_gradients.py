@@ -99,8 +99,6 @@ class Hessian(Record):
     """Half the second derivatives of the objective, constant, samples eliminated.
 
     Attributes:
-        lights: Where it is evaluated.
-        shading: Where it is evaluated.
         columns: The manifold's tangents there.
         loss_curvature: The loss's second derivative at each entry, weighted.
         weighted_residual: Of each entry.

@@ -176,7 +176,6 @@ class Illumination(Record):
     """The light of all views, and the surface that casts shadows.
 
     Attributes:
-        field: Light of all views.
         caster: Of rays on the surface; ``None`` if cast shadows are not predicted.
         guess_variance: Of what guessed normals differ from the surface's beyond what both claim,
             squared radians; 0 where they suit the photographs better.

@@ -46,9 +46,6 @@ class LearnedPrior(FactorPrior):
     what the network takes as diffuse, and the tangents of lights and halfway vectors, weighed by
     the network.
 
-    Args:
-        width: Of the layers.
-
     Differentiable in parameters and samples.
     """
 

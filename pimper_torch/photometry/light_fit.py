@@ -58,7 +58,6 @@ def fit_lights(
     Where gradients are required, it iterates to convergence: see :func:`with_gradients`.
 
     Args:
-        model: At the samples.
         iterations: At most, where no gradients are required.
         start: Lights and albedo; by default, see :meth:`LightModel.initialize`.
     """

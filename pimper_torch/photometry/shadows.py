@@ -114,7 +114,6 @@ def cast_shadows_on_rasters(
         spacing: Of the samples, scene units.
         tolerance: Scene units.
         guard: Scene units.
-        stride: Samples between rays.
         mask: Where rays are cast; elsewhere everything is lit and sure.
         seen: In which views rays are cast, sample by sample.
 

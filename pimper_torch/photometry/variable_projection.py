@@ -115,8 +115,6 @@ def curvature_of_lights(
 
     Args:
         problem: Gives manifold, regularization and prior.
-        lights: Where to linearize.
-        shading: The minimum for the lights.
         samples: Sum over about so many, evenly spaced, in place of all.
     """
     rank = lights.shape[2]

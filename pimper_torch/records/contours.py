@@ -13,7 +13,6 @@ class ContourRays(Record):
     """Rays through the silhouettes of the object, to which its surface is tangent.
 
     Attributes:
-        view: The view each ray belongs to.
         pixels: Where the silhouette is, to a fraction of a pixel.
         rays_world: Directions, as long as the ray goes while its depth grows by 1.
         normals_world: Outward unit normal of the surface where it touches the ray: across the

@@ -30,7 +30,6 @@ class MapPrior(Record):
     """Guessed maps of some photographs.
 
     Attributes:
-        names: Of the photographs.
         sizes_px: Width and height of each map inside the raster.
         undistorted: Whether the maps are of the photographs that structure from motion has
             undistorted, or of the original ones.
@@ -165,7 +164,6 @@ class LightPrior(Record):
         lights: First-order harmonics ``l``, radiance = albedo * l . (1, n), up to one factor that
             all photographs share, which is fitted.
         variance: Mean square error over the square of the length of ``l``.
-        names: Of the photographs.
         frame: Of the harmonics: each photograph's camera, or the scene's world.
     """
 

@@ -36,8 +36,6 @@ class Relighting(Record):
 
     Attributes:
         lights: Of the photographs that the surface was made from.
-        judged: With materials.
-        matte: Without any.
         held_out: Whether these photographs were held out, or the surface was made from them.
         textured: With materials, and the asset's textures in place of values of vertices.
     """

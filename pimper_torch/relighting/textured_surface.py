@@ -31,11 +31,7 @@ class TexturedSurface(LitSurface):
         return normals, linear_from_srgb(_sampled(asset.base_color, uv))
 
     def materials(self, few: Materials) -> Materials:
-        """Return the materials of the copied vertices.
-
-        Args:
-            few: Of the mesh that was laid out.
-        """
+        """Return the materials of the copied vertices."""
         return few.replace(cluster=few.cluster[self.asset.vertex])
 
 

@@ -19,7 +19,6 @@ class SparseModel(Record):
     """Observations views and the cloud that ties them together, in float64 on the CPU.
 
     Attributes:
-        names: Of the registered photographs.
         lenses: One a view, before undistortion.
         observation_pixels: Where, in the photograph before undistortion.
         background_from_view: Maps from pixels of each photograph, before undistortion, to those

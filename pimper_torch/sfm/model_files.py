@@ -71,7 +71,6 @@ class FilePoints:
 
     Attributes:
         track_point: Position in ``points`` of what each element of a track belongs to.
-        track_image: Number of the image of each element.
         track_feature: Position among the features of that image.
     """
 

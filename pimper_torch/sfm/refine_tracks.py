@@ -56,7 +56,6 @@ def refine_tracks(
     Rounds before the last find a part of the points, for cameras alone.
 
     Args:
-        iterations: Rounds.
         cameras: Whether cameras and lenses are adjusted, too. Held fixed, one round is enough.
 
     Returns:

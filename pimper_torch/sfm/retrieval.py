@@ -56,7 +56,6 @@ def global_descriptors(
 
     Args:
         descriptors: Of the features of a photograph, by its number.
-        count: Photographs.
     """
     each = -(-_LEARNED // count)
     learned = torch.cat([_some(descriptors(number), each) for number in range(count)])

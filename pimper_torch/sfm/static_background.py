@@ -191,7 +191,6 @@ def fundamental_matrix(
 
     Args:
         first: Pixels, 8 or more.
-        weight: Of the squared residuals.
 
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """

@@ -79,7 +79,6 @@ class Pictures(Record):
     """What patches are looked up in.
 
     Attributes:
-        log: Of the gray radiance.
         unusable: 1 where a pixel cannot be used.
     """
 

@@ -38,8 +38,6 @@ class Cues(Record):
         plane: That the object stands on.
         background_from_view: Maps to a room at rest before which the object turns; empty without.
         agreement: With the texture of plane and room, the better of both.
-        fixation: Where the cameras look.
-        box_world: The object is inside.
         soft: Masks that the photographs come with as priors.
     """
 

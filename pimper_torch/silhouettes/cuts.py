@@ -51,11 +51,9 @@ class Cuts(Record):
     """The object in every view, as the view itself and as all together have it.
 
     Attributes:
-        masks: Each view's own cut.
         margins_px: Inside the projection of the hull, pixels of the working size.
         exposed: Fraction of each cut that shows a background for certain.
         held: Fraction of the object's points that each cut holds.
-        on_plane: Whether the object stands on a plane.
         doubted: Views whose soft mask was not used.
     """
 

@@ -44,7 +44,6 @@ class Raster(Record):
     Attributes:
         pixels_from_raster: From homogeneous pixels of the raster to those of each view; NaN for a
             view that does not see the background.
-        size_px: Samples each way.
     """
 
     pixels_from_raster: Float[Tensor, "view 3 3"]

@@ -14,7 +14,6 @@ from pimper_torch.records import Record
 # Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
 # 10^8. Of DICT_4X4_50, with its 2^16, it would be 3 in 10^3.
 _FAMILY = cv2.aruco.DICT_APRILTAG_36h11
-_CODES = 587
 
 CELLS = 8
 """Cells along a marker's side, with its black border."""

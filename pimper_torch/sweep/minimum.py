@@ -12,7 +12,6 @@ def parabola_minimum(
     """Fit a parabola to the least cost and the two beside it.
 
     Args:
-        cost: Of each hypothesis.
         prior: Added to the costs for the choice of the least one alone.
 
     Returns:

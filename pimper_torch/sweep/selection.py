@@ -33,7 +33,6 @@ def poses_first(
 
     Args:
         score: In [0, 1].
-        poses: Number of each view's pose.
 
     Returns:
         The score, less the number of better views of the same pose.

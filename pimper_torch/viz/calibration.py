@@ -19,7 +19,6 @@ def draw_calibration(
     """Draw the calibration curve on logarithmic axes, and the diagonal that is right.
 
     Args:
-        root_mean_square: Of their true errors.
         robust: The same, blind to outliers.
         path: PNG file.
     """

@@ -35,7 +35,6 @@ def method_panels(
     Args:
         mesh: In the frame of the truth.
         met: Where the rays of the reference view meet it; ``None`` if none does.
-        heatmap: Where the errors are drawn, as PNG.
     """
     truth = inputs.maps
     if met is None or truth.cameras is None:

@@ -21,7 +21,6 @@ class Column:
     """How one figure is shown.
 
     Attributes:
-        heading: With the unit.
         value: Takes the figure out of a row.
         decimals: The same for all rows, so that points stand under one another.
     """

@@ -39,7 +39,6 @@ def read_meshroom(
         images: Folder of the photographs, which are looked up by file name: the paths in the
             file are those of the machine that wrote it. By default ``images`` beside the file,
             or the file's own folder.
-        masks: Folder of masks, if there are any.
         options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`.
 
     Raises:
@@ -72,7 +71,6 @@ def read_metashape(
         folder: With one ``.xml`` file; or the file itself.
         images: Folder of the photographs, which are called as the cameras are labelled, with
             or without suffix; by default as of :func:`read_meshroom`.
-        masks: Folder of masks, if there are any.
         options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. Names are
             those of files.
 

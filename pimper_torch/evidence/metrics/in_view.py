@@ -63,7 +63,6 @@ class TrueMaps(Record):
     Attributes:
         depth: Along z; infinite where nothing is known.
         normals_world: Unit; zero where nothing is known.
-        where: True on the object.
     """
 
     depth: Float[Tensor, "height width"]

@@ -23,7 +23,6 @@ class Row:
 
     Attributes:
         name: Of the convention, as in the JSON.
-        value: With its unit.
         meaning: What it says, and over what.
     """
 

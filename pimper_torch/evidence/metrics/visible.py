@@ -25,7 +25,6 @@ def count_seeing(
     once, however many lights they were taken under.
 
     Args:
-        capture: Cameras, and what hides.
         diagonal: Of the object's bounding box, scene units.
 
     Returns:

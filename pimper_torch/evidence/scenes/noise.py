@@ -47,7 +47,6 @@ def random_waves(
 
     Args:
         wavelength: Scene units; drawn between 0.7 and 1.4 of this.
-        root_mean_square: Of the function's values.
         axes: 3 in space, 2 over a plane.
         num_waves: More look more random and take longer.
     """

@@ -15,7 +15,6 @@ class RenderedScene(Record):
     Per-view maps hold what the ray through each pixel's centre meets first.
 
     Attributes:
-        views: The photographs, linear radiance.
         lights_world: First-order light ``l`` at the object: radiance is
             albedo * l . (1, n). Exact for closed-form scenes; for ray-traced ones the
             light at the target, without fall-off, shadows and highlights.

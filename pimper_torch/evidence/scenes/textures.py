@@ -55,12 +55,7 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Painted:
-    """One texture with another on top of it in some places.
-
-    Attributes:
-        base: Underneath.
-        paint: On top.
-    """
+    """One texture with another on top of it in some places."""
 
     base: Texture
     paint: Texture

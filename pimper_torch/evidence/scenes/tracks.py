@@ -30,7 +30,6 @@ def true_model(
     Args:
         surface: Where the points lie; it has an albedo.
         blockers: Everything that may stand in front of them.
-        cameras: Exact.
         num_points: At most; fewer where less of the surface is seen.
         min_views: Views that see a point at least, or all there are.
 

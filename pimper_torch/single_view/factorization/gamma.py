@@ -85,8 +85,6 @@ class GammaEstimate(Record):
             at an end of the range, or residuals exceed a camera's noise, so that first-order
             light does not fit under any gamma.
         residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
-        residual_linear: The same for a linear response.
-        residual_srgb: The same for sRGB.
     """
 
     gamma: float

@@ -25,7 +25,6 @@ class Restarted(Record):
 
     Attributes:
         best: A batch of one, rows as views and columns as samples.
-        residuals: Of all starts, in their order.
         repeated: Whether ``repeats`` starts reached the best minimum; if not, there may well be a
             better one.
     """

@@ -39,7 +39,6 @@ class RasterSystem:
 
     Args:
         weight_right: Of the step from each pixel to the next in its row; not negative.
-        weight_down: Of the step to the row below.
         anchor: ``a``, of each pixel's known height; not negative. None for no anchors.
         method: ``"cholesky"``: exact, on the CPU; ``"multigrid"``: conjugate gradients, memory
             and time grow with the pixels only; ``"cosine"``: one division, for full rectangles

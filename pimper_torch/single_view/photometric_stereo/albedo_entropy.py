@@ -99,7 +99,6 @@ def albedo_entropy(
 
     Args:
         shading: Albedo times normal.
-        labels: Of the groups, from 0.
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """

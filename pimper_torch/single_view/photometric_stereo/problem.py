@@ -17,7 +17,6 @@ class Problem(Record):
         images: As given, those views that have samples.
         radiance: Linear; zero where missing.
         weight: 0 where missing.
-        mask: True at the pixels.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
     """
 
