@@ -14,8 +14,8 @@ from pimper_torch.photometry.left_out import left_out, predicts_better
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
 # Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
-# sensor's noise is most of its residuals. Views within this of the median are of one exposure: lamps
-# move and fall off. Choices.
+# sensor's noise is most of its residuals. Views that near to the median are of one exposure, as
+# lamps move and fall off. Choices.
 _MOST_STOPS, _SAME_STOPS = 3.0, 1.5
 
 # Solutions, with Cauchy's weights from the residuals before: a choice.
