@@ -126,7 +126,7 @@ def block_of(
     )
     held = corners_of(whole.faces, ~chosen, len(own))[vertex]
 
-    def on_border(values: Float[Tensor, " vertex"] | None) -> Float[Tensor, " vertex"]:
+    def on_border(values: Float[Tensor, " _"] | None) -> Float[Tensor, " _"]:
         found = torch.zeros(len(held), dtype=torch.float64, device=held.device)
         if values is None:
             return found
