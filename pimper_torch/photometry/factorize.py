@@ -231,8 +231,8 @@ class Factorize(Stage):
     Differentiable in the radiance and in the initial templates and normals: light field, lights
     and samples by the implicit function theorem at the optimum (see
     :mod:`~pimper_torch.photometry.factor_gradients`), to which Newton's method converges where
-    gradients are required. Which samples are valid is constant, and so are the lights of patches
-    that light does not determine.
+    gradients are required. Which samples are valid is constant, and so are colours and exposures
+    of views, and the lights of patches that light does not determine.
     """
 
     def __init__(
