@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
@@ -29,7 +29,7 @@ _ROTATION_DEG = 40.0
 _DIMMED = 0.45
 _ACROSS, _PANEL_PX = 4, 390
 _FACETS = "#ffd24a"
-_THUMBNAILS_ACROSS = 8
+_THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
 _MAX_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
 
 
@@ -39,8 +39,8 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PAN
     Shown in the reference view, cropped to the object: the photograph, the facets over it
     and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
     and that again from 40 degrees to the left and to the right. Where silhouettes are known they
-    are drawn over the photograph, and below over small photographs of all views, red where a
-    view is not trusted.
+    are drawn over the photograph, and below over small photographs of all views, or of 64 where
+    there are more, red where a view is not trusted.
 
     Args:
         path: Ends in ``.png``.
@@ -85,14 +85,27 @@ def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
 
 
 def _all_views(result: Reconstruction, width_px: int) -> Tile:
-    """Show all photographs with their silhouettes."""
+    """Show photographs with their silhouettes: of many a selection, those not trusted first."""
     silhouettes = result.silhouettes
-    small = thumbnails(
-        result.scene.views, silhouettes, width_px=width_px, across=_THUMBNAILS_ACROSS
-    )
+    shown = _selected(silhouettes.reliable.cpu())
+    views, chosen = result.scene.views.take(shown), silhouettes.take(shown)
+    small = thumbnails(views, chosen, width_px=width_px, across=_THUMBNAILS_ACROSS)
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
-    reliable = f"{int(silhouettes.reliable.sum())} of {len(silhouettes.reliable)} views trusted"
-    return Tile(title=f"{origin}, {reliable}", picture=array(small), wide=True)
+    count = len(silhouettes.reliable)
+    title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"
+    if len(shown) < count:
+        title += f", {len(shown)} shown"
+    return Tile(title=title, picture=array(small), wide=True)
+
+
+def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
+    """Return the views that are shown, in order: of those that are trusted evenly many."""
+    most = _THUMBNAILS_ACROSS * _THUMBNAILS_DOWN
+    doubted = (~reliable).nonzero()[:most, 0]
+    trusted = reliable.nonzero()[:, 0]
+    room = min(len(trusted), most - len(doubted))
+    even = torch.linspace(0, max(0, len(trusted) - 1), room).round().long()
+    return torch.cat([doubted, trusted[even]]).sort().values.tolist()
 
 
 def _framed(camera: Cameras, vertices: Float[Tensor, "vertex 3"], width_px: int) -> Cameras:

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Silhouettes
-from pimper_torch.viz.overview import draw_overview, headline, tiles
+from pimper_torch.viz.overview import _selected, draw_overview, headline, tiles
 
 
 def drawn(path):
@@ -91,6 +91,20 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
     yellow = (below[..., 0] > 200) & (below[..., 1] > 170) & (below[..., 2] < 130)
     assert red.sum() > 100
     assert yellow.sum() > 1.5 * red.sum()  # two views are trusted, one is not
+
+
+@pytest.mark.parametrize("count", [1, 64, 65, 300])
+def test_all_views_are_shown_and_of_many_a_selection_with_all_that_are_not_trusted(count):
+    reliable = torch.ones(count, dtype=torch.bool)
+    reliable[count // 2] = False
+    shown = _selected(reliable)
+    assert len(shown) == len(set(shown)) == min(count, 64)
+    assert shown == sorted(shown)
+    assert count // 2 in shown
+    assert shown[0] == 0
+    assert shown[-1] == count - 1
+    assert max((b - a for a, b in itertools.pairwise(shown)), default=1) <= -(-count // 62)
+    assert len(_selected(torch.zeros(count, dtype=torch.bool))) == min(count, 64)
 
 
 def test_names_that_the_font_has_no_glyphs_for_are_no_reason_to_warn(reconstruction, tmp_path):
