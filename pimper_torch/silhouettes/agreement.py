@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Record
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.opencv import blind_holes, components_of
@@ -52,14 +53,16 @@ class Agreement(Record):
 
 def agreement_of(cuts: Cuts) -> Agreement:
     """Compare the cuts with the projections."""
-    projections = cuts.margins_px > 0
-    both = (cuts.masks & projections).sum(dim=(1, 2)).double()
-    either = (cuts.masks | projections).sum(dim=(1, 2))
-    own = cuts.masks.sum(dim=(1, 2))
+
+    def areas(mask: Tensor, margin: Tensor) -> Tensor:
+        projection = margin > 0
+        return torch.stack([one.sum() for one in (mask, mask & projection, mask | projection)])
+
+    own, both, either = by_view(areas, cuts.masks, cuts.margins_px).double().unbind(dim=1)
     return Agreement(
         overlap=both / either.clamp_min(1),
         covered=both / own.clamp_min(1),
-        extent=own.double() / cuts.masks[0].numel(),
+        extent=own / cuts.masks[0].numel(),
         exposed=cuts.exposed,
         held=cuts.held,
     )
@@ -76,11 +79,11 @@ def repaired(cuts: Cuts) -> Cuts:
 
 def _without_holes(cuts: Cuts) -> Cuts:
     """Fill holes deep inside the projection, as a highlight makes them in a single view."""
-    pairs = zip(cuts.masks, cuts.margins_px, strict=True)
-    filled = [
-        mask | blind_holes(mask, ~is_deep(margin / _WELL), _SHALLOW) for mask, margin in pairs
-    ]
-    return cuts.replace(masks=torch.stack(filled))
+
+    def filled(mask: Tensor, margin: Tensor) -> Tensor:
+        return mask | blind_holes(mask, ~is_deep(margin / _WELL), _SHALLOW)
+
+    return cuts.replace(masks=by_view(filled, cuts.masks, cuts.margins_px))
 
 
 def _without_shadows(cuts: Cuts) -> Cuts:

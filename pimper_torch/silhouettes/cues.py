@@ -16,6 +16,7 @@ from pimper_torch.geometry.supporting_plane import (
     supporting_plane,
     well_tracked,
 )
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Record, SparseScene
 from pimper_torch.silhouettes.cloud import pixels_of, pixels_seen, split_cloud
 from pimper_torch.silhouettes.opencv import convex_hull_of
@@ -79,7 +80,8 @@ class Cues(Record):
         found = self._agreement(masks)
         if found is None or self.agreement is None:
             return self
-        return self.replace(agreement=torch.where(found.isnan(), self.agreement, found))
+        newest = by_view(lambda new, old: new.where(~new.isnan(), old), found, self.agreement)
+        return self.replace(agreement=newest)
 
     def without(
         self, doubted: Bool[Tensor, " view"]
@@ -123,8 +125,9 @@ class Cues(Record):
             found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
         if len(self.background_from_view):
             room = room_agreement(self.pictures, self.background_from_view, hidden)
-            found.append(room.masked_fill(self.surrounded(), torch.nan))
-        return reduce(torch.fmax, found) if found else None
+            surrounded = self.surrounded()
+            found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
+        return by_view(lambda *all_of: reduce(torch.fmax, all_of), *found) if found else None
 
 
 def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from pimper_torch.mapped import by_view
 from pimper_torch.records import Record, Silhouettes
 from pimper_torch.silhouettes.cues import Cues
 from pimper_torch.silhouettes.hull import margins, visual_hull
@@ -81,7 +82,8 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     for _ in range(details.iterations):
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
-        seen = _voted(cues, masks | _likely(cues), details, unknown, voting)
+        likely = by_view(torch.bitwise_or, masks, _likely(cues))
+        seen = _voted(cues, likely, details, unknown, voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
@@ -221,7 +223,7 @@ def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
     """Find what a first cut by parallax knows nothing of, as beyond the plane."""
     if cues.agreement is None or cues.has_points:
         return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
-    return cues.agreement.isnan()
+    return by_view(Tensor.isnan, cues.agreement)
 
 
 def _voted(
@@ -239,7 +241,8 @@ def _voted(
     cameras = cues.pictures.cameras
     if voting is None:
         voting = torch.ones(len(masks), dtype=torch.bool)
-    silhouettes = Silhouettes(inside=masks.float(), reliable=voting, source="found")
+    inside = by_view(Tensor.float, masks)
+    silhouettes = Silhouettes(inside=inside, reliable=voting, source="found")
     hull = visual_hull(
         silhouettes,
         cameras,

@@ -111,9 +111,8 @@ def texture_agreement(
         return _textured(pictures.grey[view], hidden[view], longer)
 
     texture = of_views(textured, count)
-    seen, radiance = (layer.masked_fill(hidden, torch.nan) for layer in (texture, pictures.grey))
-    common, spread = _common(seen, near)
-    level, level_spread = _common(radiance, far)
+    common, spread = _common(texture, hidden, near)
+    level, level_spread = _common(pictures.grey, hidden, far)
 
     def agreement_of(view: int) -> Float[Tensor, "height width"]:
         agreement = _agreement(texture[view], common[view], spread[view], longer)
@@ -125,7 +124,9 @@ def texture_agreement(
 
 
 def _common(
-    values: Float[Tensor, "view height width"], raster: Raster
+    values: Float[Tensor, "view height width"],
+    hidden: Bool[Tensor, "view height width"],
+    raster: Raster,
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
     """Return the views' median on a background, and its spread, as each view sees it."""
     maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
@@ -134,7 +135,8 @@ def _common(
     def rectified(view: int) -> Float[Tensor, "row column"]:
         if not sees[view]:
             return values.new_full(raster.size_px[::-1], torch.nan)
-        return warped(values[view], maps[view], raster.size_px)
+        seen = values[view].masked_fill(hidden[view], torch.nan)
+        return warped(seen, maps[view], raster.size_px)
 
     seen = of_views(rectified, len(values))
     rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px[0])), dim=1)

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.mapped import stacked, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry.srgb import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
@@ -52,12 +53,15 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
         return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + _DARK)
 
     images = views.images.detach().cpu().unbind()
-    colours, opponent, grey = zip(*side_by_side(shown, images, tracked=False), strict=True)
+    colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
+    grey = zeros((len(images), high, wide))
+    for view, layers in enumerate(side_by_side(shown, images, tracked=False)):
+        colours[view], opponent[view], grey[view] = layers
     scale = torch.tensor(factors)
     return Pictures(
-        colours=torch.stack(colours).contiguous(),
-        opponent=torch.stack(opponent),
-        grey=torch.stack(grey),
+        colours=colours,
+        opponent=opponent,
+        grey=grey,
         cameras=cameras.to("cpu", torch.float32).replace(
             intrinsics=scale_intrinsics(cameras.intrinsics.cpu().float(), *factors),
             sizes_px=(cameras.sizes_px.cpu() * scale).round().long().clamp_min(1),
@@ -68,7 +72,7 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
 
 def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
     """Stack what is computed of every view by itself."""
-    return torch.stack(list(side_by_side(work, range(count))))
+    return stacked(side_by_side(work, range(count)), count)
 
 
 def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:
