@@ -60,6 +60,10 @@ _MIN_AGREEMENT = 0.5
 # choice: depths that agree differ by a step at most.
 _DENIED_STEPS = 3.0
 
+# Views, spread evenly over all, that may contradict a point: time would grow with the square of
+# their number. The largest real set that the coarse surface was measured on has 66.
+_MAX_DENYING = 66
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OrientedPoints(Record):
@@ -207,7 +211,8 @@ def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[
     cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
     pixels_from_world = cameras.intrinsics @ cameras.cam_from_world[:, :3]
     height, width = maps.valid.shape[-2:]
-    for other in range(cameras.num_views):
+    last, most = cameras.num_views - 1, min(cameras.num_views, _MAX_DENYING)
+    for other in torch.linspace(0, last, most).round().long().tolist():
         if other == view:
             continue
         to = pixels_from_world[other]
