@@ -125,7 +125,7 @@ class FactorizeConfig:
             second-order harmonics shared by the views up to exposure; ``"auto"``, the simplest
             that predicts radiance left out of the fit.
         colours: Whether views may have light of unlike colour, where that predicts radiance left
-            out of the fit.
+            out of the fit, and be exposed unlike by 1.5 stops or more.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
         light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in

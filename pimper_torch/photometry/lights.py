@@ -79,7 +79,7 @@ def light_of_mesh(
         coarse: Normals of each bucket's templates, patch frame.
         min_views: Views a sample must be valid in.
         model: See :func:`fit_light_field`.
-        colours: Whether views may have light of unlike colour.
+        colours: Whether views may have light of unlike colour and be exposed unlike.
 
     Differentiable in radiance, normals and templates; which samples are taken is constant.
     """
@@ -103,10 +103,12 @@ def light_of_mesh(
         positions = templates.points_patch[patch, row, column, None]
         points.append(transform(invert_rigid(templates.patch_from_world[patch]), positions)[:, 0])
     every, shown = torch.cat(radiance), torch.cat(visible)
-    colour = light_colours(every, shown) if colours else every.new_ones(every.shape[1:])
-    gray = (every / colour).mean(dim=2)
-    exposure = exposures(gray, shown)
-    gray = gray / exposure
+    colour = every.new_ones(every.shape[1:])
+    exposure = colour[:, 0]
+    if colours:
+        colour = light_colours(every, shown)
+        exposure = exposures((every / colour).mean(dim=2), shown)
+    gray = (every / colour).mean(dim=2) / exposure
     field = fit_light_field(gray, shown, torch.cat(normals), torch.cat(points), model=model)
     return field.replace(gain=colour * exposure[:, None], exposure=exposure)
 
