@@ -65,8 +65,8 @@ def test_points_of_the_scene_itself_stay(scene):
     assert bool(found.observed[:2].all())
 
 
-@pytest.mark.parametrize("order", [[1, 2, 3, 4, 5, 0], [3, 0, 5, 1, 4, 2]])
-def test_cameras_of_other_photographs_give_none(scene, order):
+def test_cameras_of_other_photographs_give_none(scene):
+    order = [3, 0, 5, 1, 4, 2]
     cameras = scene.cameras.replace(cam_from_world=scene.cameras.cam_from_world[order])
     wrong = scene.replace(cameras=cameras)
     with pytest.warns(PimperWarning, match="No points"):
