@@ -46,6 +46,8 @@ PAGES = {
     for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
 }
 
+FEW = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
+
 
 def modules_with_examples() -> list[str]:
     """List the modules that have an example which is meant to run."""
@@ -85,7 +87,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
     draw, turn = results.draw_overview, results.draw_turn
     monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
     monkeypatch.setattr(results, "draw_turn", lambda *given: turn(*given, side_px=8))
-    few = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
+    few = FEW | {"scales": [0.5, 1.0]}
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
 
@@ -156,7 +158,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
 
 def a_glance_at_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     a_folder_of_photographs(monkeypatch)
-    monkeypatch.setattr(presets, "load_config", lambda *_: load_config("fast"))
+    monkeypatch.setattr(presets, "load_config", lambda *_: load_config("fast", FEW))
     return {}
 
 
