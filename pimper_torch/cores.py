@@ -1,4 +1,4 @@
-"""How many cores a process may use, which may be fewer than the machine has."""
+"""Number of cores that a process may use; it may be lower than the machine's."""
 
 import math
 import os

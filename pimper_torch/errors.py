@@ -1,4 +1,4 @@
-"""What can go wrong, in the caller's words.
+"""Errors of the package, in the caller's words.
 
 Every message says where, what was found, what was needed, and what to do.
 """

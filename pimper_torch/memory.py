@@ -1,4 +1,4 @@
-"""How much memory a run takes, and giving back what is free."""
+"""Memory of a run, and the return of free memory to the system."""
 
 import ctypes
 import math

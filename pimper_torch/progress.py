@@ -1,4 +1,4 @@
-"""How far a stage has come, for whoever wants to show it.
+"""Progress of a stage, for whoever wants to show it.
 
 Stages walk their batches through :func:`track`; nothing is printed. A caller that wants a
 bar listens with :func:`listening`.

@@ -1,4 +1,4 @@
-"""What a run tells about its stages: time, memory, and the figures of each record."""
+"""Reports of a run's stages: time, memory, and the figures of each record."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""What every stage is: a module that takes records and gives one."""
+"""Base of every stage: a module that takes records and returns one."""
 
 import inspect
 import typing

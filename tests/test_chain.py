@@ -1,10 +1,8 @@
 """From one end of the chain to the other."""
 
 import logging
-import math
 import warnings
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +13,6 @@ from torch.nn.functional import normalize
 
 import pimper_torch as pt
 from pimper_torch.chains.hold_out import held_apart
-from pimper_torch.chains.published import Published, PublishedConfig
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
@@ -31,13 +28,8 @@ from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
 from pimper_torch.evidence.scenes.sparse import sparse_scene
-from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.io.estimates import estimate_of
-from pimper_torch.meshing.extract import ExtractConfig
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
-from pimper_torch.patches.decompose import DecomposeConfig
-from pimper_torch.photometry.factorize import FactorizeConfig
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,
@@ -46,15 +38,12 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.sfm.scene import write_model
 from pimper_torch.silhouettes.contours import Contours
-from pimper_torch.silhouettes.settings import SilhouetteConfig
 from pimper_torch.stage import Given
 from tests.coarse import ball
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures
 
-PUBLISHED_ERROR = 11.15  # per cent: the potatoes of the published table
 PRESETS = ("paper", "default")
 REFERENCES = {"fast": "coarse_surface", "paper": "triangulate"}
 # Pictures of 80 x 60 pixels are too small to be matched densely: facets span the cloud.
@@ -301,106 +290,14 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     assert surface.mean_angle_deg < 0.5 * facets.mean_angle_deg
 
 
-@pytest.fixture(scope="module")
-def potato(tmp_path_factory):
-    """Photographs of the potato as files, its truth, and what structure from motion makes.
-
-    With masks: along a contour in front of a table far behind, the rays that miss by a
-    pixel would make up nearly all of the error.
-    """
-    truth = potato_on_table()
-    folder = tmp_path_factory.mktemp("potato")
-    save_photographs(truth.views, folder / "photos")
-    save_masks(truth.foreground, truth.views.names, folder / "masks")
-    views = pt.load_views(folder / "photos", masks=folder / "masks")
-    found = pt.load_chain("default").reconstruct(views)
-    return truth, views, found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_potato_is_reconstructed_from_files_better_than_published(preset, potato):
-    truth, views, found = potato
-    assert found.views.num_views == truth.views.num_views
-    pimper = pt.load_chain(preset)
-    pimper.reconstruct = Given(found)  # the same in both presets, and the longest stage
-    with warnings.catch_warnings():
-        # A few facets on the contour may lack light, which may rightly be said.
-        warnings.simplefilter("ignore", PimperWarning)
-        result = pimper(views)
-    facets = Triangulate()(result.scene)
-    coarse = compared(facets.mesh, result, truth)
-    fine = compared(result.mesh, result, truth)
-    shape = compared(result.mesh.replace(normals_world=None), result, truth)
-    for name, figures in (("facets", coarse), ("surface", fine), ("its shape", shape)):
-        log.info("%s: %s %s", preset, name, figures)
-    assert fine.coverage > 0.9
-    assert fine.relative_error < PUBLISHED_ERROR
-    assert shape.mean_angle_deg < coarse.mean_angle_deg
-    if preset == "default":
-        # Measured 1.3 against 1.9 per cent and 2.6 against 7.9 degrees. In `paper` the facets
-        # alone decide where the surface is: 1.92 against 1.92 per cent.
-        assert fine.relative_error < 0.75 * coarse.relative_error
-        assert shape.mean_angle_deg < 0.6 * coarse.mean_angle_deg
-
-
-@pytest.fixture(scope="module")
-def small_set(tmp_path_factory):
-    """Photographs of potatoes on a table, their model, and the same model in UTM coordinates."""
-    folder = tmp_path_factory.mktemp("small")
-    truth = potato_on_table(num_views=8, width=240, height=180)
-    save_photographs(truth.views, folder / "photos")
-    save_masks(truth.foreground, truth.views.names, folder / "masks")
-    views = pt.load_views(folder / "photos", masks=folder / "masks")
-    # Errors of reprojection that are rounding's alone would order the points by chance.
-    generator = torch.Generator().manual_seed(17)
-    scene = sparse_scene(truth, 1500, generator, noise_px=0.3).replace(views=views)
-    write_model(scene.replace(offset_world=UTM), folder / "far")
-    write_model(scene, folder / "near")
-    return SimpleNamespace(folder=folder, views=views, truth=truth.mesh)
-
-
-UTM = (448231.25, 5411923.5, 312.125)
-
-
-# The published chain made quick: no octree of its surface turns with the frame.
-QUICK = PublishedConfig(
-    silhouettes=SilhouetteConfig(object="everything"),
-    extract=ExtractConfig(max_hole=0.2, overturned="all", min_piece=1.0),
-    decompose=DecomposeConfig(max_samples=math.inf, samples_per_pixel=0.5, overlap_samples=4.0),
-    factorize=FactorizeConfig(max_iterations=25, loss_scale=2.0, shadows=False),
-)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
-@pytest.mark.parametrize("with_mesh", [False, True])
-def test_a_georeferenced_model_gives_the_figures_of_the_plain_one(small_set, with_mesh):
-    results, errors = [], []
-    for name, offset in (("near", (0.0, 0.0, 0.0)), ("far", UTM)):
-        vertices = small_set.truth.vertices_world.double()
-        truth = small_set.truth.replace(vertices_world=vertices + vertices.new_tensor(offset))
-        rough = truth if with_mesh else None
-        result = Published(QUICK)(small_set.views, small_set.folder / name, rough)
-        found = estimate_of(result).mesh  # in the frame of the model
-        errors.append(float(NearestSurface(truth).query(found.vertices_world).distance.mean()))
-        results.append(result)
-    log.info("distances from the truth, plain and georeferenced: %s", errors)
-    assert results[0].scene.offset_world == (0.0, 0.0, 0.0)
-    assert max(results[1].scene.offset_world) > 5e6
-    assert abs(errors[1] / errors[0] - 1) < 0.01
-    assert errors[0] < (0.003 if with_mesh else 0.005)
-    near, far = (len(result.mesh.vertices_world) for result in results)
-    assert abs(far / near - 1) < 0.01
-
-
 @pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(preset):
     cameras = ball.all_round().take(torch.arange(24) // 2)
     scene = ball.photographed(cameras)
     vertices, faces = icosphere(2)
-    step = next(pt.load_chain(preset).steps(scene, mesh=Mesh(vertices_world=vertices, faces=faces)))
+    some = Mesh(vertices_world=vertices, faces=faces[:80])
+    step = next(pt.load_chain(preset).steps(scene, mesh=some))
     assert step.scene.views.poses.tolist() == [view - view % 2 for view in range(24)]
     assert torch.equal(step.silhouettes.inside[::2], step.silhouettes.inside[1::2])
     lights = torch.cat([bucket.lights_patch for bucket in step.photometric.buckets])
@@ -409,5 +306,5 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
     assert bool((lights[:, ::2] != lights[:, 1::2]).any(dim=2)[both].all())
     names = scene.views.names
     again = pt.load_chain(preset, {REFERENCES[preset]: {"reference": names[7]}})
-    named = next(again.steps(scene, mesh=Mesh(vertices_world=vertices, faces=faces)))
+    named = next(again.steps(scene, mesh=some.replace(faces=faces[:8])))
     assert named.coarse.reference == 7

@@ -28,7 +28,6 @@ from pimper_torch.evidence.scenes.lights import wandering_lights
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.evidence.scenes.noise import random_speckle
 from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.io import results
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
@@ -45,6 +44,8 @@ PAGES = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
     for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
 }
+
+FEW = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
 
 
 def modules_with_examples() -> list[str]:
@@ -82,10 +83,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
         return found.replace(views=views)
 
     monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
-    draw, turn = results.draw_overview, results.draw_turn
-    monkeypatch.setattr(results, "draw_overview", lambda found, path: draw(found, path, 40))
-    monkeypatch.setattr(results, "draw_turn", lambda *given: turn(*given, side_px=8))
-    few = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
+    few = FEW | {"scales": [0.5, 1.0]}
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
 
@@ -146,6 +144,7 @@ def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
     }
 
 
+@pytest.mark.usefixtures("small_pictures")
 @pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -156,7 +155,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
 
 def a_glance_at_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     a_folder_of_photographs(monkeypatch)
-    monkeypatch.setattr(presets, "load_config", lambda *_: load_config("fast"))
+    monkeypatch.setattr(presets, "load_config", lambda *_: load_config("fast", FEW))
     return {}
 
 
@@ -257,6 +256,7 @@ def run_block(page: str, number: int, monkeypatch: pytest.MonkeyPatch) -> dict[s
 
 
 @pytest.mark.parametrize(("page", "number"), GIVEN_TO)
+@pytest.mark.usefixtures("small_pictures")
 @pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
 def test_the_python_of_the_pages_runs(page, number, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -175,16 +175,6 @@ def test_a_round_reports_its_photometry_once_and_what_each_part_takes():
     assert f"{count}/{count}" in listener.heard
 
 
-def test_without_kernels_the_chain_gives_the_same_surface():
-    found, expected = (
-        chain(scene.views).mesh.vertices_world
-        for chain, scene in (in_iterations(Silent(), kernels=name) for name in ("numba", "torch"))
-    )
-    assert found.shape == expected.shape
-    spacing = (found[1:] - found[:-1]).norm(dim=1).median()
-    assert (found - expected).norm(dim=1).quantile(0.99) < 0.05 * spacing
-
-
 def test_gradients_reach_the_photographs_through_the_buckets(given):
     views, cameras, patches = given
     patches = patches.replace(buckets=patches.buckets[:4])

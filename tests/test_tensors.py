@@ -104,6 +104,7 @@ def test_cameras_of_another_convention_are_recognised(given):
         scene_of(scene, cam_from_world=mirrored)
 
 
+@pytest.mark.usefixtures("small_pictures")
 @pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 def test_from_tensors_to_a_saved_result(given, tmp_path):
     scene, coarse = given

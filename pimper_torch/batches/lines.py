@@ -1,4 +1,4 @@
-"""How the objects of a batch come on: a line each on a terminal, or events for a machine."""
+"""Progress of the objects of a batch: a line each on a terminal, or events for a machine."""
 
 import types
 from collections import Counter

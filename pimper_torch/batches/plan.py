@@ -1,4 +1,4 @@
-"""What is known of every object before anything starts: its arguments, and what it will take."""
+"""Plan of every object before anything starts: its arguments, and its expected cost."""
 
 import hashlib
 import warnings

@@ -29,7 +29,7 @@ from pimper_torch.outputs.files import prepare_file
 from pimper_torch.outputs.stages import locked
 
 TRIES = 3
-"""How often an object is begun, unless another number is given."""
+"""Default number of tries of an object."""
 AT_ONCE = 100
 """Most objects that an engine is handed at once, unless another number is given."""
 

@@ -47,7 +47,7 @@ _SILENCE_SECONDS = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What a worker needs to know of an object.
+    """Inputs of a worker for one object.
 
     Attributes:
         arguments: Of ``pimper reconstruct``, with absolute paths.
@@ -79,7 +79,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """How a try ended.
+    """End of a try.
 
     Attributes:
         status: ``ended`` with a result; ``failed`` by itself, as it will anywhere; ``lost``, as

@@ -1,4 +1,4 @@
-"""How far a run has come, on the terminal."""
+"""Progress bars of a run on the terminal."""
 
 import types
 

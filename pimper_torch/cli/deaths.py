@@ -1,4 +1,4 @@
-"""What is told of a process that was killed or crashed."""
+"""Messages about a process that was killed or crashed."""
 
 import signal
 import sys

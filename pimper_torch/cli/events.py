@@ -1,4 +1,4 @@
-"""How far a run has come, as events for a machine."""
+"""Progress of a run, as events for a machine."""
 
 import time
 from collections.abc import Callable

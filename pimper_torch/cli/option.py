@@ -1,4 +1,4 @@
-"""What the options of a command are called and mean, from its signature and docstrings."""
+"""Names and meanings of a command's options, from its signature and docstrings."""
 
 import dataclasses
 import inspect

@@ -75,14 +75,14 @@ class CommonOptions:
 
     @property
     def files(self) -> MeshFiles:
-        """How the surface is written."""
+        """Form in which the surface is written."""
         formats = (*(("stl",) if self.stl else ()), *(("obj",) if self.obj else ()))
         return MeshFiles(faces=self.faces, watertight=self.watertight, formats=formats)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputOptions:
-    """What the photographs come with.
+    """Inputs beside the photographs.
 
     Attributes:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.

@@ -1,4 +1,4 @@
-"""What a command tells while it runs and at its end: sentences for people, or events as JSON."""
+"""Output of a command while it runs and at its end: sentences for people, or events as JSON."""
 
 import json
 import math
@@ -25,7 +25,7 @@ _PROGRESS_SECONDS = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Output:
-    """How a command tells what it has to tell.
+    """Form of a command's output.
 
     With ``as_json`` every line of standard output is an object with ``event``, ``elapsed`` in
     seconds, and what :meth:`event` is called with:

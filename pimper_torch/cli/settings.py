@@ -23,7 +23,7 @@ _WIDTH = 96
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """What is asked for: all settings of a preset, a section of them, or one."""
+    """Choice of all settings of a preset, a section of them, or one."""
 
     preset: str
     config: Config

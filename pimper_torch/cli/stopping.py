@@ -1,4 +1,4 @@
-"""How a process stops when it is told to: by Ctrl-C, a polite kill, or a closed terminal.
+"""Stop of a process by Ctrl-C, a polite kill, or a closed terminal.
 
 Loads nothing, so that it can be the first thing that a process does.
 """

@@ -62,7 +62,7 @@ def main() -> int:
 
 
 class _Watch:
-    """What the watcher knows.
+    """State of the watcher.
 
     Attributes:
         first: Number of the first signal that told to stop; 0 before.

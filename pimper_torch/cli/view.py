@@ -49,7 +49,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
 
 
 def tell_place(viewer: Viewer, output: Output, port: int = PORT) -> None:
-    """Tell where the page is."""
+    """Print the address of the page."""
     output.event("view", address=viewer.address)
     taken = f" (port {port} is taken)" if port not in (0, viewer.server.get_port()) else ""
     output.say(f"The viewer is at {viewer.address}{taken}; Ctrl-C ends it.")

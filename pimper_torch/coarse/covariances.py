@@ -1,4 +1,4 @@
-"""How accurately the points of the cloud are triangulated."""
+"""Covariances of the triangulated points of the cloud."""
 
 import torch
 from jaxtyping import Float, Int

@@ -1,4 +1,4 @@
-"""How well views match through a surface, whatever their light: correlation of windows.
+"""Match of views through a surface, under any light: correlation of windows.
 
 A surface is a field of inverse depths over a view. Every source view is looked up once
 through the field, and windows are compared in what comes back: they are slanted and bent as
@@ -120,7 +120,7 @@ def pair(level: Level, view: int, sources: Int[Tensor, " source"]) -> Pairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Windows:
-    """How windows are compared. The values are choices.
+    """Settings of the comparison of windows. The values are choices.
 
     Attributes:
         radius: Windows are squares of ``2 radius + 1`` pixels.

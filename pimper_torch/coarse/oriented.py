@@ -125,7 +125,7 @@ def _covered(
 def _of_view(
     maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]
 ) -> tuple[OrientedPoints, Bool[Tensor, "height width"]]:
-    """Give a view's points at wanted pixels, and mark the pixels that have these or finer ones."""
+    """Return a view's points at wanted pixels, and the mask of pixels with these or finer ones."""
     intrinsics = maps.level.cameras.intrinsics[view]
     frame = maps.level.cameras.cam_from_world[view]
     inverse_depth, slope, spread, fitted = fitted_planes(

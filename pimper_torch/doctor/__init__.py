@@ -1,1 +1,1 @@
-"""What photographs are worth and what a machine has, told in seconds before a run of minutes."""
+"""Checks of photographs and of the machine, in seconds, before a run of minutes."""

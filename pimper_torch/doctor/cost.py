@@ -1,4 +1,4 @@
-"""How long a run will take, and how much memory."""
+"""Estimates of a run's time and memory."""
 
 from collections.abc import Iterator, Sequence
 

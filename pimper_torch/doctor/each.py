@@ -1,4 +1,4 @@
-"""What can be told of photographs one by one: number, size, blur, exposure, lens."""
+"""Checks of photographs one by one: number, size, blur, exposure, lens."""
 
 import math
 from collections import Counter

@@ -1,4 +1,4 @@
-"""What was found, what was needed, and what to do."""
+"""Findings: the measurement, the requirement, and the advice."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ Severity = Literal["ok", "note", "warning", "error"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What one check found.
+    """Result of one check.
 
     Attributes:
         severity: ok; a note, which may be meant; a warning, where the result will suffer; or an

@@ -1,4 +1,4 @@
-"""How much the light varies between photographs, where the same is seen in both."""
+"""Variation of light between photographs, where both see the same points."""
 
 from collections.abc import Iterator, Sequence
 from statistics import median

@@ -1,4 +1,4 @@
-"""What is installed, and what the machine has."""
+"""Installed versions, cores and memory of the machine."""
 
 import os
 from collections.abc import Iterator

@@ -25,7 +25,7 @@ _BRIGHT = 0.99  # quantile of radiance that tells the exposure; more are highlig
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Photograph(Record):
-    """What is known of a photograph without its neighbours.
+    """Measurements of one photograph without its neighbours.
 
     Attributes:
         width: Pixels, as a run would take them.

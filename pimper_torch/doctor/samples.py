@@ -1,4 +1,4 @@
-"""What files say about their samples: what a run follows of it, and what it does not."""
+"""Samples' encoding as the files state it: the parts that a run follows, and the others."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How blurred the strongest edges of a photograph are, in pixels."""
+"""Blur of the strongest edges of a photograph, in pixels."""
 
 import torch
 from jaxtyping import Bool, Float

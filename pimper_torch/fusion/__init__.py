@@ -1,1 +1,1 @@
-"""What patches say of the surface, brought together on the subdivided mesh of the coarse mesh."""
+"""Fusion of the patches on the subdivided coarse mesh."""

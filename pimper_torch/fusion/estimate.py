@@ -207,7 +207,7 @@ def _evaluated(
     probe: Float[Tensor, " vertex"],
     answer: Float[Tensor, " vertex"],
 ) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
-    """Give squared residuals in units of the claimed variance, and how many equations are used up.
+    """Return squared residuals over the claimed variance, and the number of equations used up.
 
     Args:
         probe: Random signs.

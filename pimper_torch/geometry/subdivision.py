@@ -123,7 +123,7 @@ def transferred(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Cuts:
-    """How edges are cut, and how facets see their corners and edges from slot 0."""
+    """Subdivision of edges, and each facet's corners and edges from slot 0."""
 
     pieces: Int[Tensor, " edge"]
     edges: Int[Tensor, "edge 2"]

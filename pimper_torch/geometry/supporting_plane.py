@@ -16,7 +16,7 @@ _MIN_POINTS = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaneSearch:
-    """What counts as the plane that an object stands on.
+    """Criteria for the plane that an object stands on.
 
     Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
 

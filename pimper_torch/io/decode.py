@@ -316,7 +316,7 @@ def _unfit(path: Path, kind: str) -> InputError:
 
 
 def _unidentified(path: Path) -> InputError:
-    """Tell why Pillow does not know a file: a TIFF of samples that it has no name for, or none."""
+    """Return the refusal of a file unknown to Pillow: a TIFF of other samples, or no image."""
     found = unread_tiff(path)
     if found.startswith(("float", "int", "uint", "complex")):
         return _unfit(path, found)

@@ -1,4 +1,4 @@
-"""What files say about their samples and is not followed, in one warning a kind."""
+"""Warnings about files' tags that are not followed, one a kind."""
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence

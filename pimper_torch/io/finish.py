@@ -1,4 +1,4 @@
-"""What becomes of a surface before it is written: fewer vertices, and caps where it is open."""
+"""Finish of a surface before it is written: fewer vertices, and caps where it is open."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,7 +18,7 @@ _ATTEMPTS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeshFiles:
-    """How the surface is written.
+    """Form in which the surface is written.
 
     Attributes:
         faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a

@@ -1,4 +1,4 @@
-"""What a file says about its image, whichever library reads it."""
+"""Header of an image file, whichever library reads it."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Header(Record):
-    """What a file says about its image without decoding it.
+    """Metadata of an image file, read without decoding.
 
     Attributes:
         width: Pixels, the right way up.

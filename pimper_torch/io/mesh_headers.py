@@ -1,4 +1,4 @@
-"""What mesh files say that they hold and their parser would take memory for, or misread.
+"""Checks of mesh files' headers: sizes that a parser would allocate, and values it would misread.
 
 Counts of binary PLY and of glTF's views beyond the file are refused by trimesh itself.
 """

@@ -111,7 +111,7 @@ def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
 
 
 def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
-    """Give what a file says of vertices beside position and normal, in units of what it may be off.
+    """Return a file's other values of vertices, in units of their tolerances.
 
     For :func:`pimper_torch.meshing.simplify.simplify`: sRGB colour may be off by 8 levels of 255,
     confidence by 0.1, expected error by a tenth of itself.

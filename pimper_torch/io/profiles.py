@@ -1,4 +1,4 @@
-"""What an image file says about its samples: profiles, chunks of PNG, tags of TIFF and EXIF."""
+"""Colour metadata of image files: profiles, chunks of PNG, tags of TIFF and EXIF."""
 
 import struct
 import zlib

@@ -164,7 +164,7 @@ def resized_mask(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Tally(Record):
-    """How often each level occurs in all files of like bits; in how many files at all often."""
+    """Histogram of levels over all files of equal bits, and each level's number of files."""
 
     counts: Int[Tensor, "channel level"]
     photographs: Int[Tensor, "channel level"]

@@ -1,4 +1,4 @@
-"""What a run found, in numbers: lights and the summary, ready for JSON."""
+"""Results of a run in numbers: lights and the summary, ready for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence

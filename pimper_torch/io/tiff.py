@@ -193,7 +193,7 @@ def read_gray_tiff(image: Image.Image, layout: Layout | None) -> np.ndarray:
 
 
 def unread_tiff(path: Path | str) -> str:
-    """Tell why Pillow does not know a TIFF: the kind of its samples, or a sentence; else empty."""
+    """Return the reason why Pillow does not know a TIFF: kind of samples, sentence, or empty."""
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first

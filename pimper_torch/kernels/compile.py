@@ -1,4 +1,4 @@
-"""How kernels are compiled: once per installation, some of them in a child process.
+"""Compilation of kernels: once per installation, some of them in a child process.
 
 Machine code is cached on disk, in numba's folder. A kernel is compiled when its module is imported.
 Every module has a lock there, so that no two processes compile the same kernel.

@@ -200,7 +200,7 @@ def raised(m: Six) -> Six:
 
 @compiled(fast=True)
 def inverse_factor(m: Six) -> Six:
-    """Give ``C^-1`` row by row for ``m = C C^T``; see ``photometry.quadratics.PackedCholesky``."""
+    """Return ``C^-1`` row by row, ``m = C C^T``; see ``photometry.quadratics.PackedCholesky``."""
     floor = max(1e-12 * (m[0] + m[3] + m[5]), _TINY)
     c00 = 1 / math.sqrt(max(m[0], floor))
     c10, c20 = m[1] * c00, m[2] * c00

@@ -265,7 +265,7 @@ def with_product(
     gain: float = 1.0,
     found: Float[Tensor, "row ..."] | None = None,
 ) -> Float[Tensor, "row ..."]:
-    """Give ``keep * start + gain * matrix @ vectors`` by compiled kernels, in ``found`` or new."""
+    """Return ``keep * start + gain * matrix @ vectors`` by compiled kernels, into ``found``."""
     from pimper_torch.kernels import sparse
 
     if found is None:

@@ -30,7 +30,7 @@ _UNSURE = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtractConfig:
-    """What of the surface is worth keeping.
+    """Criteria for the parts of the surface to keep.
 
     Attributes:
         max_expected_error: Faces with a vertex that is expected to be further off are cut out;

@@ -23,7 +23,7 @@ from pimper_torch.stage import Stage
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecomposeConfig:
-    """How finely facets are sampled and how far they reach over their edges.
+    """Spacing of a facet's samples, and their reach over its edges.
 
     Attributes:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's

@@ -22,7 +22,7 @@ _COMPACT_FRACTION = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class State(Record):
-    """What every solver iterates, and some more besides; the first axis is the patch.
+    """State that every solver iterates; the first axis is the patch.
 
     Attributes:
         lights: ``L``.

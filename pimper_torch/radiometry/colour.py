@@ -1,4 +1,4 @@
-"""What a file says about how its samples encode radiance."""
+"""Encoding of radiance by a file's samples."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _DISAGREE = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Colour:
-    """What a file says about its samples.
+    """Encoding of a file's samples.
 
     Attributes:
         source: Where it says so, such as ``ICC profile "Display P3"``; empty where it is silent.

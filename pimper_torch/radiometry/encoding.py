@@ -1,4 +1,4 @@
-"""What is told about the values in photographs' files."""
+"""User-given encoding of the values in photographs' files."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ SaturationChoice = Literal["auto"] | float | tuple[float | int, float | int, flo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Encoding:
-    """How radiance became the values in the files.
+    """Encoding of radiance as the values in the files.
 
     Levels up to 1 are fractions of the files' full scale, larger ones are in the files' own units:
     0.25 and 16384 are the same in files of 16 bits.

@@ -1,4 +1,4 @@
-"""What silhouettes say about the surface: rays that it touches, and where."""
+"""Contour rays: rays tangent to the surface at its silhouettes, and the points of tangency."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What of a run failed or was left out."""
+"""Failures of a run, and the parts that it left out."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,7 +27,7 @@ class Failure(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut(Record):
-    """What a guard left out of what it looked at, or doubted; see :mod:`pimper_torch.ledger`.
+    """Items that a guard left out or doubted; see :mod:`pimper_torch.ledger`.
 
     Attributes:
         guard: Room and name, such as ``extract.borders``.

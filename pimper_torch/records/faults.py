@@ -1,4 +1,4 @@
-"""What may be wrong with the values of a record; each tensor is looked through once."""
+"""Checks of the values of a record; each tensor is read once."""
 
 from collections.abc import Callable
 from typing import Any

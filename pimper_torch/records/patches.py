@@ -95,7 +95,7 @@ class Templates(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPatches(Record):
-    """What is known of all patches, in buckets like those of the templates.
+    """A result over all patches, in buckets like those of the templates.
 
     ``len`` counts patches, and indexing by a facet's number, or iterating, gives records of one
     patch each.
@@ -174,7 +174,7 @@ class PatchSet(OverPatches):
 
     @property
     def num_patches(self) -> int:
-        """How many facets there are."""
+        """Number of facets."""
         return sum(len(bucket.facet) for bucket in self.buckets)
 
     @property
@@ -274,7 +274,7 @@ class StopCause(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Convergence(Record):
-    """How an iteration ended, one entry a problem of the batch.
+    """End of an iteration, one entry a problem of the batch.
 
     Attributes:
         iterations: Taken until it stopped.
@@ -516,7 +516,7 @@ def _given(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPhotometry(OverPatches):
-    """What is known of all patches beyond their photometry."""
+    """Further results over the photometry of all patches."""
 
     photometric: PhotometricPatches
 

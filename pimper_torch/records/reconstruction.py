@@ -12,7 +12,7 @@ from pimper_torch.records.views import Cameras
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageReport(Record):
-    """What one stage cost and found.
+    """Cost and figures of one stage.
 
     Attributes:
         peak_memory_mb: Highest resident memory of the process up to the stage's end.

@@ -1,4 +1,4 @@
-"""What structure from motion finds, and triangle meshes."""
+"""Results of structure from motion, and triangle meshes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What is known about photographs beforehand, and what a method says about them."""
+"""Ground truth of photographs, and a method's estimate."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from pimper_torch.records.views import Cameras, Views
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Truth(Record):
-    """What is known of an object besides its photographs; ``None`` where unknown.
+    """Ground truth of an object; ``None`` where unknown.
 
     Maps hold what the ray through each pixel's centre meets first, one a view.
 
@@ -82,7 +82,7 @@ class DtuProtocol(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Estimate(Record):
-    """What a method says about an object, in a frame of its own.
+    """A method's estimate of an object, in a frame of its own.
 
     Attributes:
         mesh: The surface; may have no faces if the method gives points only.

@@ -47,7 +47,7 @@ class Views(Record):
 
     @property
     def num_views(self) -> int:
-        """How many photographs there are."""
+        """Number of photographs."""
         return self.images.shape[0]
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
@@ -89,7 +89,7 @@ class Cameras(Record):
 
     @property
     def num_views(self) -> int:
-        """How many cameras there are."""
+        """Number of cameras."""
         return self.intrinsics.shape[0]
 
     def faults(self) -> Iterator[tuple[str, str, str]]:

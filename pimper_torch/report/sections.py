@@ -32,7 +32,7 @@ def _warnings(summary: Summary) -> Json:
 
 
 def _relighting(summary: Summary) -> Json | None:
-    """Tell what predictions of photographs are worth, with materials and without."""
+    """Return the section on errors of predicted photographs, with materials and without."""
     found = summary.get("relighting")
     if not found or found["psnr_db"] is None:
         return None

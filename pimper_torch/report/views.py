@@ -1,4 +1,4 @@
-"""What a page says of every photograph: its camera, its picture, its light."""
+"""Entries of a page for every photograph: its camera, its picture, its light."""
 
 from collections.abc import Sequence
 

@@ -40,7 +40,7 @@ class Features(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Alike(Record):
-    """What features of one photograph are most like, among those of another that are near.
+    """Best matches of one photograph's features among the near ones of another.
 
     Attributes:
         products: Of the descriptors, the largest and the second largest; -1 where there is none.

@@ -88,7 +88,7 @@ def _maps(found: "_Found") -> tuple[Float[Tensor, "3 3"], ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
-    """What COLMAP's database holds of photographs and their matches before verification.
+    """Photographs and matches of COLMAP's database before verification.
 
     Attributes:
         ids: Of the photographs in the database, in the order of their names.
@@ -102,7 +102,7 @@ class Matched:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Found:
-    """What is at rest, between mapped pixels of photographs, and to how many of them."""
+    """Static background between mapped pixels of photographs."""
 
     rest: StaticBackground
     maps: tuple[Float[Tensor, "3 3"], ...]

@@ -42,7 +42,7 @@ class VerifiedPair(Record):
 
     @property
     def num_matches(self) -> int:
-        """How many matches there are."""
+        """Number of matches."""
         return len(self.first)
 
 

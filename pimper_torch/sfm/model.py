@@ -40,7 +40,7 @@ class SparseModel(Record):
 
     @property
     def num_views(self) -> int:
-        """How many views are registered."""
+        """Number of registered views."""
         return len(self.names)
 
     @property

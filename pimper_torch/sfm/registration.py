@@ -49,7 +49,7 @@ _MARGIN = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
-    """What came of one run of the mapper.
+    """Result of one run of the mapper.
 
     Attributes:
         models: One a component, the one with most views that see depth first.

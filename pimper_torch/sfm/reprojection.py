@@ -1,4 +1,4 @@
-"""How far from where they should be points are seen."""
+"""Reprojection errors of points."""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""What becomes of a model of several series of photographs, between which the object was moved."""
+"""Models of several series of photographs, between which the object was moved."""
 
 from collections.abc import Sequence
 

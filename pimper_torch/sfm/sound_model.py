@@ -1,4 +1,4 @@
-"""What of a COLMAP model can be used; broken cameras, poses, points, observations are dropped."""
+"""The valid part of a COLMAP model; broken cameras, poses, points, observations are dropped."""
 
 from pathlib import Path
 

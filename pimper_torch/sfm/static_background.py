@@ -47,7 +47,7 @@ class Pair(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class StaticBackground(Record):
-    """What is at rest in photographs.
+    """Static background of photographs.
 
     Attributes:
         features: True for those of a room at rest, one tensor a photograph.

@@ -1,4 +1,4 @@
-"""What surrounds each point of a sparse cloud: a little plane, and who looks at it."""
+"""Tangent plane at each point of a sparse cloud, and the views of it."""
 
 from dataclasses import dataclass
 

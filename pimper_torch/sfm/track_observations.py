@@ -76,7 +76,7 @@ class SightingSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pictures(Record):
-    """What patches are looked up in.
+    """Photographs in which patches are looked up.
 
     Attributes:
         unusable: 1 where a pixel cannot be used.
@@ -129,7 +129,7 @@ class TrackObservations(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Templates(Record):
-    """What the reference views show.
+    """Patches as the reference views show them.
 
     Attributes:
         values: Light taken out; the window's square root is in them.

@@ -1,4 +1,4 @@
-"""How reliable silhouettes are: every view's cut against the visual hull and what is behind."""
+"""Reliability of silhouettes: every view's cut against the visual hull and the background."""
 
 from dataclasses import dataclass
 

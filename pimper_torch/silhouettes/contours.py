@@ -1,4 +1,4 @@
-"""What the silhouettes say about the surface, as one record that stages hand on."""
+"""Constraints of the silhouettes on the surface, as one record that stages hand on."""
 
 from dataclasses import dataclass
 

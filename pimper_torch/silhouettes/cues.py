@@ -1,4 +1,4 @@
-"""What is known of the object before any view is cut."""
+"""Cues about the object before any view is cut."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -32,7 +32,7 @@ _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degree
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Cues(Record):
-    """What is known of the object before any view is cut.
+    """Cues about the object before any view is cut.
 
     Attributes:
         object_px: Pixels of the object's points, one tensor a view.
@@ -54,7 +54,7 @@ class Cues(Record):
 
     @property
     def num_views(self) -> int:
-        """How many views there are."""
+        """Number of views."""
         return len(self.object_px)
 
     @property

@@ -131,7 +131,7 @@ class Everywhere(Hull):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class HalfSpace(Everywhere):
-    """What is above planes, where silhouettes tell nothing.
+    """Half-space above planes, where silhouettes constrain nothing.
 
     Points of the planes are as deep inside as all others, and shape the surface with them; surface
     on a plane is not held.

@@ -1,4 +1,4 @@
-"""What OpenCV computes on masks and photographs."""
+"""Operations of OpenCV on masks and photographs."""
 
 import cv2
 import numpy as np

@@ -22,7 +22,7 @@ _DARK = 0.005  # of white; logarithms of what is darker tell noise
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pictures(Record):
-    """What the eye would see, small.
+    """Photographs in display colours, reduced.
 
     Attributes:
         colours: Encoded as sRGB, exposed alike; padding is black.

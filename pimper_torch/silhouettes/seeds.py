@@ -1,4 +1,4 @@
-"""What is certain before a view is cut: labels from points, parallax and the hull."""
+"""Certain labels before a view is cut: from points, parallax and the hull."""
 
 import torch
 from jaxtyping import Bool, Float, UInt8

@@ -34,7 +34,7 @@ class SilhouetteConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SilhouetteDetails:
-    """What of :class:`FindSilhouettes` is the same for all photographs.
+    """Values of :class:`FindSilhouettes` that all photographs share.
 
     Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
 

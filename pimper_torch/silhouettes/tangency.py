@@ -25,7 +25,7 @@ _NEIGHBOURS = 7
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TangencyConfig:
-    """How positions on contour rays are chosen.
+    """Settings of the choice of positions on contour rays.
 
     Attributes:
         steps: Places that are looked at on each ray, over the object's depth.

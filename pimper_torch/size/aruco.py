@@ -1,4 +1,4 @@
-"""What OpenCV's ArUco finds in photographs, and how its markers look. Imports ``cv2``."""
+"""Detection and drawing of ArUco markers by OpenCV. Imports ``cv2``."""
 
 from dataclasses import dataclass
 

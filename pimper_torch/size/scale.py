@@ -25,7 +25,7 @@ _ANOTHER = 0.15
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale(Record):
-    """What lengths have to be multiplied by to be in a known unit.
+    """Factor that brings lengths to a known unit.
 
     Attributes:
         factor: Of a result in its own unit.

@@ -1,4 +1,4 @@
-r"""How well views agree on one point of the surface, under the light of each.
+r"""Agreement of views on one point of the surface, under the light of each.
 
 A view ``g`` should show :math:`\rho s_g`, with :math:`s_g` what its light makes of albedo 1
 there. The albedo that fits all views best is found by re-weighted means, and its robust residual

@@ -1,4 +1,4 @@
-"""What hands a bucket's samples to the compiled sweep, and takes the costs of all heights."""
+"""Costs of a bucket's samples at all heights, by the compiled sweep."""
 
 import torch
 from jaxtyping import Float, Int

@@ -35,7 +35,7 @@ _LEAST_WAY = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Scan(Record):
-    """What every frame of a video is worth.
+    """Quality of every frame of a video.
 
     Attributes:
         sharpness: See :func:`~pimper_torch.video.quality.sharpness`.

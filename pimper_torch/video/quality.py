@@ -1,4 +1,4 @@
-"""What tells how sharp a frame is, and how far the camera or the object moved since another."""
+"""Sharpness of a frame, and motion of the camera or the object since another."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""What a surface can be coloured by."""
+"""Quantities that colour a surface."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What a run finds, one after another, in the viewer."""
+"""Results of a run, one after another, in the viewer."""
 
 import torch
 

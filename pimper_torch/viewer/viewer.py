@@ -60,7 +60,7 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """What a browser opens."""
+        """Address for a browser."""
         return address(self.server)
 
     def stop(self) -> None:

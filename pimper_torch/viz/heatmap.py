@@ -31,7 +31,7 @@ _BAR_PX = (16, 400)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorScale:
-    """How errors become colours.
+    """Scale from errors to colours.
 
     Attributes:
         clip: Errors from here on have the last colour.
@@ -48,13 +48,13 @@ class ErrorScale:
 
     @property
     def label(self) -> str:
-        """What stands above the colour bar."""
+        """Title of the colour bar."""
         return f"{self.what}, {self.unit}, 0 to {self.clip:g} (clipped at {self.clip:g})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodPanels:
-    """What one method made of a scene.
+    """Result of one method on a scene.
 
     Attributes:
         surface: Picture of it, sRGB, rows first; ``None`` if it gave none.

@@ -1,4 +1,4 @@
-"""What a view shows of a mesh, pixel by pixel."""
+"""Maps of a mesh as a view shows it, pixel by pixel."""
 
 from dataclasses import dataclass
 

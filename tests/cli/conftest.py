@@ -27,7 +27,7 @@ def ctrl_c(monkeypatch):
 
 
 @pytest.fixture
-def chain(reconstruction, monkeypatch):
+def chain(reconstruction, monkeypatch, lit_before):
     """Put a chain in the place of the real one that tells what it was given."""
     from pimper_torch.cli import run
     from pimper_torch.io import results

@@ -41,7 +41,6 @@ def test_the_help_that_comes_at_once_is_that_of_the_command(tmp_path, capsys):
 
 REFUSED = [
     ["reconstruct", "photos", "-o", "out", "--sede", "3"],
-    ["reconstruct", "photos", "-o", "out", "--reconstruct.starts", "many"],
     ["reconstruct", "nowhere", "-o", "out"],
     ["reconstruct", "photos", "-o", "out", "--masks", "nowhere"],
     ["reconstruct", "photos", "-o", "out", "--reference", "nosuch"],
@@ -50,10 +49,8 @@ REFUSED = [
     ["render", "mug", "-o", "out", "--num-views", "-3"],
     ["export", "nowhere", "-o", "out", "--format", "maps"],
     ["export", "photos", "-o", "out", "--format", "gif"],
-    ["export", "photos", "-o", "out", "--format"],
     ["export", "photos", "-o", "photos", "--format", "maps"],
     ["evaluate", "nowhere", "photos"],
-    ["bench", "-o", "photos"],
     ["convert", "nowhere", "-o", "out", "--source", "idr", "--target", "colmap"],
     ["gamma", "nowhere"],
     ["clean", "nowhere"],
@@ -125,15 +122,14 @@ def test_where_nothing_can_be_told_at_once_the_command_does(tmp_path):
     answers(code, tmp_path)
 
 
-@pytest.mark.parametrize("line", [["--help"], ["gamma", "--help"]])
-def test_whoever_has_read_enough_sees_no_traceback(line):
-    code = f"""if True:
+def test_whoever_has_read_enough_sees_no_traceback():
+    code = """if True:
         import os, sys
         from pimper_torch.cli.main import main
         reading, writing = os.pipe()
         os.dup2(writing, 1)
         os.close(reading)
-        sys.exit(main({line}))
+        sys.exit(main(["gamma", "--help"]))
     """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stderr == ""

@@ -82,7 +82,7 @@ def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, caps
     assert "lies in the folder of the result" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--images", "--masks", "--mesh"])
+@pytest.mark.parametrize("option", ["--images", "--mesh"])
 def test_an_input_of_convert_in_its_output_is_refused(project, capsys, option):
     others = ["--source", "colmap", "--target", "idr", "--overwrite"]
     assert run("convert", project, "-o", project, *others) == 2

@@ -2,13 +2,12 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.densify import agreeing, median3, push_pull, sweep
+from pimper_torch.coarse.densify import agreeing, push_pull, sweep
 from pimper_torch.coarse.fine_surface import near_points
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, pair
 from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
 from pimper_torch.coarse.oriented import (
     OrientedPoints,
-    fitted_planes,
     no_points,
     sparse_oriented,
     thinned,
@@ -94,22 +93,6 @@ def test_holes_are_filled_from_around_and_the_rest_stays():
     assert_close(even, torch.full_like(values, 3.0))
 
 
-def test_a_plane_is_fitted_exactly_and_a_step_is_not_smoothed():
-    u, v = torch.arange(20.0), torch.arange(16.0)
-    plane = 0.2 + 0.001 * u[None] - 0.002 * v[:, None]
-    valid = torch.ones_like(plane, dtype=torch.bool)
-    fitted, slope, _, fine = fitted_planes(plane, valid, 0.004)
-    inner = (slice(3, -3), slice(3, -3))
-    assert fine[inner].all()
-    assert_close(fitted[inner], plane[inner], atol=1e-5, rtol=0)
-    expected = torch.tensor([0.001, -0.002]).expand_as(slope[inner])
-    assert_close(slope[inner], expected, atol=1e-5, rtol=0)
-    stepped = plane + 0.2 * (u > 9)
-    near, _, _, fine = fitted_planes(stepped, valid, 0.004)
-    assert_close(near[fine], stepped[fine], atol=2e-4, rtol=0)
-    assert not fine[3:-3, 9:11].any()  # beside the step half a window is elsewhere
-
-
 def test_noisy_points_share_larger_cells_and_sides_stay_apart():
     points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0))
     points[:, 2] = 0.5
@@ -170,14 +153,6 @@ def test_narrow_strips_along_a_border_go_unless_they_are_long_and_supported():
     assert not bool(fringes(vertices, faces, kept, supported, 5.0, 0).any())
 
 
-def test_faces_are_connected_to_marked_ones_through_their_kind_only():
-    vertices, faces = icosphere(3)
-    height = vertices[faces].mean(dim=1)[:, 2]
-    caps = height.abs() > 0.5
-    found = connected_to(faces, caps, height > 0.99)
-    assert (found == (height > 0.5)).all()
-
-
 def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it():
     flat = table(half_side=72.0, cells=48)
     centre = flat.vertices_world[flat.faces].mean(dim=1)
@@ -202,13 +177,6 @@ def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it
     assert connected[narrow < 20].all()  # the strip joins them
     dark = counts.replace(lit=0 * views)
     assert (near_points(flat.faces, centre, cloud, support, dark, 1.0) == ~empty).all()
-
-
-def test_the_median_of_nine_is_that_of_a_sort():
-    values = torch.randn(17, 23, generator=torch.Generator().manual_seed(0))
-    wide = torch.nn.functional.pad(values[None], (1, 1, 1, 1), mode="replicate")[0]
-    around = wide.unfold(0, 3, 1).unfold(1, 3, 1).flatten(2)
-    assert torch.equal(median3(values), around.median(dim=2).values)
 
 
 def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_sees_another():

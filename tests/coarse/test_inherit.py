@@ -3,11 +3,11 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.inherit import fitted_normals, with_points
+from pimper_torch.coarse.inherit import fitted_normals
 from pimper_torch.coarse.splitting import split_edges
 from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
+from pimper_torch.records import Convergence, Mesh, Surface
 
 
 @pytest.fixture
@@ -90,45 +90,3 @@ def test_where_the_surface_has_no_vertex_normals_are_the_facets_own(generator):
     found = fitted_normals(mesh, surface, split, index)
     used = torch.unique(mesh.faces)
     assert_close(found[used], torch.tensor([0.0, 0, 1]).double().expand(len(used), 3))
-
-
-def test_points_follow_their_facets_and_a_moved_vertex_leaves_its_point(generator):
-    vertices, faces, split, fine = square()
-    uv = torch.rand(60, 2, generator=generator, dtype=torch.float64)
-    points_world = torch.cat([uv, 0.05 * uv[:, :1]], dim=1)  # off the plane
-    covariance = torch.eye(3).double() * torch.arange(1, 65)[:, None, None]
-    coarse = CoarseMesh(
-        mesh=Mesh(vertices_world=vertices, faces=faces),
-        reference=0,
-        is_point=torch.tensor([True, True, True, False]),
-        covariance_world=covariance[60:] * torch.tensor([1, 1, 1, 0])[:, None, None],
-        points=FacetPoints(
-            points_world=points_world,
-            covariance_world=covariance[:60],
-            facet=(uv[:, 1] > uv[:, 0]).long(),
-        ),
-        support=torch.tensor([2, 3]),
-    )
-    moved = fine.clone()
-    moved[2, 2] += 0.1
-    dropped = 5
-    kept = torch.arange(len(split.faces)) != dropped
-    index = torch.where(kept, kept.cumsum(dim=0) - 1, -1)
-    mesh = Mesh(vertices_world=moved, faces=split.faces[kept])
-    found = with_points(coarse, mesh, split, index, torch.arange(len(moved)))
-    assert found.is_point.tolist() == [True, True] + [False] * (len(moved) - 2)
-    assert_close(found.covariance_world[:2], coarse.covariance_world[:2])
-    assert not found.covariance_world[2:].any()
-    assert found.support.tolist() == coarse.support[split.parent[kept]].tolist()
-    # Brute force: the child whose triangle holds the point, seen from above.
-    child = barycentric_2d(uv[:, None], fine[split.faces][None, ..., :2]).amin(dim=-1).argmax(dim=1)
-    stays = child != dropped
-    assert 0 < int((~stays).sum()) < 30
-    points = found.points
-    assert_close(points.points_world[:-1], points_world[stays])
-    assert_close(points.covariance_world[:-1], covariance[:60][stays])
-    assert points.facet[:-1].tolist() == index[child][stays].tolist()
-    # The vertex that moved: its former position, with its covariance, on a face round it.
-    assert_close(points.points_world[-1], vertices[2])
-    assert_close(points.covariance_world[-1], coarse.covariance_world[2])
-    assert 2 in mesh.faces[points.facet[-1]].tolist()

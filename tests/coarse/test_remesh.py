@@ -1,12 +1,10 @@
-import time
-
 import pytest
 import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
-from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.errors import InputError
 from pimper_torch.evidence.scenes.meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
@@ -301,21 +299,3 @@ def test_a_surface_of_another_mesh_is_refused(generator):
     coarse, other = sheet(generator), sheet(generator, side=9)
     with pytest.raises(InputError, match="facets"):
         remesh(coarse, surface_on(other, lambda points: points), SPACING)
-
-
-def test_impossible_settings_are_refused():
-    with pytest.raises(ConfigError, match="max_departure"):
-        RemeshConfig(max_departure=0.0)
-
-
-@pytest.mark.slow
-def test_five_thousand_facets_and_a_million_vertices_take_seconds(generator):
-    vertices, faces = icosphere(4)
-    coarse = coarse_of(vertices, faces)
-    surface = surface_on(coarse, lambda points: normalize(points, dim=1), spacing=0.0038)
-    assert len(surface.vertices_world) > 900_000
-    config = RemeshConfig(max_departure=0.05, min_samples=5.0, max_facets=20_000)
-    began = time.process_time()
-    found = remesh(coarse, surface, 0.0038, config)
-    assert time.process_time() - began < 20  # 1.5 measured
-    assert len(found.mesh.faces) > 10_000

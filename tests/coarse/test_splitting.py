@@ -36,7 +36,7 @@ def generator():
     return torch.Generator().manual_seed(23)
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("fraction", [0.1, 1.0])
 def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(generator, fraction):
     vertices, faces = icosphere(2)
     edges, _ = face_edges(faces)

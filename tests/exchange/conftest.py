@@ -67,7 +67,7 @@ def run(reconstruction, photographs):
 
 
 @pytest.fixture
-def without_pictures(monkeypatch):
+def without_pictures(monkeypatch, lit_before):
     """Draw nothing: pictures are not read back, and take longer than all else."""
     for draw in ("draw_overview", "draw_turn"):
         monkeypatch.setattr(results, draw, lambda *given: given[-1].write_bytes(b""))

@@ -13,7 +13,7 @@ from pimper_torch.exchange import read_result
 from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.geometry.projection import project
 from pimper_torch.io import results
-from pimper_torch.io.estimates import estimate_of, read_estimate
+from pimper_torch.io.estimates import estimate_of
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import Encoding
 
@@ -45,14 +45,6 @@ def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
         atol=1e-6,
         equal_nan=True,
     )
-
-
-def test_both_readers_of_a_folder_agree(folder):
-    found, estimate = read_result(folder), read_estimate(folder)
-    assert_close(found.mesh.vertices_world.double(), estimate.mesh.vertices_world)
-    assert_close(found.lights_world, estimate.lights_world, rtol=0, atol=0, equal_nan=True)
-    assert torch.equal(found.cameras.cam_from_world, estimate.cameras.cam_from_world)
-    assert found.reference == estimate.reference
 
 
 def test_photographs_that_moved_are_named(folder, photographs, tmp_path):

@@ -97,13 +97,6 @@ def test_with_everything_or_nothing_known_nothing_is_changed(square, everywhere)
     assert torch.equal(about_mean(ramp(points), known, face_edges(faces)[0]), ramp(points))
 
 
-def test_values_that_are_all_alike_are_continued(square):
-    points, faces = square
-    known = points[:, 0] < 0.3
-    alike = torch.where(known, 0.25, 7.0)[:, None].float()
-    assert_close(about_mean(alike, known, face_edges(faces)[0]), torch.full_like(alike, 0.25))
-
-
 def test_gradients_are_those_of_what_is_known(square):
     points, faces = square
     known = (points[:, :2] - 0.5).norm(dim=1) > 0.25

@@ -65,16 +65,6 @@ def test_the_noise_of_each_kind_is_found_whatever_it_claims(generator):
     assert abs(found.factors[1] * 3.24 - 1) < 0.25
 
 
-def test_the_answer_beats_each_kind_alone(generator):
-    slopes, heights = drawn(generator, 0.02, 3 * (COUNT - 1)), drawn(generator, 0.1)
-    both = fused([steps(slopes, 0.05), places(heights, 0.05)], iterations=20).heights - smooth()
-    assert both.square().mean().sqrt() < 0.5 * heights.square().mean().sqrt()
-    mean = slopes.reshape(3, -1).mean(dim=0)
-    integrated = torch.cat([torch.zeros(1), mean]).cumsum(0)
-    integrated = integrated - integrated.mean()
-    assert both.square().mean().sqrt() < 0.3 * integrated.square().mean().sqrt()
-
-
 def test_outliers_are_let_go(generator):
     wrong = drawn(generator, 0.05)
     wrong[::10] = 4.0

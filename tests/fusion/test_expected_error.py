@@ -81,10 +81,9 @@ def near(found, expected):
     assert ((found / expected - 1).abs() < CLOSE).all()
 
 
-@pytest.mark.parametrize("deviation", [0.01, 0.1])
-def test_independent_noise_gives_the_diagonal_of_the_inverse(square, deviation):
+def test_independent_noise_gives_the_diagonal_of_the_inverse(square):
     subdivision, facets = square
-    fused = solved(subdivision, differences(subdivision, 0.02), heights(subdivision, deviation))
+    fused = solved(subdivision, differences(subdivision, 0.02), heights(subdivision, 0.1))
     found = expected_error(fused, fused, subdivision, facets, DRAWS)
     near(found, torch.linalg.inv(dense(fused)[0]).diagonal().sqrt())
 
@@ -155,19 +154,6 @@ def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
     own, rest = answer[:, : len(edges)], answer[:, len(edges) : len(edges) + len(eye)]
     total = own @ covariance @ own.mT + 0.1**2 * rest @ rest.mT
     near(found, total.diagonal().sqrt())
-
-
-def test_regions_are_a_few_facets_wide(square):
-    subdivision, _ = square
-    label = regions(subdivision)
-    assert len(label.unique()) == 4
-    centre = subdivision.points.new_zeros(32, 3).index_add(0, subdivision.facet, subdivision.points)
-    centre = centre / torch.bincount(subdivision.facet)[:, None]
-    for one in label.unique():
-        extent = centre[label == one].amax(dim=0) - centre[label == one].amin(dim=0)
-        assert extent.max() < 2.5 * 0.27  # the edge of an equilateral facet of their area
-    moved = subdivision.replace(points=3 * subdivision.points)
-    assert torch.equal(regions(moved), label)  # whatever the scale
 
 
 def test_facets_whose_vertices_name_others_have_regions():

@@ -9,7 +9,6 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.chains.streaming import warn_of_priors
-from pimper_torch.coarse.remesh import Remesh
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
@@ -56,9 +55,8 @@ def off_plane(lifted, surface) -> torch.Tensor:
     return (surface.vertices_world.double() @ lifted.normal) / spacing
 
 
-@pytest.mark.parametrize("height", [-1.5, 1.0])
-def test_facets_beside_a_plane_come_to_lie_on_it(swept, height):
-    lifted, given = swept(height)
+def test_facets_beside_a_plane_come_to_lie_on_it(swept):
+    lifted, given = swept(-1.5)
     surface = Fuse()(given, FREE)
     off = off_plane(lifted, surface).abs()
     assert off.quantile(0.9) < 0.05
@@ -131,7 +129,6 @@ def spoiled(given, **changes):
         ({"normals_patch": torch.tensor([1.0, 0, 0]).double()}, "1 of .* face away"),
         ({"normals_patch": torch.full((3,), torch.nan).double()}, "1 of .* NaN"),
         ({"information": -0.1}, "information has 1 .* such as -0.1"),
-        ({"information": torch.inf}, "such as inf"),
         ({"information": torch.nan}, "such as nan"),
     ],
 )
@@ -239,47 +236,6 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     assert pimple.abs().max() < 0.1
 
 
-def noisy(lifted, given, points: float, rotation: float, seed: int):
-    """Add noise to normals, radians, and to points of the cloud, samples; both say how much."""
-    generator = torch.Generator().manual_seed(seed)
-    spacing = float(given.patches.buckets[0].spacing[0])
-    buckets = []
-    for found in given.photometric.buckets:
-        noise = torch.randn(found.normals_patch.shape, generator=generator, dtype=torch.float64)
-        wrong = normalize(found.normals_patch + rotation * noise, dim=-1)
-        information = torch.full_like(found.information, 1 / rotation**2)
-        buckets.append(found.replace(normals_patch=wrong, information=information))
-    rotated = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
-    cloud = near_plane(lifted, 0.0)
-    cloud = cloud + points * spacing * torch.randn(cloud.shape, generator=generator).double()
-    return with_points(rotated, cloud, points * spacing)
-
-
-def test_the_expected_error_is_the_true_one_on_noise_of_two_levels(swept):
-    lifted, given = swept(0.5)
-    spacing = float(given.patches.buckets[0].spacing[0])
-    fuse = Fuse(FuseConfig(terms=without("swept_heights"), bias_iterations=1, noise_iterations=2))
-    median = []
-    for points, rotation in ((0.05, 0.02), (0.4, 0.1)):
-        ratios, expected = [], []
-        for seed in range(3):
-            surface = fuse(noisy(lifted, given, points, rotation, seed), FREE)
-            error = surface.expected_error / spacing
-            off = off_plane(lifted, surface).abs()
-            ratios.append(float((off / error).median() / 0.6745))
-            expected.append(float(error.median()))
-        # A plane through 24 points has three errors, so that one draw of noise varies by two.
-        assert 0.4 < sorted(ratios)[1] < 2.5
-        median.append(sorted(expected)[1])
-    assert 3 < median[1] / median[0] < 12  # noise is 8 and 5 times as large
-    silent = Fuse(
-        FuseConfig(
-            terms=without("swept_heights"), bias_iterations=1, noise_iterations=2, error_draws=0
-        )
-    )
-    assert silent(noisy(lifted, given, 0.1, 0.05, 0), FREE).expected_error is None
-
-
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
     nothing = tuple(
@@ -364,15 +320,6 @@ def test_what_is_continued_does_not_outvote_points(swept):
     off = off_plane(lifted, surface)
     assert off[dark[inner]].median() > 0.4  # as stiff as the lit surface: 0.14
     assert off[surface.confidence > 0].median() < 0.01
-
-
-def test_facets_that_views_see_stay_though_light_tells_nothing_of_them(swept):
-    _, given = swept(0.8)
-    surface = Fuse()(given, FREE)
-    dark = surface.replace(information=torch.zeros_like(surface.information))
-    dark.information[0] = 1.0  # so that there is some at all
-    kept = Remesh()(given, dark, FREE)
-    assert len(kept.mesh.faces) >= len(given.patches.coarse.mesh.faces)
 
 
 @pytest.mark.parametrize("name", ["normals_patch", "offset"])

@@ -151,7 +151,7 @@ def test_flat_facets_come_to_lie_on_the_sphere(cap):
     assert angle.max() < 2  # at the border, where one side is missing
 
 
-@pytest.mark.parametrize(("rotation", "lift"), [(0.05, 0.5), (0.2, 0.5), (0.2, 2.0)])
+@pytest.mark.parametrize(("rotation", "lift"), [(0.05, 0.5), (0.2, 2.0)])
 def test_the_expected_error_is_that_of_draws_of_noise_whatever_is_claimed(cap, rotation, lift):
     # Facets that err by nothing together: what their mean shows is chance, and is not sought.
     fuse = Fuse(FuseConfig(bias_iterations=0))
@@ -162,7 +162,7 @@ def test_the_expected_error_is_that_of_draws_of_noise_whatever_is_claimed(cap, r
         true.append(off_sphere(surface.vertices_world).square().mean())
         expected.append(surface.expected_error.square().mean())
     ratio = (torch.stack(true).mean() / torch.stack(expected).mean()).sqrt()
-    # Measured 0.81, 0.89 and 1.18; eight draws of eight draws. Slopes of neighbouring edges share
+    # Measured 0.81 and 1.18; eight draws of eight draws. Slopes of neighbouring edges share
     # a normal's error, which is drawn for each: where normals alone know the shape it is 1.5.
     assert 0.75 < ratio < 1.25
 

@@ -37,31 +37,6 @@ def test_the_inverse_undoes_the_transform_in_every_batch(generator):
     assert_close(transform(source_from_target, transform(target_from_source, points)), points)
 
 
-def test_transforms_chain_by_matrix_product(generator):
-    c_from_b, b_from_a = random_rigid(generator, 2)
-    points = torch.randn(7, 3, generator=generator, dtype=torch.float64)
-    assert_close(
-        transform(c_from_b @ b_from_a, points), transform(c_from_b, transform(b_from_a, points))
-    )
-
-
-def test_one_set_of_points_meets_many_frames(generator):
-    frames = random_rigid(generator, 4)
-    points = torch.randn(6, 3, generator=generator, dtype=torch.float64)
-    together = transform(frames, points)
-    assert together.shape == (4, 6, 3)
-    assert_close(together[2], transform(frames[2], points))
-
-
-def test_directions_do_not_feel_the_translation(generator):
-    frame = random_rigid(generator, 1)[0]
-    moved = frame.clone()
-    moved[:3, 3] += 5
-    vectors = torch.randn(6, 3, generator=generator, dtype=torch.float64)
-    assert_close(rotate(frame, vectors), rotate(moved, vectors))
-    assert_close(rotate(frame, vectors).norm(dim=1), vectors.norm(dim=1))
-
-
 def test_gradients_reach_points_and_frames(generator):
     frame = random_rigid(generator, 1)[0].requires_grad_()
     points = torch.randn(3, 3, generator=generator, dtype=torch.float64, requires_grad=True)

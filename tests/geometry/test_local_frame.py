@@ -7,7 +7,7 @@ from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origi
 from tests.coarse.ball import all_round
 
 UTM = (448231.25, 5411923.5, 312.125)
-OFFSETS = [UTM, (1e5, -1e5, 0.0), (4.2e6, 1.7e5, 4.78e6), (0.0, 0.0, -3e7)]
+OFFSETS = [UTM, (0.0, 0.0, -3e7)]
 
 
 def cameras_and_points(offset):
@@ -25,7 +25,7 @@ def test_a_far_scene_gets_an_origin_among_its_points(offset):
     assert_close(near, transform(poses, points), rtol=0, atol=1e-7)  # 3e7 in double precision
 
 
-@pytest.mark.parametrize("offset", [NO_OFFSET, (10.0, 0.0, 0.0), (-20.0, 20.0, 15.0)])
+@pytest.mark.parametrize("offset", [NO_OFFSET, (-20.0, 20.0, 15.0)])
 def test_a_scene_near_its_origin_keeps_it(offset):
     assert local_origin(*cameras_and_points(offset)) == NO_OFFSET
 

@@ -33,11 +33,6 @@ def test_a_camera_projects_alone_as_it_does_in_company(cameras, points):
     assert_close(depth[1], depth_alone)
 
 
-def test_the_camera_centre_is_where_all_rays_start(cameras):
-    in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world[:, :3, :3], cameras.centers_world)
-    assert_close(in_cam + cameras.cam_from_world[:, :3, 3], torch.zeros(3, 3).double())
-
-
 def test_skewed_intrinsics_keep_the_round_trip(points):
     K = torch.tensor([[90.0, 2.0, 30], [0, 85, 20], [0, 0, 1]], dtype=torch.float64)
     cam_from_world = torch.eye(4, dtype=torch.float64)

@@ -8,10 +8,8 @@ from pimper_torch.geometry.topology import (
     boundary_vertices,
     corners_of,
     face_components,
-    face_counts,
     face_edges,
     face_pairs,
-    half_edges,
     vertex_components,
     vertex_fans,
 )
@@ -43,11 +41,6 @@ def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
     assert found == expected
 
 
-def test_an_edge_of_three_faces_joins_no_pair():
-    pairs, _ = face_pairs(torch.tensor([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
-    assert len(pairs) == 0
-
-
 def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     faces = torch.from_numpy(mesh.faces)
@@ -68,13 +61,6 @@ def test_the_boundary_is_where_an_edge_has_not_two_faces():
     assert boundary_vertices(fin, int(fin.max()) + 1).nonzero()[:, 0].tolist() == sorted(
         [*closed[0, :2].tolist(), int(fin.max())]
     )
-
-
-def test_half_edges_are_those_of_face_edges_in_the_direction_of_their_face():
-    edges, index = face_edges(FACES)
-    assert half_edges(FACES)[:3].tolist() == [[1, 2], [2, 0], [0, 1]]
-    assert torch.equal(half_edges(FACES).sort(dim=1).values, edges[index.flatten()])
-    assert face_counts(index).tolist() == [2 if edge == [0, 2] else 1 for edge in edges.tolist()]
 
 
 def test_corners_are_marked_once_for_chosen_faces_only():

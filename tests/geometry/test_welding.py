@@ -15,7 +15,7 @@ def triangles(vertices, faces):
     return sorted(vertices[faces].flatten(1).tolist())
 
 
-@pytest.mark.parametrize("offset", [0.0, 1.0, 5e6])
+@pytest.mark.parametrize("offset", [0.0, 5e6])
 def test_a_soup_of_triangles_becomes_the_surface_that_it_was(offset):
     vertices, faces = icosphere(3)
     vertices = vertices + offset

@@ -87,7 +87,7 @@ def test_without_its_package_heic_is_refused_with_what_to_install(tmp_path, monk
         load_views(tmp_path)
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".PNG", ".tif", ".dng"])
+@pytest.mark.parametrize("suffix", [".PNG", ".dng"])
 def test_heic_is_read_whatever_it_is_called(tmp_path, suffix):
     wanted = decode(write(tmp_path / "a.heic", DEEP))
     found = decode(write(tmp_path / f"b{suffix}", DEEP))
@@ -95,13 +95,13 @@ def test_heic_is_read_whatever_it_is_called(tmp_path, suffix):
     assert (found.lossy, found.full) == (True, wanted.full)
 
 
-@pytest.mark.parametrize("suffix", [".heic", ".cr2", ".png"])
-@pytest.mark.parametrize(("name", "lossy"), [("JPEG", True), ("PNG", False), ("TIFF", False)])
+@pytest.mark.parametrize(
+    ("suffix", "name", "lossy"),
+    [(".heic", "TIFF", False), (".cr2", "JPEG", True), (".png", "JPEG", True)],
+)
 def test_other_images_are_read_whatever_they_are_called(
     tmp_path, stored, monkeypatch, suffix, name, lossy
 ):
-    if suffix == ".cr2" and name == "TIFF":
-        pytest.skip("camera raw begins as TIFF does")
     monkeypatch.setattr("pimper_torch.io.extras.find_spec", lambda _: None)  # none is needed
     for index in range(3):
         Image.fromarray(stored).save(tmp_path / f"{index}{suffix}", format=name)
@@ -118,12 +118,10 @@ def test_other_images_are_read_whatever_they_are_called(
         (b"\0\0\0\x20ftypavif\0\0\0\0", "AVIF"),
         (b"RIFF\x10\0\0\0WEBPVP8 ", "WebP"),
         (b"\0\0\0\x20ftypisom\0\0\0\0", "MP4"),
-        (b"GIF89a" + bytes(20), "GIF"),
-        (b"8BPS" + bytes(20), "PSD"),
         (b"%PDF-1.7" + bytes(20), "PDF"),
     ],
 )
-@pytest.mark.parametrize("suffix", [".heic", ".jpg", ".dng"])
+@pytest.mark.parametrize("suffix", [".heic", ".dng"])
 def test_what_a_file_of_another_format_is_stands_in_its_refusal(tmp_path, start, name, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(start)

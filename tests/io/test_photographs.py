@@ -15,22 +15,13 @@ from pimper_torch.doctor.photograph import read_all
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.progress import listening
-from pimper_torch.radiometry import FROM_FILES, LINEAR, linear_from_srgb, srgb_from_linear
+from pimper_torch.radiometry import FROM_FILES, LINEAR, linear_from_srgb
 from pimper_torch.sfm.lenses import choose_lenses
 
 
 def save(path, array, **options):
     path.parent.mkdir(exist_ok=True, parents=True)
     Image.fromarray(array).save(path, **options)
-
-
-def test_linearization_undoes_the_encoding_and_has_its_known_values():
-    radiance = torch.linspace(0, 1, 1001, dtype=torch.float64)
-    # The standard's two pieces miss each other by about 3e-8 at the joint.
-    assert_close(linear_from_srgb(srgb_from_linear(radiance)), radiance, rtol=0, atol=1e-7)
-    known = torch.tensor([0.04, 0.5], dtype=torch.float64)
-    wanted = torch.tensor([0.04 / 12.92, 0.21404114048], dtype=torch.float64)
-    assert_close(linear_from_srgb(known), wanted, rtol=0, atol=1e-10)
 
 
 def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
@@ -209,20 +200,6 @@ def overlap(one, other):
     return float((one & other).sum() / (one | other).sum())
 
 
-def test_masks_drawn_before_or_after_turning_fit(photos, tmp_path, pixels):
-    exif = Image.Exif()
-    exif[274] = 6
-    for number in (1, 2, 10):
-        save(photos / f"{number}.png", pixels, exif=exif)
-    drawn = np.zeros((8, 12), dtype=np.uint8)
-    drawn[:3, :5] = 255
-    save(tmp_path / "masks" / "1.png", drawn)
-    save(tmp_path / "masks" / "2.png", drawn, exif=exif)
-    save(tmp_path / "masks" / "10.png", np.rot90(drawn, -1).copy())
-    masks = load_views(photos, masks=tmp_path / "masks").masks
-    assert torch.equal(masks, torch.from_numpy(np.rot90(drawn, -1) > 0).expand(3, 12, 8))
-
-
 def test_masks_shrink_with_their_photographs_and_do_not_reach_into_padding(tmp_path):
     white = np.full((32, 48, 3), 200, dtype=np.uint8)
     drawn = np.zeros((32, 48), dtype=np.uint8)
@@ -297,12 +274,6 @@ def test_black_photographs_are_refused_by_name(photos):
 def test_two_files_of_one_stem_are_refused(photos, pixels):
     save(photos / "2.jpg", pixels)
     with pytest.raises(InputError, match=r"2\.(jpg|png) and 2\.(jpg|png) differ only in"):
-        load_views(photos)
-
-
-def test_a_damaged_file_is_refused_by_name(photos):
-    (photos / "2.png").write_bytes((photos / "2.png").read_bytes()[:-60])
-    with pytest.raises(InputError, match=r"2\.png: cannot be read"):
         load_views(photos)
 
 

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.radiance import resized, resized_radiance
-from pimper_torch.radiometry import LINEAR, SATURATED, Encoding, linear_from_srgb
+from pimper_torch.radiometry import LINEAR, SATURATED, Encoding
 
 
 @pytest.fixture
@@ -188,8 +188,3 @@ def test_files_of_unlike_depth_saturate_each_at_their_own_level(raw, pixels):
         images = load_views(folder, encoding=Encoding(response="linear")).images
     assert_close(images[3], torch.from_numpy(shallow / 255).movedim(-1, 0).float())
     assert_close(images[0].double(), (levels[0] / 15000).clamp(max=1), rtol=0, atol=1e-4)
-
-
-def test_srgb_photographs_at_full_scale_are_read_as_ever(photos, pixels):
-    stored = torch.from_numpy(pixels / 255).movedim(-1, 0)
-    assert_close(load_views(photos).images[0].double(), linear_from_srgb(stored), rtol=0, atol=1e-6)

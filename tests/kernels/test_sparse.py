@@ -25,7 +25,7 @@ def agree(found, expected, rounding):
     assert (found[LAST:] == 7).all()
 
 
-@pytest.mark.parametrize("sides", [1, 2, 3, 8])
+@pytest.mark.parametrize("sides", [1, 3])
 def test_products_are_scipys(system, sides):
     matrix, generator, rounding = system
     given, start = (vectors(generator, sides, matrix) for _ in range(2))
@@ -34,7 +34,7 @@ def test_products_are_scipys(system, sides):
     agree(found, 0.5 * start - 2 * (matrix @ given), rounding)
 
 
-@pytest.mark.parametrize("sides", [1, 2, 3, 8])
+@pytest.mark.parametrize("sides", [1, 3])
 def test_a_step_is_scaled_and_corrected_as_written_out(system, sides):
     matrix, generator, rounding = system
     residual, step, start = (vectors(generator, sides, matrix) for _ in range(3))

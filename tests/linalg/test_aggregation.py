@@ -12,8 +12,10 @@ from tests.linalg.laplacians import triangles
 CPU = torch.device("cpu")
 
 
-@pytest.mark.parametrize("decades", [0.0, 4.0, 10.0])
-@pytest.mark.parametrize("side", [60, 160])  # the larger one has more rows than a thread is given
+@pytest.mark.parametrize(
+    ("side", "decades"),
+    [(60, 10.0), (160, 0.0)],  # the larger one has more rows than a thread is given
+)
 def test_prolongation_keeps_constants_where_there_is_no_anchor(side, decades):
     matrix = triangles(side, decades)
     diagonal = np.maximum(matrix.diagonal(), abs(matrix).sum(axis=1) / 2)
@@ -27,8 +29,7 @@ def test_prolongation_keeps_constants_where_there_is_no_anchor(side, decades):
     assert (rows > 0).mean() > 0.99  # others are isolated
 
 
-@pytest.mark.parametrize("decades", [0.0, 4.0, 10.0])
-@pytest.mark.parametrize("side", [60, 300])
+@pytest.mark.parametrize(("side", "decades"), [(60, 10.0), (300, 0.0)])
 def test_coarse_matrices_are_scipys_products(side, decades):
     matrix = triangles(side, decades)
     spread = prolongation(matrix)
@@ -61,7 +62,7 @@ def test_entries_off_the_diagonal_are_added_up_by_sign():
         np.testing.assert_allclose(size, abs(off[first:last]).sum(), rtol=1e-12)
 
 
-@pytest.mark.parametrize("sides", [(), (1,), (2,), (3,)])
+@pytest.mark.parametrize("sides", [(), (3,)])
 def test_a_level_is_that_of_torch_for_any_number_of_sides(sides):
     matrix = triangles(160, 3.0)  # more rows than one thread is given
     side = torch.randn(25600, *sides, generator=torch.Generator().manual_seed(1)).double()
@@ -72,7 +73,7 @@ def test_a_level_is_that_of_torch_for_any_number_of_sides(sides):
     assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("sides", [1, 2, 3])
+@pytest.mark.parametrize("sides", [1, 3])
 def test_a_cycle_in_float32_is_that_in_float64_but_for_rounding(sides):
     matrix = triangles(160, 3.0)
     side = torch.randn(25600, sides, generator=torch.Generator().manual_seed(1)).double()

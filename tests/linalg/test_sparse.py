@@ -46,7 +46,7 @@ def dense(rows, cols, values, size):
     return matrix.index_put((rows, cols), values, accumulate=True)
 
 
-@pytest.mark.parametrize("columns", [(), (1,), (3,), (0,)])
+@pytest.mark.parametrize("columns", [(), (3,), (0,)])
 def test_solutions_equal_those_of_a_dense_solve(generator, columns):
     start, end, weights, anchor = small_system(generator)
     rows, cols, values = laplacian(weights, start, end, anchor)
@@ -67,16 +67,6 @@ def test_gradients_reach_matrix_and_right_hand_side(generator):
 
     assert torch.autograd.gradcheck(solution, inputs)
     assert torch.autograd.gradgradcheck(solution, inputs)
-
-
-def test_one_factor_serves_many_right_hand_sides(generator):
-    start, end, weights, anchor = small_system(generator)
-    rows, cols, values = laplacian(weights, start, end, anchor)
-    factor = SparseCholesky(rows, cols, values, size=12)
-    rhs = torch.randn(2, 12, generator=generator, dtype=torch.float64)
-    matrix = dense(rows, cols, values, 12)
-    for one in rhs:
-        assert_close(matrix @ factor.solve(one), one)
 
 
 def test_float32_input_gets_a_float32_answer_computed_in_float64():

@@ -32,7 +32,7 @@ def test_straight_borders_stay_and_right_angles_are_rounded():
     assert not found[away > 3.5 * LENGTH].any()
 
 
-@pytest.mark.parametrize("radius", [6.0, 9.0])
+@pytest.mark.parametrize("radius", [6.0])
 def test_a_round_border_of_a_few_lengths_stays(radius):
     vertices, faces, middle = sheet()
     disc = (middle - 30).norm(dim=1) < radius * LENGTH

@@ -85,7 +85,7 @@ def test_a_closed_mesh_comes_back():
     assert torch.equal(found.mesh.faces, faces)
 
 
-@pytest.mark.parametrize("missing", [1, 2, 3, 7])
+@pytest.mark.parametrize("missing", [1, 7])
 def test_holes_of_few_faces_are_closed(missing):
     vertices, faces = icosphere(2)
     found = closed(Mesh(vertices_world=vertices, faces=faces[missing:]))

@@ -3,9 +3,9 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.errors import ReconstructionError
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.groups import diagonal, small_groups
+from pimper_torch.meshing.groups import diagonal
 from pimper_torch.records import Convergence, Surface
 from tests.meshing.sheets import sheet_of
 
@@ -74,17 +74,6 @@ def test_small_holes_stay_filled_and_large_ones_open():
     assert as_trimesh(mesh).euler_number == 0  # a disc with one hole
     closed = Extract(ExtractConfig(max_hole=0.5))(surface.replace(information=information))
     assert as_trimesh(closed).euler_number == 1
-
-
-def test_unsupported_groups_are_measured_one_by_one():
-    surface = sheet()
-    supported = (columns(surface) + surface.vertices_world[:, 1]) % 4 != 0
-    whole = diagonal(surface.vertices_world)
-    marked = small_groups(surface.vertices_world, surface.faces, ~supported, 0.1 * whole)
-    assert torch.equal(marked, ~supported)  # scattered singles, however far apart
-    band = columns(surface) > 1
-    marked = small_groups(surface.vertices_world, surface.faces, ~band, 0.5 * whole)
-    assert not marked.any()
 
 
 def test_islands_go_and_the_largest_piece_stays():
@@ -179,16 +168,3 @@ def test_faces_with_a_large_expected_error_are_cut_out():
         Extract(ExtractConfig(max_expected_error=1e-9))(
             surface.replace(expected_error=1 + 0 * fraction)
         )
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_expected_error", 0.0),
-        ("max_hole", -0.1),
-        ("max_stretch", 1.0),
-    ],
-)
-def test_settings_that_mean_nothing_are_refused(name, value):
-    with pytest.raises(ConfigError, match=name):
-        ExtractConfig(**{name: value})

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -8,15 +6,12 @@ from closedness import closedness
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import (
     boundary_loops,
     boundary_vertices,
     face_edges,
-    face_pairs,
-    graph_components,
     vertex_components,
 )
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -138,21 +133,6 @@ def test_looking_only_round_the_folds_changes_nothing():
     assert_close(Repair()(surface).vertices_world, whole)
 
 
-def test_folds_looked_for_among_few_faces_are_those_of_all(generator):
-    _, surface = folded_sphere()
-    vertices, faces = surface.vertices_world, surface.faces
-    vertices = vertices + 0.03 * torch.randn(vertices.shape, generator=generator).double()
-    found = faults(vertices, faces, surface.facet, torch.inf)
-    normals, pairs = unit_face_normals(vertices, faces), face_pairs(faces)[0]
-    fold = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(dim=1) < math.cos(math.radians(110))
-    over = found.overturned(vertices)
-    label = graph_components(pairs[over[pairs].all(dim=1)], len(faces))
-    folded = torch.zeros_like(over).index_fill(0, pairs[fold].flatten(), True)
-    folded |= over & torch.isin(label, label[folded & over])
-    assert 20 < folded.sum() < len(faces) / 2
-    assert (found.broken(vertices) == folded).all()
-
-
 def test_a_genuine_opening_stays_as_it_is():
     _, surface = folded_sphere()
     below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
@@ -196,12 +176,6 @@ def test_a_fold_that_extends_too_far_is_left():
     assert torch.equal(left.vertices_world, surface.vertices_world)
     assert torch.equal(left.confidence, surface.confidence)
     assert Repair(RepairConfig(max_extent=0.0))(surface) is surface
-
-
-@pytest.mark.parametrize(("name", "value"), [("max_extent", -0.1), ("max_stretch", 1.0)])
-def test_settings_that_mean_nothing_are_refused(name, value):
-    with pytest.raises(ConfigError, match=name):
-        RepairConfig(**{name: value})
 
 
 def test_a_spike_is_drawn_in():

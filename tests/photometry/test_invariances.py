@@ -1,6 +1,5 @@
 """What must not change normals: order of views and of patches, brightness. On random orders."""
 
-import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -22,7 +21,7 @@ def shuffled(count, seed):
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-@given(seed=SEEDS, power=st.integers(-4, 4))
+@given(seed=SEEDS, power=st.integers(-10, 10))
 def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, power):
     seen = scene().seen
     usual = Factorize()(seen)
@@ -52,13 +51,3 @@ def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, po
         )
         assert_close(shading, gain * usual_shading, rtol=1e-3, atol=0)
         assert torch.equal(after.status, before.status[order])
-
-
-@pytest.mark.parametrize("gain", [1e-3, 1e3])
-def test_any_unit_of_radiance_will_do(scene, gain):
-    seen = scene().seen
-    brighter = seen.replace(
-        buckets=tuple(one.replace(radiance=gain * one.radiance) for one in seen.buckets)
-    )
-    for before, after in zip(Factorize()(seen).buckets, Factorize()(brighter).buckets, strict=True):
-        assert_close(after.normals_patch, before.normals_patch, rtol=0, atol=1e-3)

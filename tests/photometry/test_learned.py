@@ -8,7 +8,6 @@ import pimper_torch as pt
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics.evaluate import EvaluateConfig, evaluate
-from pimper_torch.evidence.scenes import SceneConfig, render_scene
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
@@ -99,13 +98,6 @@ def test_what_is_not_seen_does_not_matter(prior, samples):
     assert torch.equal(one.normal_weight, other.normal_weight)
 
 
-def test_guesses_are_unit_normals_and_factors(prior, samples):
-    found = prior(samples)
-    assert torch.allclose(found.normals.norm(dim=-1), torch.ones(2, 9, dtype=torch.float64))
-    assert ((found.inlier > 0) & (found.inlier <= 1)).all()
-    assert (found.normal_weight > 0).all()
-
-
 def test_missing_or_foreign_weights_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"there is no such file; needed: the weights"):
         LearnedPrior.trained(tmp_path / "none.safetensors")
@@ -136,23 +128,3 @@ def errors(scene, preset):
     return tuple(
         statistics.fmean(getattr(one, f"{kind}_deg") for one in off) for kind in ("median", "mean")
     )
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
-@pytest.mark.parametrize(
-    ("shape", "settings", "factor"),
-    [
-        ("jar", {"num_views": 8, "width": 240, "height": 180, "seed": 0}, 0.9),  # glossy
-        ("balls", {"num_views": 10, "width": 200, "height": 150, "seed": 45}, 1.05),  # matte
-    ],
-)
-def test_medians_are_better_on_a_glossy_scene_and_hardly_worse_on_a_matte_one(
-    shape, settings, factor, tmp_path
-):
-    scene = render_scene(shape, tmp_path / shape, SceneConfig(**settings), processes=1)
-    median, mean = errors(scene, "default")
-    learned_median, learned_mean = errors(scene, "learned")
-    assert learned_median < factor * median
-    # The mean is of places that light does not tell: rims, and what few views see.
-    assert learned_mean < 1.01 * mean

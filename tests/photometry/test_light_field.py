@@ -49,19 +49,6 @@ def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
     assert_close(field.lights_at(points, normalize(points + 1, dim=1))[:, 0, 1:], found)
 
 
-def test_a_point_light_far_away_is_the_same_everywhere():
-    field = LightField(
-        origin=torch.zeros(3).double(),
-        soft=torch.tensor([[0.3, 0.1, 0.2, 0.4] + 5 * [0.0]]).double(),
-        point_light=torch.tensor([[0.6, 0.0, 0.8]]).double(),
-        closeness=torch.zeros(1).double(),
-    )
-    points = torch.tensor([[0.0, 0, 0], [50.0, -8, 4]], dtype=torch.float64)
-    expected = torch.tensor([0.3, 0.7, 0.2, 1.2], dtype=torch.float64)
-    found = field.lights_at(points, normalize(points + 1, dim=1))
-    assert_close(found[:, 0], expected.expand(2, 4))
-
-
 def test_point_lights_are_found_where_they_are(room, generator):
     points, normals, field = room
     albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)

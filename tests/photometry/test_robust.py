@@ -46,15 +46,6 @@ def test_the_spread_has_the_gradient_of_its_differences(generator):
     assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)
 
 
-def test_the_scale_of_gaussian_noise_solves_its_equation():
-    # By quadrature: the expectation of x^4 / (x^4 + t^4) over a unit Gaussian is a half at t.
-    x = torch.linspace(-12, 12, 400_001, dtype=torch.float64)
-    density = torch.exp(-x * x / 2) / (2 * torch.pi) ** 0.5
-    fraction = x**4 / (x**4 + 0.6472404**4)
-    half = torch.trapezoid(density * fraction, x)
-    assert abs(float(half) - 0.5) < 1e-7  # the constant has seven digits
-
-
 def test_weights_and_curvatures_are_derivatives_of_the_loss(generator):
     residual = drawn(generator, 60).requires_grad_()
     deviation = torch.tensor(0.4, dtype=torch.float64)

@@ -63,18 +63,6 @@ def test_a_distant_point_light_casts_the_ellipse_of_a_ball(ball_over_plane, plan
     assert 0.03 < (~found.lit).float().mean() < 0.2  # a shadow was there to be found
 
 
-def test_a_near_point_light_overhead_casts_a_wider_circle(ball_over_plane, plane):
-    points, normals = plane
-    point_light_height = 3.0
-    found = cast_shadows(
-        point_lights([(0, 0, point_light_height)]), ball_over_plane, points, normals, 1e-4
-    )
-    opening = math.asin(RADIUS / (point_light_height - HEIGHT))
-    contour = points[..., :2].norm(dim=-1) - point_light_height * math.tan(opening)
-    clear = contour.abs() > 0.003
-    assert (found.lit[..., 0] == (contour > 0))[clear].all()
-
-
 def test_what_stands_behind_the_point_light_casts_no_shadow(ball_over_plane, plane):
     points, normals = plane
     found = cast_shadows(
@@ -118,6 +106,7 @@ def test_edges_nearer_than_the_guard_make_unsure_and_no_others(ball_over_plane, 
     plain = cast_shadows(
         point_lights([(0, 0, point_light_height)]), ball_over_plane, points, normals, 1e-4
     )
+    assert (plain.lit[..., 0] == (contour > 0))[contour.abs() > 0.003].all()
     assert plain.sure.all()
     assert (plain.lit == found.lit).all()
 
@@ -131,7 +120,7 @@ def test_a_view_without_a_point_light_is_lit_everywhere(ball_over_plane, plane):
     assert found.lit[..., 1].all()
 
 
-@pytest.mark.parametrize("stride", [1, 3, 4])
+@pytest.mark.parametrize("stride", [1, 4])
 def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_plane, plane, stride):
     points, normals = plane
     field = point_lights([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
@@ -146,21 +135,6 @@ def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_pla
     assert found.sure.float().mean() > 0.85
     if stride == 1:
         assert (found.lit == dense.lit).all()
-
-
-def test_rays_are_cast_only_where_asked(ball_over_plane, plane):
-    points, normals = plane
-    field = point_lights([(0, 0, 3.0)])
-    mask = torch.zeros(1, *points.shape[:2], dtype=torch.bool)
-    mask[0, 90:110] = True
-    spacing = torch.tensor([0.02]).double()
-    settings = {"tolerance": 1e-4, "stride": 4}
-    raster = points[None], normals[None], spacing
-    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, mask=mask)
-    whole = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings)
-    assert (found.lit == whole.lit)[mask].all()
-    assert not found.lit[mask].all()
-    assert found.lit[0, :80].all()
 
 
 def test_rays_are_cast_only_in_views_that_show_the_sample(ball_over_plane, plane):

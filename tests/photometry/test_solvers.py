@@ -20,7 +20,12 @@ def solve_projection(problem, max_iterations, tolerance):
     return solve_variable_projection(problem, max_iterations, tolerance**2)
 
 
-SOLVERS = pytest.mark.parametrize("solve", [solve_balm, solve_projection])
+def solve_compiled(problem, max_iterations, tolerance):
+    found = solve_projection(problem.to(torch.float32), max_iterations, tolerance)
+    return found.to(torch.float64)
+
+
+SOLVERS = pytest.mark.parametrize("solve", [solve_balm, solve_projection, solve_compiled])
 
 
 def error(found, truth, weight, least=7):

@@ -142,26 +142,12 @@ def test_detached_records_are_cut_off(cameras):
     assert not moved.detach().intrinsics.requires_grad
 
 
-def test_a_record_is_saved_and_loaded_without_pickled_code(cameras, tmp_path):
-    box = Box(inside=cameras, many=(torch.ones(2),), label="box")
-    torch.save(box, tmp_path / "box.pt")
-    found = torch.load(tmp_path / "box.pt", weights_only=True)
-    assert found.label == "box"
-    assert torch.equal(found.inside.intrinsics, cameras.intrinsics)
-
-
 def test_a_loader_of_batches_puts_records_together(cameras):
     loader = DataLoader(
         [cameras.take([0]), cameras.take([1])], batch_size=2, collate_fn=Cameras.cat
     )
     (batch,) = loader
     assert torch.equal(batch.cam_from_world, cameras.cam_from_world)
-
-
-def test_camera_centres_are_transferred_to_the_origin_of_their_camera(cameras):
-    homogeneous = torch.cat([cameras.centers_world, torch.ones(2, 1).double()], dim=1)
-    in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world, homogeneous)
-    torch.testing.assert_close(in_cam[:, :3], torch.zeros(2, 3).double())
 
 
 def test_padding_is_outside_the_photographs():

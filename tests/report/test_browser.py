@@ -1,10 +1,8 @@
 """The page in a browser: what it draws, under which light, and what it asks for."""
 
-import os
 import shutil
 import time
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -306,29 +304,3 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     page.locator("#prediction img").wait_for(state="visible")
     assert page.get_by_role("heading", name="Stages").is_visible()
     plain.close()
-
-
-def test_pictures_of_a_result_are_made(browser, tmp_path):
-    """Pictures for README and docs: PIMPER_REPORT names a page, PIMPER_PICTURES the folder."""
-    report = os.environ.get("PIMPER_REPORT")
-    if not report:
-        pytest.skip("PIMPER_REPORT names no page")
-    folder = Path(os.environ.get("PIMPER_PICTURES", tmp_path))
-    context = browser.new_context(viewport={"width": 1200, "height": 770})
-    page = context.new_page()
-    opening(page, Path(report).absolute())
-    print(f"first frame after {page.evaluate('document.documentElement.dataset.ready')} ms")  # noqa: T201 - a figure to read
-    count = page.locator("#thumbnails button").count()
-    for name, layer, view in (
-        ("report", "lit", None),
-        ("report_photograph", "lit", count // 3),
-        ("report_error", "expected error", None),
-    ):
-        page.get_by_role("button", name="whole surface").click()
-        choose(page, layer)
-        if view is not None:
-            behind(page, view)
-        page.wait_for_timeout(500)
-        page.screenshot(path=folder / f"{name}.jpg", type="jpeg", quality=68)
-        assert pixels((folder / f"{name}.jpg").read_bytes()).std() > 20
-    context.close()

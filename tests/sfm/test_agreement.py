@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import rigid
-from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.agreement import agreement, epipolar_geometry, judged, pinholes_of
+from pimper_torch.sfm.agreement import agreement, judged
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
@@ -47,16 +45,6 @@ def rotated(model, view, angle=0.6):
     poses = model.cam_from_world.clone()
     poses[view] = poses[view] @ moved
     return model.replace(cam_from_world=poses)
-
-
-def test_the_epipolar_geometry_is_that_of_the_cameras(generator):
-    cameras, points = ball.cameras_on_an_arc(), ball.points_on_the_ball(20, generator)
-    model = ball.model_of(cameras, points, generator, noise_px=0.0)
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    ones = torch.ones(20, 1, dtype=torch.float64)
-    first, second = (torch.cat([pixels[view], ones], dim=1) for view in (1, 4))
-    F = epipolar_geometry(pinholes_of(model), (1, 4))
-    assert_close((second * (first @ F.mT)).sum(dim=1) / F.norm(), torch.zeros(20).double())
 
 
 def test_exact_matches_agree_with_their_model_through_a_bent_lens(generator):

@@ -3,8 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
 WRITE = """
 import numpy as np
 from PIL import Image
@@ -13,25 +11,19 @@ Image.fromarray(pixels).save({path!r})
 print("written")
 """
 COLMAP_FIRST = "from pimper_torch.sfm.binding import loaded\nloaded()\n"
-PILLOW_FIRST = f"import pimper_torch.io.decode\n{COLMAP_FIRST}"
 
 
-@pytest.mark.parametrize("start", [COLMAP_FIRST, PILLOW_FIRST])
-def test_a_png_is_written_after_colmap_was_loaded(start, tmp_path):
-    script = start + WRITE.format(path=str(tmp_path / "a.png"))
+def test_a_png_is_written_after_colmap_was_loaded(tmp_path):
+    script = COLMAP_FIRST + WRITE.format(path=str(tmp_path / "a.png"))
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert ran.stdout == "written\n", ran.stderr
+    assert (ran.stdout, ran.stderr) == ("written\n", "")
 
 
 def test_a_script_that_loads_pycolmap_before_pillow_is_warned():
     ran = subprocess.run(
-        [sys.executable, "-c", "import pycolmap\n" + PILLOW_FIRST],
+        [sys.executable, "-c", f"import pycolmap\nimport pimper_torch.io.decode\n{COLMAP_FIRST}"],
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert "Put `import PIL.Image` before `import pycolmap`" in ran.stderr
-    ran = subprocess.run(
-        [sys.executable, "-c", COLMAP_FIRST], capture_output=True, text=True, timeout=60
-    )
-    assert ran.stderr == ""

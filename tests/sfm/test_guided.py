@@ -73,8 +73,7 @@ def distance_from_mapped(homography, first, second):
     return (mapped[:, None, :2] / mapped[:, None, 2:] - second).norm(dim=2)
 
 
-@pytest.mark.parametrize("length", [128, 13])
-@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize(("length", "planar"), [(128, False), (13, True)])
 def test_the_two_largest_products_within_the_distance_are_found(generator, length, planar):
     def some(count):
         described = torch.rand(count, length, generator=generator)

@@ -93,11 +93,6 @@ def test_files_are_read_as_colmap_reads_them(model, tmp_path, text):
     assert tracks[0] == tracks[1]
 
 
-def test_a_name_with_spaces_is_read_from_text(model, tmp_path):
-    reconstruction_of(model, COLORS).write_text(str(tmp_path))
-    assert read_model(tmp_path).names == model.names
-
-
 def test_a_name_with_whatever_unicode_takes_for_spaces_and_line_ends_is_read_from_text(
     model, tmp_path
 ):

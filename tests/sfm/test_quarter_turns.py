@@ -40,12 +40,3 @@ def test_a_picture_turned_by_torch_has_its_pixels_where_they_are_said_to_be(gene
         column, row = (moved - 0.5).long().unbind(dim=1)
         turned = torch.rot90(picture, -quarters)  # against the clock
         assert torch.equal(turned[row, column], picture.reshape(-1))
-
-
-def test_four_quarters_give_the_lens_and_the_pose_back(lens):
-    pose = torch.randn(4, 4, dtype=torch.float64)
-    turned = lens
-    for _ in range(4):
-        turned, pose_too = turned_lens(turned, 1), turned_pose(pose, 4)
-    assert turned == lens
-    assert torch.equal(pose_too, pose)

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 import warnings
 from importlib.resources import files
 
@@ -17,7 +15,6 @@ from pimper_torch.errors import (
 )
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.progress import listening
-from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Views
 from pimper_torch.sfm import mapping, registration, retrieval, tangents
 from pimper_torch.sfm.reconstruct import Reconstruct, structure_from_motion
@@ -124,14 +121,6 @@ def test_a_folder_without_a_model_is_refused(views, tmp_path):
         Reconstruct()(views, tmp_path)
 
 
-def test_a_damaged_model_is_refused(scene, views, tmp_path):
-    write_model(scene, tmp_path)
-    images = tmp_path / "images.bin"
-    images.write_bytes(images.read_bytes()[:100])
-    with pytest.raises(InputError, match="cannot be read"):
-        Reconstruct()(views, tmp_path)
-
-
 def test_a_model_with_two_of_the_photographs_is_refused(scene, views, tmp_path):
     write_model(scene, tmp_path)
     few = views.replace(names=("b.jpg", "a.jpg", "x.jpg", "y.jpg", "z.jpg"))
@@ -172,20 +161,9 @@ def test_photographs_of_noise_that_do_not_match_are_refused(generator):
         Reconstruct(ReconstructConfig(affine_shape=False))(views.replace(images=noise))
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("camera_model", "SIMPLE_RADAL"),
-        ("peak_threshold", 0.0),
-        ("max_ratio", 1.5),
-        ("starts", -1),
-        ("guided_pairs", -1),
-        ("threads", -1),
-    ],
-)
-def test_an_impossible_setting_is_refused(field, value):
-    with pytest.raises(ConfigError, match=field):
-        ReconstructConfig(**{field: value})
+def test_an_unknown_camera_model_is_refused():
+    with pytest.raises(ConfigError, match="camera_model"):
+        ReconstructConfig(camera_model="SIMPLE_RADAL")
 
 
 def test_photographs_are_written_as_srgb_without_padding_and_masks_beside():
@@ -204,17 +182,6 @@ def test_photographs_are_written_as_srgb_without_padding_and_masks_beside():
     assert second.shape == (3, 2)
     assert (second == 0).all()
     assert mask.tolist() == [[255, 0]] * 3
-
-
-def test_the_srgb_curve_meets_its_published_points():
-    linear = torch.tensor([0.0, 0.0031308, 0.214041140482, 1.0, 2.0], dtype=torch.float64)
-    encoded = torch.tensor([0.0, 0.04045, 0.5, 1.0, 1.0], dtype=torch.float64)
-    assert_close(srgb_from_linear(linear), encoded, rtol=0, atol=1e-6)  # the curve's own seam
-
-
-def test_importing_the_package_does_not_load_colmap():
-    code = "import sys, pimper_torch.sfm.reconstruct; sys.exit('pycolmap' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ def ball(level: int = 5) -> Mesh:
     )
 
 
-@pytest.mark.parametrize("max_faces", [200, 1000, 5000])
+@pytest.mark.parametrize("max_faces", [200, 5000])
 def test_a_ball_has_no_more_faces_than_asked_for_and_keeps_what_it_knows(max_faces):
     few = reduced(ball(), max_faces)
     assert 0.9 * max_faces <= len(few.faces) <= max_faces

@@ -66,7 +66,7 @@ def off_deg(direction, truth=(0.0, 1.0, 0.0)):
 
 
 @pytest.mark.parametrize("span_deg", [330.0, 60.0])
-@pytest.mark.parametrize("elevation_deg", [-10.0, 0.0, 40.0, 75.0])
+@pytest.mark.parametrize("elevation_deg", [-10.0, 75.0])
 def test_cameras_that_are_held_level_tell_which_way_is_up(span_deg, elevation_deg):
     # Along an arc of 60 degrees, the y axes' lean counts a little against the x axes'.
     poses = standing(span_deg=span_deg, elevation_deg=elevation_deg).cam_from_world

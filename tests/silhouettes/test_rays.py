@@ -3,7 +3,6 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 from tests.silhouettes.shapes import PIXEL, ball, nearest_to, ring, silhouettes_of
@@ -96,10 +95,3 @@ def test_no_number_of_rays_reaches_past_the_end_of_a_contour(cameras):
     found = silhouettes_of(ball, cameras)
     for asked in (31, 62):
         assert len(contour_rays(found, cameras, RayConfig(per_view=asked)).view) > 0
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match="per_view"):
-        RayConfig(per_view=0)
-    with pytest.raises(ConfigError, match="max_concave_deg"):
-        RayConfig(max_concave_deg=200.0)

@@ -1,12 +1,10 @@
-import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.metrics.relative import angles_deg
 from pimper_torch.silhouettes.hull import visual_hull
 from pimper_torch.silhouettes.rays import contour_rays
-from pimper_torch.silhouettes.tangency import TangencyConfig, ambiguous, contour_points
+from pimper_torch.silhouettes.tangency import ambiguous, contour_points
 from tests.silhouettes.shapes import CENTERS, DISTANCE, PIXEL, ball, ring, silhouettes_of, two_balls
 
 BOX = torch.tensor([[-1.6, -1.6, -1.6], [1.6, 1.6, 1.6]])
@@ -111,8 +109,3 @@ def test_rays_that_miss_the_hull_have_no_point(cameras):
     beside = rays.replace(rays_world=rays.rays_world + 0.2 * rays.normals_world)
     towards = directions(500)
     assert len(contour_points(beside, cameras, hull, towards, towards).ray) == 0
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match="steps"):
-        TangencyConfig(steps=2)

@@ -50,10 +50,8 @@ def surface(reconstruction, shift):
 
 
 @pytest.fixture
-def folder(reconstruction, tmp_path, monkeypatch):
+def folder(reconstruction, tmp_path, small_pictures):
     """A folder of results of three passes, whose photographs are gone, with what the run kept."""
-    draw = results.draw_overview
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
     stages = [report("coarse_surface", 1.5), *(report("fuse", one) for one in (2.5, 3.5, 4.5))]
     run = reconstruction.replace(report=tuple(stages))
     about = {"photographs": str(tmp_path / "gone"), "masks": None}

@@ -82,9 +82,3 @@ def test_a_frame_holds_the_points_at_the_size_asked_for(front):
     low, high = bounding_box(front, points, 0.0)
     assert_close(low, project(points[:2], front.cam_from_world[0], front.intrinsics[0])[0].amin(0))
     assert (high > low).all()
-
-
-def test_single_takes_the_view_asked_for():
-    eyes = torch.tensor([[0.0, 0, 5], [1, 0, 5]])
-    both = pinholes(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1, 0])), 40.0, 32, 24)
-    assert_close(both.take([1]).centers_world, eyes[1:])
