@@ -181,6 +181,7 @@ def _shots(view: int, folder: Layout, root: Layout) -> list[Shot]:
         "as many photographs as light directions and intensities",
         f"{len(names)}, {len(directions)} and {len(intensities)}",
     )
+    folder.expect(len(set(names)) == len(names), "photographs of unlike names", "others")
     folder.expect(bool((intensities > 0).all()), "intensities above 0", "others")
     rows = zip(names, normalize(directions, dim=-1), intensities.mean(dim=1), strict=True)
     return [

@@ -3,39 +3,41 @@
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.io
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files.layout import Layout
 from pimper_torch.errors import some
+from pimper_torch.evidence.datasets.mat_files import read_variables
 
 _FORMAT = "a MATLAB file of version 5 to 7"
 
 
 def read_matlab(file: Layout, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read arrays of numbers, with the types that they have in MATLAB.
+    """Read arrays of numbers of a MATLAB file (up to version 7).
 
     Raises:
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
             numbers; lists what the file holds.
     """
-    arrays = file.read(
-        lambda path: scipy.io.loadmat(path, mat_dtype=True, variable_names=tuple(names)), _FORMAT
-    )
-    absent = [name for name in names if name not in arrays]
-    if absent:
-        there = some(sorted(variables(file)), most=12) or "none"
-        file.refuse(f"the variables {some(absent)}", f"variables {there}")
+    found = _variables(file, names)
+    absent = [name for name in names if name not in found]
+    there = some(sorted(found), most=12) or "none"
+    file.expect(not absent, f"the variables {some(absent)}", f"variables {there}")
+    arrays = {}
     for name in names:
-        file.expect(arrays[name].dtype.kind in "biuf", f"real numbers in {name}", "another class")
-    return {name: arrays[name] for name in names}
+        array = found[name]
+        if array is None:
+            file.refuse(f"real numbers in {name}", "another class")
+        arrays[name] = array
+    return arrays
 
 
-def variables(file: Layout) -> set[str]:
-    """Name the variables of a MATLAB file."""
-    return {name for name, *_ in file.read(scipy.io.whosmat, _FORMAT)}
+def _variables(file: Layout, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
+    """Read arrays of these names, and name the other variables."""
+    read = file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
+    return {one.name: one.array for one in read}
 
 
 def read_toolbox_projections(file: Layout, numbers: Sequence[int]) -> Float[Tensor, "view 3 4"]:
@@ -54,7 +56,7 @@ def read_toolbox_projections(file: Layout, numbers: Sequence[int]) -> Float[Tens
         :func:`~pimper_torch.camera_files.projections.decompose_projections` settles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
-    intrinsic = ["KK"] if "KK" in variables(file) else ["fc", "cc"]
+    intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]
     arrays = read_matlab(file, [*intrinsic, *poses])
 
     def shaped(name: str, *shape: int) -> Float[Tensor, "..."]:
