@@ -19,7 +19,8 @@ from pimper_torch.numpy_files import read_npz
 from pimper_torch.progress import track
 from pimper_torch.radiometry import Linear, Srgb
 from pimper_torch.records import Cameras, Capture, Truth, Views
-from pimper_torch.sfm.colmap import pinhole_of, read_model
+from pimper_torch.sfm.agreement import pinholes_of
+from pimper_torch.sfm.colmap import read_model
 
 _KIND = "a rendered scene (`pimper render`)"
 
@@ -104,13 +105,7 @@ def _read_cameras(folder: Layout, names: Sequence[str]) -> Cameras:
     model = read_model(folder.path)
     missing = [name for name in names if name not in model.names]
     folder.expect(not missing, f"cameras of {names}", f"none of {missing}")
-    rows = [model.names.index(name) for name in names]
-    lenses = [model.lenses[row] for row in rows]
-    return Cameras(
-        intrinsics=torch.stack([pinhole_of(lens) for lens in lenses]),
-        cam_from_world=model.cam_from_world[rows],
-        sizes_px=torch.tensor([[lens.width, lens.height] for lens in lenses]),
-    )
+    return pinholes_of(model).take([model.names.index(name) for name in names])
 
 
 def _read_views(
