@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout, contents
+from pimper_torch.camera_files.layout import DataSetPath, contents
 from pimper_torch.evidence.datasets.diligent import FLIP, decoded_normals, directed_lights
 from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.io.photographs import read_mask
@@ -41,7 +41,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
     Raises:
         InputError: Another layout; names what was expected and what was found.
     """
-    root = Layout(Path(folder), _UW)
+    root = DataSetPath(Path(folder), _UW)
     listed = root.inner(f"{name}/{name}.txt")
     root.expect(listed.path.is_file(), f"{name}/{name}.txt")
     count, *names = listed.read_text().split() or ["0"]
@@ -86,13 +86,13 @@ def read_yale_b(
     Source: Georghiades, Belhumeur & Kriegman, From Few to Many, PAMI 23(6), 2001.
     """
     root = Path(folder)
-    Layout(root, _YALE).expect(root.is_dir(), "a folder of photographs")
+    DataSetPath(root, _YALE).expect(root.is_dir(), "a folder of photographs")
     found = sorted(
         (path, float(match[1]), float(match[2]))
         for path in root.iterdir()
         if (match := _ANGLES.fullmatch(path.name))
     )
-    Layout(root, _YALE).expect(bool(found), "photographs such as yaleB02_P00A+035E-20.pgm")
+    DataSetPath(root, _YALE).expect(bool(found), "photographs such as yaleB02_P00A+035E-20.pgm")
     views = read_photographs(
         [path for path, _, _ in found],
         [path.name for path, _, _ in found],
@@ -160,7 +160,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
 
     Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
     """
-    root = Layout(Path(folder), "a normal map to integrate")
+    root = DataSetPath(Path(folder), "a normal map to integrate")
     for name in ("normal_map.png", "mask.png"):
         root.expect((root.path / name).is_file(), name)
     mask = read_mask(root.path / "mask.png")
@@ -178,7 +178,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     )
 
 
-def _read_depth(file: Layout) -> Float[Tensor, "height width"]:
+def _read_depth(file: DataSetPath) -> Float[Tensor, "height width"]:
     array = file.read(
         lambda path: read_npz(path, lambda name: name == "depth_gt")["depth_gt"], "an archive"
     ).astype(np.float32)
@@ -187,7 +187,9 @@ def _read_depth(file: Layout) -> Float[Tensor, "height width"]:
     return torch.where(depth.isfinite() & (depth > 0), depth, torch.inf)
 
 
-def _same_shape(shape: Sequence[int], expected: Sequence[int], root: Layout, name: str) -> None:
+def _same_shape(
+    shape: Sequence[int], expected: Sequence[int], root: DataSetPath, name: str
+) -> None:
     root.expect(
         tuple(shape) == tuple(expected),
         f"{name} of the mask's {expected[1]} x {expected[0]}",

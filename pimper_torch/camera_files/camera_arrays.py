@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
@@ -50,7 +50,7 @@ def read_camera_arrays(
     Raises:
         InputError: The file has other arrays, or not one camera a photograph.
     """
-    file = Layout(path, _KIND)
+    file = DataSetPath(path, _KIND)
     arrays = file.read(read_npz, "an archive of numpy.savez")
     count = sum(name.startswith("world_mat_") and "inv" not in name for name in arrays)
     intrinsics, poses = read_world_mats(path, count) if count else _plain(arrays, file)
@@ -88,7 +88,7 @@ def read_world_mats(path: Path, count: int) -> Rig:
     Raises:
         InputError: There are more or fewer, or a matrix is no camera's.
     """
-    file = Layout(path, IDR)
+    file = DataSetPath(path, IDR)
     arrays = file.read(
         lambda path: read_npz(path, lambda name: name.startswith("world_mat_")),
         "an archive of numpy.savez",
@@ -103,7 +103,7 @@ def read_world_mats(path: Path, count: int) -> Rig:
     return intrinsics, poses
 
 
-def _plain(arrays: Arrays, file: Layout) -> Rig:
+def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
     projections = _array(arrays, ("projections", "P"), ((3, 4),), file)
     if projections is not None:
         return _decomposed(list(projections), "projection ", file)
@@ -133,7 +133,7 @@ def _plain(arrays: Arrays, file: Layout) -> Rig:
 
 
 def _array(
-    arrays: Arrays, names: Sequence[str], shapes: Sequence[tuple[int, ...]], file: Layout
+    arrays: Arrays, names: Sequence[str], shapes: Sequence[tuple[int, ...]], file: DataSetPath
 ) -> Tensor | None:
     """Return the first array of these names, one entry a camera; refuse one of other shapes."""
     name = next((name for name in names if name in arrays), None)
@@ -149,7 +149,7 @@ def _array(
     return torch.from_numpy(found.astype(np.float64))
 
 
-def _decomposed(matrices: Sequence[Float[Tensor, "3 4"]], what: str, file: Layout) -> Rig:
+def _decomposed(matrices: Sequence[Float[Tensor, "3 4"]], what: str, file: DataSetPath) -> Rig:
     intrinsics, poses = [], []
     for index, matrix in enumerate(matrices):
         try:

@@ -19,7 +19,7 @@ _MAX_TEXT, _MAX_VALUE = 400, 80  # characters of a message that quote a file
 T = TypeVar("T")
 
 
-class Layout(NamedTuple):
+class DataSetPath(NamedTuple):
     """A folder or file of a data set.
 
     Attributes:
@@ -29,7 +29,7 @@ class Layout(NamedTuple):
     path: Path
     kind: str
 
-    def inner(self, name: str | Path) -> "Layout":
+    def inner(self, name: str | Path) -> "DataSetPath":
         """Return a file or folder inside."""
         return self._replace(path=self.path / name)
 
@@ -139,7 +139,7 @@ def first_of(candidates: Sequence[Path]) -> Path | None:
     return next((path for path in candidates if path.exists()), None)
 
 
-def file_in(given: Path | str, names: Sequence[str], kind: str) -> Layout:
+def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
     """Return a file, or the one of these names, or of one pattern, in a folder.
 
     Raises:
@@ -147,15 +147,15 @@ def file_in(given: Path | str, names: Sequence[str], kind: str) -> Layout:
     """
     given = Path(given)
     if given.is_file():
-        return Layout(given, kind)
-    folder, found = Layout(given, kind), [given / name for name in names]
+        return DataSetPath(given, kind)
+    folder, found = DataSetPath(given, kind), [given / name for name in names]
     if names[0].startswith("*"):
         found = sorted(given.glob(names[0])) if given.is_dir() else []
         folder.expect(len(found) == 1, f"one file named {names[0]}")
     path = first_of(found)
     if path is None:
         folder.refuse(f"a file {' or '.join(names)}")
-    return Layout(path, kind)
+    return DataSetPath(path, kind)
 
 
 def _shown(value: object) -> str:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.errors import some
 from pimper_torch.geometry.pixels import pixels_from_indices
@@ -42,7 +42,7 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
         InputError: The file has another structure or describes a lens or rig that cannot be
             read.
     """
-    file = Layout(path, KIND)
+    file = DataSetPath(path, KIND)
     whole = file.read_json()
     version = tuple(int(part) for part in file.numbers(whole.get("version"), 3, "version"))
     poses, intrinsics = (
@@ -68,7 +68,9 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
     return cameras
 
 
-def _cam_from_world(entry: Mapping[str, object], name: str, file: Layout) -> Float[Tensor, "4 4"]:
+def _cam_from_world(
+    entry: Mapping[str, object], name: str, file: DataSetPath
+) -> Float[Tensor, "4 4"]:
     pose = entry.get("pose")
     transform = pose.get("transform") if isinstance(pose, Mapping) else None
     if not isinstance(transform, Mapping):
@@ -80,7 +82,9 @@ def _cam_from_world(entry: Mapping[str, object], name: str, file: Layout) -> Flo
     return rigid_or_refuse(exact, -exact @ center, what, file)
 
 
-def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, file: Layout) -> Lens:
+def _lens(
+    entry: Mapping[str, object], version: tuple[int, ...], camera: int, file: DataSetPath
+) -> Lens:
     def value(key: str, count: int = 1, default: object = None) -> Float[Tensor, " value"]:
         return file.numbers(entry.get(key, default), count, f"{key} of an intrinsic")
 
@@ -103,7 +107,7 @@ def _lens(entry: Mapping[str, object], version: tuple[int, ...], camera: int, fi
     return Lens(camera=camera, model=model, params=(*pinhole, *params), width=width, height=height)
 
 
-def _distortion(entry: Mapping[str, object], file: Layout) -> tuple[str, tuple[float, ...]]:
+def _distortion(entry: Mapping[str, object], file: DataSetPath) -> tuple[str, tuple[float, ...]]:
     """Translate a distortion to COLMAP's model and what its parameters are after the centre.
 
     AliceVision's Brown model has (k1, k2, k3, t1, t2) and is OpenCV's, its ``fisheye4`` is

@@ -8,7 +8,7 @@ from xml.parsers import expat
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.errors import InputError, caution, some
 from pimper_torch.geometry.frames import invert_rigid, rigid
@@ -35,7 +35,7 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
         InputError: The file is something else, defines entities, or describes a lens or rig
             that cannot be read.
     """
-    file = Layout(path, KIND)
+    file = DataSetPath(path, KIND)
     chunk = _chunk(file)
     lenses = {
         str(sensor.get("id")): (sensor, number)
@@ -82,7 +82,7 @@ def parse_without_entities(path: Path) -> ElementTree.Element:
     return ElementTree.fromstring(content)
 
 
-def _chunk(file: Layout) -> ElementTree.Element:
+def _chunk(file: DataSetPath) -> ElementTree.Element:
     root = file.read(parse_without_entities, "XML")
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     file.expect(bool(chunks), "a document of one chunk", f"<{root.tag}> without one")
@@ -121,7 +121,7 @@ def _component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTr
 
 
 def _cam_from_world(
-    camera: ElementTree.Element, chunk: ElementTree.Element, file: Layout
+    camera: ElementTree.Element, chunk: ElementTree.Element, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
     what = f"transform of {camera.get('label')}"
     chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
@@ -146,7 +146,7 @@ def _similarity_of(
 
 
 def _rigid_and_scale(
-    element: ElementTree.Element, file: Layout
+    element: ElementTree.Element, file: DataSetPath
 ) -> tuple[Float[Tensor, "4 4"], float]:
     def values(tag: str, count: int, default: str) -> Float[Tensor, " value"]:
         return file.numbers(element.findtext(tag, default), count, f"{tag} of the chunk")
@@ -158,7 +158,7 @@ def _rigid_and_scale(
     return rigid_or_refuse(rotation, translation, "the chunk's transform", file), scale
 
 
-def _lens(sensor: ElementTree.Element, number: int, file: Layout) -> tuple[Lens, float]:
+def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[Lens, float]:
     """Translate a sensor's calibration; return the skew, too."""
     label = sensor.get("label") or sensor.get("id")
     given = sensor.findall("calibration")

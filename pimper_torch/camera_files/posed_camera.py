@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import Lens, Record
 
@@ -52,7 +52,7 @@ def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> 
 
 
 def rigid_or_refuse(
-    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: Layout
+    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
     """Put a file's rotation and translation together, the rotation made exact.
 

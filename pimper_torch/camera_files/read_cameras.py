@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pimper_torch.camera_files.camera_arrays import read_camera_arrays
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.meshroom_sfm import read_meshroom_cameras
 from pimper_torch.camera_files.metashape_xml import read_metashape_cameras
 from pimper_torch.camera_files.posed_camera import PosedCamera, SizesOf
@@ -31,7 +31,7 @@ def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> l
     if suffix == ".xml":
         return read_metashape_cameras(path)
     if suffix in (".sfm", ".json"):
-        framed = suffix == ".json" and "frames" in Layout(path, _KIND).read_json()
+        framed = suffix == ".json" and "frames" in DataSetPath(path, _KIND).read_json()
         return read_transforms_cameras(path, sizes_of) if framed else read_meshroom_cameras(path)
     raise InputError(
         f"{path}: is no file of cameras; needed: the folder of a COLMAP model, or a file "

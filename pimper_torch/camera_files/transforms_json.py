@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
@@ -30,7 +30,7 @@ def read_frames(path: Path) -> list[dict[str, object]]:
     Raises:
         InputError: The file has another structure, or a frame names no photograph.
     """
-    file = Layout(path, KIND)
+    file = DataSetPath(path, KIND)
     whole = file.read_json()
     frames = [{**whole, **frame} for frame in file.objects(whole.get("frames"), "frames")]
     for frame in frames:
@@ -87,7 +87,7 @@ def frame_camera(
         frame: Of :func:`read_frames`.
         name: Of its photograph, for messages too.
     """
-    file = Layout(path, KIND)
+    file = DataSetPath(path, KIND)
     matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
     rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
     file.expect(bool(rows), f"4 rows of 4 numbers as {what}", type(matrix).__name__)
@@ -97,7 +97,9 @@ def frame_camera(
     return PosedCamera(name=name, lens=_lens(frame, name, size_px, file), cam_from_world=pose)
 
 
-def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: Layout) -> Lens:
+def _lens(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
+) -> Lens:
     def value(key: str, default: float = 0.0) -> float:
         given = frame.get(key)
         if given is None:

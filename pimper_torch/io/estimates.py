@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.meshes import read_mesh
@@ -85,7 +85,7 @@ def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view
     Returns:
         ``None`` where there is no such file, no view, or no light.
     """
-    file = Layout(Path(path), _KIND)
+    file = DataSetPath(Path(path), _KIND)
     if not file.path.is_file() or not names:
         return None
     views = file.objects(file.read_json().get("views"), "views")
@@ -101,7 +101,7 @@ def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view
 
 def read_reference(path: Path | str) -> str | None:
     """Read the name of the reference view; ``None`` where there is no such file."""
-    file = Layout(Path(path), _KIND)
+    file = DataSetPath(Path(path), _KIND)
     if not file.path.is_file():
         return None
     found = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")

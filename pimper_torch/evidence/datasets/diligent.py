@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.raster import nearest
@@ -57,7 +57,7 @@ def read_diligent(folder: Path | str, **options: Unpack[LightOptions]) -> Captur
     Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
     and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
     """
-    root = Layout(Path(folder), _ONE_VIEW)
+    root = DataSetPath(Path(folder), _ONE_VIEW)
     return _capture(root, {1: root}, None, options)
 
 
@@ -90,7 +90,7 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
     Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
     layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
     """
-    root = Layout(Path(folder), _MANY_VIEWS)
+    root = DataSetPath(Path(folder), _MANY_VIEWS)
     root.expect(root.path.is_dir(), "an object's folder such as mvpmsData/bearPNG")
     folders = {
         int(match[1]): root.inner(path)
@@ -109,7 +109,7 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
     return capture.replace(truth=capture.truth.replace(mesh=read))
 
 
-def decoded_normals(file: Layout) -> Float[Tensor, "height width 3"]:
+def decoded_normals(file: DataSetPath) -> Float[Tensor, "height width 3"]:
     """Read normals kept as colours ``(n + 1) / 2``, y up, into our camera frame."""
     samples = decode(file.path).samples
     file.expect(samples.shape[0] == 3, "normals as red, green and blue", "one channel")
@@ -125,8 +125,8 @@ def directed_lights(
 
 
 def _capture(
-    root: Layout,
-    folders: Mapping[int, Layout],
+    root: DataSetPath,
+    folders: Mapping[int, DataSetPath],
     cameras: CamerasOf | None,
     options: LightOptions,
 ) -> Capture:
@@ -167,7 +167,7 @@ def _of_shots(
     return torch.stack(list(normals))[index]
 
 
-def _shots(view: int, folder: Layout, root: Layout) -> list[Shot]:
+def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
     """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
     directions, intensities = (
         _rows_of_three(folder.inner(f"light_{what}.txt")) for what in ("directions", "intensities")
@@ -199,7 +199,7 @@ def _shots(view: int, folder: Layout, root: Layout) -> list[Shot]:
     ]
 
 
-def _normals(folder: Layout) -> Float[Tensor, "height width 3"] | None:
+def _normals(folder: DataSetPath) -> Float[Tensor, "height width 3"] | None:
     """Read ``Normal_gt`` in our camera frame (facing the viewer is ``n_z < 0``).
 
     Zero where the file knows none; ``None`` without such a file.
@@ -220,7 +220,7 @@ def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height wi
     return torch.where(known, normalize(rotated, dim=-1), 0)
 
 
-def _rows_of_three(file: Layout) -> Float[Tensor, "row 3"]:
+def _rows_of_three(file: DataSetPath) -> Float[Tensor, "row 3"]:
     words = file.read_text().split()
     file.expect(len(words) % 3 == 0 and bool(words), "rows of three numbers", f"{len(words)}")
     return file.numbers(words, len(words), "rows of three").reshape(-1, 3)

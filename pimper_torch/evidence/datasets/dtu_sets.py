@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout, file_in, first_of
+from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.sampling import LightOptions, Shot, read_shots
@@ -59,7 +59,7 @@ def read_dtu_points(folder: Path | str, scan: int, **options: Unpack[LightOption
     roboimagedata.compute.dtu.dk; layout as in the set's RobotEvalCode (GetCam.m,
     GenStrLightGrid_v2.m, ReadMe.txt).
     """
-    root = Layout(Path(folder), _POINTS)
+    root = DataSetPath(Path(folder), _POINTS)
     shots = _shots(root, f"SET{scan:03d}", _POINTS_NAME, "Img001_01.bmp (position, LED)")
     calibration = file_in(folder, _CALIBRATIONS, _POINTS)
     photographs = root.inner(f"SET{scan:03d}")
@@ -103,7 +103,7 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
     Source: Jensen et al., Large Scale Multi-view Stereopsis Evaluation, CVPR 2014,
     roboimagedata.compute.dtu.dk; names as in the set's SampleSet and in MVSNet's loader.
     """
-    root = Layout(Path(folder), _MVS)
+    root = DataSetPath(Path(folder), _MVS)
     inner = f"Rectified/scan{scan}"
     shots = _shots(root, inner, _MVS_NAME, "rect_001_0_r5000.png")
     if options.get("lights") is None:
@@ -134,7 +134,7 @@ def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
 
     Source: PointCompareMain.m of the set's SampleSet.
     """
-    root = Layout(Path(folder) / "ObsMask", _MVS)
+    root = DataSetPath(Path(folder) / "ObsMask", _MVS)
     mask_file, plane_file = root.inner(f"ObsMask{scan}_10.mat"), root.inner(f"Plane{scan}.mat")
     arrays = read_matlab(mask_file, ("ObsMask", "BB", "Res"))
     plane = read_matlab(plane_file, ("P",))["P"]
@@ -154,7 +154,7 @@ def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
     )
 
 
-def _shots(root: Layout, inner: str, name: re.Pattern[str], example: str) -> list[Shot]:
+def _shots(root: DataSetPath, inner: str, name: re.Pattern[str], example: str) -> list[Shot]:
     """List a scene's photographs, whose names tell position and light."""
     photographs = root.inner(inner)
     root.expect(photographs.path.is_dir(), f"photographs in {inner}")
@@ -172,7 +172,7 @@ def _shots(root: Layout, inner: str, name: re.Pattern[str], example: str) -> lis
     return shots
 
 
-def _halves(root: Layout, scan: int) -> Float[Tensor, "point 3"] | None:
+def _halves(root: DataSetPath, scan: int) -> Float[Tensor, "point 3"] | None:
     """Read the structured-light points, of which there is a near and a far half."""
     name = f"Clean_Reconstruction_{scan:02d}.mat"
     path = first_of([root.path / folder / name for folder in _SCANS])
@@ -190,7 +190,7 @@ def _halves(root: Layout, scan: int) -> Float[Tensor, "point 3"] | None:
 
 
 def _mvs_cameras(
-    root: Layout, positions: Sequence[int]
+    root: DataSetPath, positions: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
     """Read the cameras of positions, from the set's own files or else from MVSNet's."""
     official, other = root.inner("Calibration/cal18"), root.inner("Cameras")
@@ -212,7 +212,7 @@ def _mvs_cameras(
     return torch.stack(intrinsics), torch.stack(poses)
 
 
-def _mvsnet_camera(file: Layout) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"]]:
+def _mvsnet_camera(file: DataSetPath) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"]]:
     words = file.read_text().split()
     file.expect(
         len(words) >= 27 and words[0] == "extrinsic" and words[17] == "intrinsic",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pimper_torch.camera_files import meshroom_sfm, metashape_xml, transforms_json
 from pimper_torch.camera_files.camera_arrays import IDR, read_world_mats
-from pimper_torch.camera_files.layout import Layout, file_in, first_of
+from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.camera_files.posed_camera import PosedCamera, pinhole_lens, rigid_or_refuse
 from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.posed import (
@@ -59,7 +59,7 @@ def read_colmap(
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
-    root = Layout(Path(folder), _COLMAP)
+    root = DataSetPath(Path(folder), _COLMAP)
     files = [root.path / name / f"cameras{end}" for name in _MODELS for end in (".bin", ".txt")]
     found = first_of(files)
     if found is None:
@@ -112,7 +112,7 @@ def read_llff(
         InputError: The folder is laid out otherwise, there is not one photograph a row, or a
             file is damaged.
     """
-    root = Layout(Path(folder), _LLFF)
+    root = DataSetPath(Path(folder), _LLFF)
     file = root.inner("poses_bounds.npy")
     rows = file.read(read_npy, "a file")
     ok = rows.ndim == 2 and rows.shape[1] == 17 and rows.dtype.kind == "f"
@@ -132,7 +132,7 @@ def read_llff(
     return assemble(_beside(cameras, lambda one: pictures[one.name], drawn, root), root, **options)
 
 
-def _llff_images(root: Layout, images: Path | str | None) -> Path:
+def _llff_images(root: DataSetPath, images: Path | str | None) -> Path:
     if images is not None:
         return first_of([root.path / images, Path(images)]) or root.path / images
     reduced = [
@@ -145,7 +145,7 @@ def _llff_images(root: Layout, images: Path | str | None) -> Path:
     return whole if whole.is_dir() else min(reduced)[1]
 
 
-def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: Layout) -> PosedCamera:
+def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> PosedCamera:
     height, width, focal_px = row[:, 4].tolist()
     whole = height.is_integer() and width.is_integer()
     root.expect(
@@ -180,7 +180,7 @@ def read_idr(
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
-    root = Layout(Path(folder), IDR)
+    root = DataSetPath(Path(folder), IDR)
     file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, IDR)
     drawn, files = root.inner("mask"), image_files(root.inner("image"))
     masks = image_files(drawn) if drawn.path.is_dir() else [None] * len(files)
@@ -316,7 +316,7 @@ def _with_suffix(image: Path) -> Path:
     return first_of(tried) or tried[0]
 
 
-def _pictures(file: Layout, images: Path | str | None) -> Layout:
+def _pictures(file: DataSetPath, images: Path | str | None) -> DataSetPath:
     """Return the folder of the photographs, by default beside the file of cameras."""
     beside = file.path.parent / "images"
     place = Path(images) if images else beside if beside.exists() else file.path.parent
@@ -327,7 +327,7 @@ def _beside(
     cameras: Sequence[PosedCamera],
     find: Callable[[PosedCamera], Path],
     masks: Path | str | None,
-    data_set: Layout,
+    data_set: DataSetPath,
 ) -> list[PosedPhotograph]:
     """Find the photographs of cameras, and their masks by name."""
     mask_of = mask_finder(masks, data_set.kind)

@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.mat_files import read_variables
 
 _FORMAT = "a MATLAB file of version 5 to 7"
 
 
-def read_matlab(file: Layout, names: Sequence[str]) -> dict[str, np.ndarray]:
+def read_matlab(file: DataSetPath, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Read arrays of numbers of a MATLAB file (up to version 7).
 
     Raises:
@@ -34,13 +34,15 @@ def read_matlab(file: Layout, names: Sequence[str]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _variables(file: Layout, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
+def _variables(file: DataSetPath, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
     """Read arrays of these names, and name the other variables."""
     read = file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
     return {one.name: one.array for one in read}
 
 
-def read_toolbox_projections(file: Layout, numbers: Sequence[int]) -> Float[Tensor, "view 3 4"]:
+def read_toolbox_projections(
+    file: DataSetPath, numbers: Sequence[int]
+) -> Float[Tensor, "view 3 4"]:
     """Read ``K [R | t]`` from what Bouguet's calibration toolbox for MATLAB saves.
 
     ``KK`` (or ``fc`` and ``cc``) hold the intrinsics, ``Rc_<i>`` and ``Tc_<i>`` take points

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera
 from pimper_torch.errors import InputError, some
 from pimper_torch.evidence.datasets.raster import read_photographs
@@ -68,7 +68,7 @@ class PosedOptions(TypedDict, total=False):
 
 def assemble(
     photographs: Sequence[PosedPhotograph],
-    data_set: Layout,
+    data_set: DataSetPath,
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
@@ -137,7 +137,7 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
     return tuple(lenses)
 
 
-def image_files(folder: Layout) -> list[Path]:
+def image_files(folder: DataSetPath) -> list[Path]:
     """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
 
     Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
@@ -162,7 +162,7 @@ def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path |
     """
     if folder is None:
         return lambda photograph: None
-    place = Layout(Path(folder), kind)
+    place = DataSetPath(Path(folder), kind)
     paths = image_files(place)
 
     def find(photograph: Path) -> Path | None:
@@ -178,7 +178,7 @@ def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path |
 
 
 def _select(
-    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, data_set: Layout
+    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, data_set: DataSetPath
 ) -> list[PosedPhotograph]:
     by_name = {one.name: one for one in photographs}
     repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})

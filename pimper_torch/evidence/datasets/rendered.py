@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.config import SceneConfig
@@ -49,7 +49,7 @@ def read_rendered(
     Raises:
         InputError: Not such a folder, or something in it is missing or damaged.
     """
-    root = Layout(Path(folder), _KIND)
+    root = DataSetPath(Path(folder), _KIND)
     names, settings = _read_report(root)
     chosen = list(range(len(names)) if views is None else views)
     root.expect(
@@ -78,7 +78,7 @@ def read_rendered(
     return Capture(views=pictures, cameras=cameras, truth=truth, position=position, light=order)
 
 
-def _read_report(root: Layout) -> tuple[tuple[str, ...], SceneConfig]:
+def _read_report(root: DataSetPath) -> tuple[tuple[str, ...], SceneConfig]:
     file = root.inner("truth/scene.json")
     report = file.read_json()
     found = (report.get("format"), report.get("format_version"))
@@ -101,7 +101,7 @@ def _read_report(root: Layout) -> tuple[tuple[str, ...], SceneConfig]:
     return tuple(names), config
 
 
-def _read_cameras(folder: Layout, names: Sequence[str]) -> Cameras:
+def _read_cameras(folder: DataSetPath, names: Sequence[str]) -> Cameras:
     model = read_model(folder.path)
     missing = [name for name in names if name not in model.names]
     folder.expect(not missing, f"cameras of {names}", f"none of {missing}")
@@ -109,7 +109,7 @@ def _read_cameras(folder: Layout, names: Sequence[str]) -> Cameras:
 
 
 def _read_views(
-    root: Layout,
+    root: DataSetPath,
     names: Sequence[str],
     settings: SceneConfig,
     cameras: Cameras,
@@ -137,7 +137,7 @@ def _read_views(
 
 
 def _read_picture(
-    folder: Layout, name: str, width: int, height: int
+    folder: DataSetPath, name: str, width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
     file = folder._replace(path=folder.inside(name))
     samples = file.read(decode, "a picture").samples
@@ -147,7 +147,9 @@ def _read_picture(
     return samples
 
 
-def _read_maps(folder: Layout, names: Sequence[str], settings: SceneConfig) -> dict[str, Tensor]:
+def _read_maps(
+    folder: DataSetPath, names: Sequence[str], settings: SceneConfig
+) -> dict[str, Tensor]:
     read: dict[str, list[Tensor]] = {name: [] for name in MAP_NAMES}
     size = f"{settings.width} x {settings.height} pixels as scene.json says"
     for name in track(names):
@@ -164,7 +166,7 @@ def _read_maps(folder: Layout, names: Sequence[str], settings: SceneConfig) -> d
 
 
 def _read_lights(
-    file: Layout, count: int
+    file: DataSetPath, count: int
 ) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "view 4"]]:
     report = file.read_json()
     positions, harmonics = (

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.raster import (
     intrinsics_from_indices,
@@ -69,7 +69,7 @@ class Shots(NamedTuple):
 
 def read_shots(
     shots: Sequence[Shot],
-    folder: Layout,
+    folder: DataSetPath,
     cameras: CamerasOf | None,
     *,
     size_px: tuple[int, int] | None = None,
@@ -166,7 +166,7 @@ def one_light_per_position(
 def choose_photographs(
     position: Positions,
     light: Sequence[int],
-    folder: Layout,
+    folder: DataSetPath,
     *,
     positions: Positions | None = None,
     lights: Sequence[int] | None = None,

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pimper_torch.camera_files.layout import Layout
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.sampling import choose_photographs, one_light_per_position
 
@@ -53,7 +53,7 @@ def test_a_position_with_a_single_light_takes_it_though_its_neighbour_has_it_too
 
 def test_subsets_are_kept_in_order_of_position_and_light():
     position, light = [2, 1, 2, 1, 3], [0, 1, 1, 0, 0]
-    folder = Layout(Path("set"), "a set")
+    folder = DataSetPath(Path("set"), "a set")
     assert choose_photographs(position, light, folder) == [
         3, 1, 0, 2, 4,
     ]  # fmt: skip
@@ -66,7 +66,7 @@ def test_lights_that_were_left_out_are_not_sampled_either():
     chosen = choose_photographs(
         position.tolist(),
         light.tolist(),
-        Layout(Path("set"), "a set"),
+        DataSetPath(Path("set"), "a set"),
         positions=range(3, 9),
         lights=(2, 5),
         light_seed=3,
@@ -80,4 +80,4 @@ def test_lights_that_were_left_out_are_not_sampled_either():
 )
 def test_a_position_or_light_that_is_not_there_is_refused(asked):
     with pytest.raises(InputError, match=r"set: not the layout of a set.*(positions 4|lights 9)"):
-        choose_photographs([1, 2], [0, 1], Layout(Path("set"), "a set"), **asked)
+        choose_photographs([1, 2], [0, 1], DataSetPath(Path("set"), "a set"), **asked)
