@@ -24,7 +24,6 @@ from pimper_torch.numpy_files import read_npz
 Arrays = dict[str, np.ndarray]
 Rig = tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]
 
-IDR = "an IDR or NeuS set"
 _KIND = "an archive of cameras"
 
 
@@ -33,9 +32,11 @@ def read_camera_arrays(
 ) -> list[PosedCamera]:
     """Read the cameras of an archive.
 
-    Either IDR's ``world_mat_0`` and so on, see :func:`read_world_mats`; or arrays, in our
-    conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x right,
-    y down, z forward):
+    Either IDR's ``world_mat_0`` and so on, ``K [R t]`` as 4x4 matrices from the world to pixels,
+    with our camera axes; IDR and NeuS cast rays through whole numbers (``uv`` of ``mgrid``,
+    ``pixels_x`` of ``arange``): they count centres from 0, so half a pixel is added. Or arrays, in
+    our conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x
+    right, y down, z forward):
 
     - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world`` (3x4 or 4x4 each) or
       with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
@@ -53,7 +54,7 @@ def read_camera_arrays(
     file = DataSetPath(path, _KIND)
     arrays = file.read(read_npz, "an archive of numpy.savez")
     count = sum(name.startswith("world_mat_") and "inv" not in name for name in arrays)
-    intrinsics, poses = read_world_mats(path, count) if count else _plain(arrays, file)
+    intrinsics, poses = _world_mats(arrays, count, file) if count else _plain(arrays, file)
     if "names" in arrays:
         names = [str(name) for name in arrays["names"].reshape(-1).tolist()]
         file.expect(len(names) == len(poses), f"{len(poses)} names", f"{len(names)}")
@@ -75,29 +76,10 @@ def read_camera_arrays(
     return number_lenses(cameras)
 
 
-def read_world_mats(path: Path, count: int) -> Rig:
-    """Read IDR's cameras.
-
-    ``world_mat_i`` is ``K [R t]`` as a 4x4 matrix, from the world to pixels, with our camera
-    axes. IDR and NeuS cast rays through whole numbers (``uv`` of ``mgrid``, ``pixels_x`` of
-    ``arange``): they count centres from 0, so half a pixel is added.
-
-    Returns:
-        ``K`` with its skew, and ``cam_from_world``.
-
-    Raises:
-        InputError: There are more or fewer, or a matrix is no camera's.
-    """
-    file = DataSetPath(path, IDR)
-    arrays = file.read(
-        lambda path: read_npz(path, lambda name: name.startswith("world_mat_")),
-        "an archive of numpy.savez",
-    )
-    wanted = [f"world_mat_{index}" for index in range(count)]
-    there = [name for name in arrays if "inv" not in name]
-    needed = f"world_mat_0 to world_mat_{count - 1}, one for each image"
-    file.expect(set(there) == set(wanted) and count > 0, needed, f"{len(there)} of them")
-    matrices = [file.numbers(arrays[name], 16, name).reshape(4, 4)[:3] for name in wanted]
+def _world_mats(arrays: Arrays, count: int, file: DataSetPath) -> Rig:
+    names = [f"world_mat_{index}" for index in range(count)]
+    file.expect(set(names) <= set(arrays), f"world_mat_0 to {names[-1]}", "other numbers")
+    matrices = [file.numbers(arrays[name], 16, name).reshape(4, 4)[:3] for name in names]
     intrinsics, poses = _decomposed(matrices, "world_mat_", file)
     intrinsics[:, :2, 2] = pixels_from_indices(intrinsics[:, :2, 2])
     return intrinsics, poses

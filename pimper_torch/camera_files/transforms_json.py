@@ -60,17 +60,18 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
         InputError: The file has another structure.
     """
     frames = read_frames(path)
-    names = [str(frame["file_path"]) for frame in frames]
-    sizes = sizes_of(names) if any(stated_size(frame) is None for frame in frames) else None
-    cameras = []
-    for index, (frame, name) in enumerate(zip(frames, names, strict=True)):
-        size = stated_size(frame) or (sizes[index] if sizes else None)
-        if size is not None:
-            cameras.append(frame_camera(frame, name, size, path))
+    names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
+    sizes = [_stated_size(frame) for frame in frames]
+    read = sizes if all(sizes) else sizes_of(names)
+    cameras = [
+        _camera(frame, name, size, DataSetPath(path, KIND))
+        for frame, name, *both in zip(frames, names, sizes, read, strict=True)
+        if (size := both[0] or both[1])
+    ]
     return number_lenses(cameras)
 
 
-def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
+def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
     """Return a frame's width and height, where the file says them."""
     sides = frame.get("w"), frame.get("h")
     if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
@@ -78,16 +79,9 @@ def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
     return round(float(str(sides[0]))), round(float(str(sides[1])))
 
 
-def frame_camera(
-    frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path
+def _camera(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
 ) -> PosedCamera:
-    """Read one frame.
-
-    Args:
-        frame: Of :func:`read_frames`.
-        name: Of its photograph, for messages too.
-    """
-    file = DataSetPath(path, KIND)
     matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
     rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
     file.expect(bool(rows), f"4 rows of 4 numbers as {what}", type(matrix).__name__)

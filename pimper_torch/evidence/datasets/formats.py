@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files import meshroom_sfm, metashape_xml, transforms_json
-from pimper_torch.camera_files.camera_arrays import IDR, read_world_mats
+from pimper_torch.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
-from pimper_torch.camera_files.posed_camera import PosedCamera, pinhole_lens, rigid_or_refuse
+from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.errors import some
 from pimper_torch.evidence.datasets.posed import (
     PosedOptions,
@@ -32,6 +32,7 @@ _COLMAP = "a COLMAP model with its photographs"
 _MODELS = (".", "sparse/0", "sparse", "model", "0")
 _LLFF = "an LLFF set"
 _LLFF_MASKS = ("masks", "mask", "images_mask")
+_IDR = "an IDR or NeuS set"
 _IDR_CAMERAS = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
 _MESHROOM = ("cameras.sfm", "sfm.json", "sfm.sfm", "cameras.json")
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
@@ -168,7 +169,7 @@ def read_idr(
 ) -> Capture:
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
 
-    Their meaning is that of :func:`~pimper_torch.camera_files.camera_arrays.read_world_mats`.
+    Their meaning is that of :func:`~pimper_torch.camera_files.camera_arrays.read_camera_arrays`.
     ``scale_mat_i``, from the unit sphere round the object to the world, is left out: cameras and
     truth are in the world's units. Arrays and masks belong to the images in plain order of their
     names.
@@ -180,27 +181,26 @@ def read_idr(
     Raises:
         InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
-    root = DataSetPath(Path(folder), IDR)
-    file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, IDR)
-    drawn, files = root.inner("mask"), image_files(root.inner("image"))
+    root = DataSetPath(Path(folder), _IDR)
+    file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, _IDR)
+    drawn, pictures = root.inner("mask"), root.inner("image")
+    files = image_files(pictures)
     masks = image_files(drawn) if drawn.path.is_dir() else [None] * len(files)
     needed = f"{len(files)} masks, one for each image"
     drawn.expect(len(masks) == len(files), needed, f"{len(masks)}")
-    intrinsics, poses = read_world_mats(file.path, len(files))
-    photographs = []
-    for path, mask, K, pose in zip(files, masks, intrinsics, poses, strict=True):
-        header = read_header(path)
-        photographs.append(
-            PosedPhotograph(
-                name=path.name,
-                image=path,
-                mask=mask,
-                lens=pinhole_lens(K, (header.width, header.height)),
-                skew_px=float(K[0, 1]),
-                cam_from_world=pose,
-            )
-        )
+    names = [path.name for path in files]
+    cameras = read_camera_arrays(file.path, names, lambda names: _sizes(pictures, names))
+    photographs = [
+        PosedPhotograph.of(camera, path, mask)
+        for camera, path, mask in zip(cameras, files, masks, strict=True)
+    ]
     return assemble(photographs, root, **options)
+
+
+def _sizes(folder: DataSetPath, names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the sizes of photographs in their files."""
+    headers = [read_header(_with_suffix(folder.inside(name))) for name in names]
+    return [(header.width, header.height) for header in headers]
 
 
 def read_meshroom(
@@ -289,27 +289,25 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     file = file_in(folder, _TRANSFORMS, transforms_json.KIND)
     around = file._replace(path=file.path.parent)
     frames = transforms_json.read_frames(file.path)
-    paths = (str(frame["file_path"]).replace("\\", "/") for frame in frames)
-    images = [_with_suffix(around.inside(path)) for path in paths]
+    cameras = transforms_json.read_transforms_cameras(
+        file.path, lambda names: _sizes(around, names)
+    )
+    images = [_with_suffix(around.inside(camera.name)) for camera in cameras]
     names = [image.name for image in images]
     if len(set(names)) < len(names):
         names = [PurePosixPath(image.relative_to(around.path)).as_posix() for image in images]
-    photographs = []
-    for frame, image, name in zip(frames, images, names, strict=True):
-        size = transforms_json.stated_size(frame)
-        if size is None:
-            file.expect(image.is_file(), f"the photograph {image.name}", "no such file")
-            header = read_header(image)
-            size = header.width, header.height
-        camera = transforms_json.frame_camera(frame, name, size, file.path)
-        drawn = frame.get("mask_path")
-        mask = around.inside(str(drawn)) if drawn else None
-        photographs.append(PosedPhotograph.of(camera, image, mask, name))
+    masks = [
+        around.inside(str(frame["mask_path"])) if frame.get("mask_path") else None
+        for frame in frames
+    ]
+    photographs = [
+        PosedPhotograph.of(*one) for one in zip(cameras, images, masks, names, strict=True)
+    ]
     return assemble(photographs, file, **options)
 
 
 def _with_suffix(image: Path) -> Path:
-    """Find the file of a frame, whose suffix may be left out."""
+    """Find the file of a photograph, whose suffix may be left out."""
     if image.suffix.lower() in SUFFIXES:
         return image
     tried = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]

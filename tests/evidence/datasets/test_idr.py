@@ -55,7 +55,7 @@ def test_other_camera_files_are_found(folder, sees):
 
 def test_matrices_for_other_images_are_refused(folder, paint):
     save(folder, count=3)
-    with pytest.raises(InputError, match=r"world_mat_0 to world_mat_1.*Found: 3"):
+    with pytest.raises(InputError, match=r"2 photographs.*Found: 3 cameras"):
         read_idr(folder)
 
 
