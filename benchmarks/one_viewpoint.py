@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import contents, expect, inside, numbers, read_text
-from pimper_torch.errors import InputError
+from pimper_torch.camera_files.layout import DataSetPath, contents
 from pimper_torch.evidence.datasets.diligent import FLIP, decoded_normals, directed_lights
-from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs, there
+from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.io.photographs import read_mask
 from pimper_torch.numpy_files import read_npz
 from pimper_torch.radiometry import LINEAR
@@ -42,23 +41,19 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
     Raises:
         InputError: Another layout; names what was expected and what was found.
     """
-    root = Path(folder)
-    listed = root / name / f"{name}.txt"
-    expect(listed.is_file(), root, _UW, f"{name}/{name}.txt")
-    count, *names = read_text(listed, _UW).split() or ["0"]
-    expect(
+    root = DataSetPath(Path(folder), _UW)
+    listed = root.inner(f"{name}/{name}.txt")
+    root.expect(listed.path.is_file(), f"{name}/{name}.txt")
+    count, *names = listed.read_text().split() or ["0"]
+    listed.expect(
         count.isdecimal() and len(names) == int(count) + 1 > 1,
-        listed,
-        _UW,
         "a number, so many names of photographs, and the mask's name",
         f"{count!r} and {len(names)} names",
     )
-    lights = root / "lights.txt"
-    lines = [line for line in read_text(lights, _UW).splitlines() if line.strip()]
-    directions = numbers(
-        " ".join(lines[2:]).split(), 3 * int(count), "light directions", lights, _UW
-    )
-    *photographs, mask = (inside(root / name, one, _UW) for one in names)
+    lights = root.inner("lights.txt")
+    lines = [line for line in lights.read_text().splitlines() if line.strip()]
+    directions = lights.numbers(" ".join(lines[2:]), 3 * int(count), "light directions")
+    *photographs, mask = (root.inner(name).inside(one) for one in names)
     views = read_photographs(
         photographs,
         names[:-1],
@@ -91,13 +86,13 @@ def read_yale_b(
     Source: Georghiades, Belhumeur & Kriegman, From Few to Many, PAMI 23(6), 2001.
     """
     root = Path(folder)
-    expect(root.is_dir(), root, _YALE, "a folder of photographs")
+    DataSetPath(root, _YALE).expect(root.is_dir(), "a folder of photographs")
     found = sorted(
         (path, float(match[1]), float(match[2]))
         for path in root.iterdir()
         if (match := _ANGLES.fullmatch(path.name))
     )
-    expect(bool(found), root, _YALE, "photographs such as yaleB02_P00A+035E-20.pgm")
+    DataSetPath(root, _YALE).expect(bool(found), "photographs such as yaleB02_P00A+035E-20.pgm")
     views = read_photographs(
         [path for path, _, _ in found],
         [path.name for path, _, _ in found],
@@ -165,44 +160,38 @@ def read_normal_map(folder: Path | str) -> NormalMap:
 
     Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
     """
-    root, kind = Path(folder), "a normal map to integrate"
+    root = DataSetPath(Path(folder), "a normal map to integrate")
     for name in ("normal_map.png", "mask.png"):
-        expect((root / name).is_file(), root, kind, name)
-    mask = read_mask(there(root / "mask.png"))
-    normals = decoded_normals(root / "normal_map.png", kind)
-    _same_shape(normals.shape[:2], mask.shape, root, kind, "normal_map.png")
-    K_path, depth_path = root / "K.txt", root / "depth_gt.npz"
+        root.expect((root.path / name).is_file(), name)
+    mask = read_mask(root.path / "mask.png")
+    normals = decoded_normals(root.inner("normal_map.png"))
+    _same_shape(normals.shape[:2], mask.shape, root, "normal_map.png")
+    K_file, depth_file = root.inner("K.txt"), root.inner("depth_gt.npz")
     K = None
-    if K_path.is_file():
-        K = numbers(read_text(K_path, kind), 9, "K", K_path, kind).reshape(3, 3)
-        K = intrinsics_from_indices(K)
-    depth = _read_depth(depth_path, kind) if depth_path.is_file() else None
+    if K_file.path.is_file():
+        K = intrinsics_from_indices(K_file.numbers(K_file.read_text(), 9, "K").reshape(3, 3))
+    depth = _read_depth(depth_file) if depth_file.path.is_file() else None
     if depth is not None:
-        _same_shape(depth.shape, mask.shape, root, kind, "depth_gt.npz")
+        _same_shape(depth.shape, mask.shape, root, "depth_gt.npz")
     return NormalMap(
         normals=torch.where(mask[..., None], normals, 0), mask=mask, intrinsics=K, depth=depth
     )
 
 
-def _read_depth(path: Path, kind: str) -> Float[Tensor, "height width"]:
-    try:
-        array = read_npz(path, lambda name: name == "depth_gt")["depth_gt"].astype(np.float32)
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); needed: an array depth_gt. Copy the file again."
-        ) from error
-    expect(array.ndim == 2, path, kind, "depth_gt of height x width", f"{array.ndim} axes")
+def _read_depth(file: DataSetPath) -> Float[Tensor, "height width"]:
+    array = file.read(
+        lambda path: read_npz(path, lambda name: name == "depth_gt")["depth_gt"], "an archive"
+    ).astype(np.float32)
+    file.expect(array.ndim == 2, "depth_gt of height x width", f"{array.ndim} axes")
     depth = torch.from_numpy(array)
     return torch.where(depth.isfinite() & (depth > 0), depth, torch.inf)
 
 
 def _same_shape(
-    shape: Sequence[int], expected: Sequence[int], root: Path, kind: str, name: str
+    shape: Sequence[int], expected: Sequence[int], root: DataSetPath, name: str
 ) -> None:
-    expect(
+    root.expect(
         tuple(shape) == tuple(expected),
-        root,
-        kind,
         f"{name} of the mask's {expected[1]} x {expected[0]}",
-        f"{shape[1]} x {shape[0]}; the folder holds {contents(root)}",
+        f"{shape[1]} x {shape[0]}; the folder holds {contents(root.path)}",
     )

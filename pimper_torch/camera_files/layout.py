@@ -1,9 +1,10 @@
-"""Layout of data sets: refusals of other layouts, and readers of their text files."""
+"""Folders and files of data sets, and refusals of those of another layout."""
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -13,28 +14,116 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 
 _MAX_NAME = 255  # bytes, of most file systems
+_MAX_TEXT, _MAX_VALUE = 400, 80  # characters of a message that quote a file
+
+T = TypeVar("T")
 
 
-def expect(ok: bool, path: Path, kind: str, needed: str, found: str | None = None) -> None:
-    """Refuse a folder or file that does not have the layout of a data set.
+class DataSetPath(NamedTuple):
+    """A folder or file of a data set.
 
-    Args:
+    Attributes:
         kind: The data set, as its users call it.
-        found: What is there instead; by default what the folder holds.
     """
-    if ok:
-        return
-    if found is None:
-        found = contents(path)
-    needed, found = _shortened(needed), _shortened(found)
-    raise InputError(
-        f"{path}: not the layout of {kind}. Needed: {needed}. Found: {found}. Point to the folder "
-        "that holds it, or choose the reader of another layout."
-    )
 
+    path: Path
+    kind: str
 
-def _shortened(text: str, most: int = 400) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    def inner(self, name: str | Path) -> "DataSetPath":
+        """Return a file or folder inside."""
+        return self._replace(path=self.path / name)
+
+    def refuse(self, needed: str, found: str | None = None) -> NoReturn:
+        """Refuse it.
+
+        Args:
+            found: What is there instead; by default what the folder holds.
+        """
+        found = contents(self.path) if found is None else found
+        raise InputError(
+            f"{self.path}: not the layout of {self.kind}. Needed: {_shortened(needed, _MAX_TEXT)}. "
+            f"Found: {_shortened(found, _MAX_TEXT)}. Point to the folder that holds it, or choose "
+            "the reader of another layout."
+        )
+
+    def expect(self, ok: bool, needed: str, found: str | None = None) -> None:
+        """Refuse it unless it is as needed."""
+        if not ok:
+            self.refuse(needed, found)
+
+    def read(self, reader: Callable[[Path], T], what: str) -> T:
+        """Read the file.
+
+        Args:
+            what: The format, for messages.
+
+        Raises:
+            InputError: There is no such file, or the reader fails.
+        """
+        parent = self._replace(path=self.path.parent)
+        parent.expect(self.path.is_file(), f"a file {self.path.name}")
+        try:
+            return reader(self.path)
+        except InputError:
+            raise
+        except Exception as error:  # every parser has its own kinds
+            raise InputError(
+                f"{self.path}: cannot be read as {what} ({error}); needed: {what} of {self.kind}. "
+                "Copy it again, or write it anew."
+            ) from error
+
+    def read_text(self) -> str:
+        """Read a text file, or refuse it."""
+        return self.read(lambda path: path.read_text(encoding="utf-8-sig"), "a text in UTF-8")
+
+    def read_json(self) -> dict[str, object]:
+        """Read a JSON file of one object, or refuse it."""
+        found = self.read(lambda path: json.loads(path.read_text("utf-8-sig")), "JSON in UTF-8")
+        self.expect(isinstance(found, dict), "a JSON object", f"a {type(found).__name__}")
+        return dict(found)
+
+    def inside(self, name: str) -> Path:
+        """Join a path that a file of the data set names to its folder.
+
+        Links that lie in the folder are followed wherever they lead: who put them there wants that.
+
+        Returns:
+            Without ``..``, which would leave the folder behind a link.
+
+        Raises:
+            InputError: The path is absolute, leads out by ``..``, or is no path.
+        """
+        longest = max(
+            len(part.encode("utf-8", "surrogatepass")) for part in (*Path(name).parts, "")
+        )
+        self.expect(longest <= _MAX_NAME, "names of files", f"{name!r}")
+        within = os.path.normpath(name)
+        stays = not Path(name).anchor and Path(within).parts[:1] != ("..",) and "\0" not in name
+        self.expect(stays, "paths that stay in this folder", f"{name!r}, which leads out of it")
+        return self.path / within
+
+    def objects(self, value: object, what: str) -> list[dict[str, object]]:
+        """Return a value of the file as a list of objects; refuse anything else, or none."""
+        entries = list(value) if isinstance(value, list) else []
+        ok = bool(entries) and all(isinstance(entry, dict) for entry in entries)
+        self.expect(ok, f"a list of objects as {what}", _shown(value))
+        return entries
+
+    def numbers(self, value: object, count: int, what: str) -> Float[Tensor, " number"]:
+        """Return a value of the file as so many finite numbers in float64; refuse anything else.
+
+        Args:
+            value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
+        """
+        pieces = value.split() if isinstance(value, str) else value
+        try:
+            array = np.asarray(pieces, dtype=np.float64).reshape(-1)
+        except (ValueError, TypeError, OverflowError):
+            array = np.full(1, np.nan)
+        ok = len(array) == count and bool(np.isfinite(array).all())
+        plural = "s" if count > 1 else ""
+        self.expect(ok, f"{count} finite number{plural} as {what}", _shown(value))
+        return torch.from_numpy(array.copy())
 
 
 def contents(path: Path) -> str:
@@ -45,130 +134,33 @@ def contents(path: Path) -> str:
     return "a file" if path.exists() else "nothing there"
 
 
-def inside(folder: Path, name: str, kind: str) -> Path:
-    """Join a path that a data set's file names to its folder, refusing to leave the folder.
-
-    Links that lie in the folder are followed wherever they lead: who put them there wants that.
-
-    Returns:
-        Without ``..``, which would leave the folder behind a link.
-
-    Raises:
-        InputError: The path is absolute, leads out by ``..``, or is no path.
-    """
-    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in (*Path(name).parts, ""))
-    expect(longest <= _MAX_NAME, folder, kind, "names of files", f"{name!r}")
-    within = os.path.normpath(name)
-    stays = not Path(name).anchor and Path(within).parts[:1] != ("..",) and "\0" not in name
-    expect(
-        stays,
-        folder,
-        kind,
-        "paths that stay in this folder",
-        f"{name!r}, which leads out of it",
-    )
-    return folder / within
-
-
 def first_of(candidates: Sequence[Path]) -> Path | None:
     """Return the first path that exists."""
     return next((path for path in candidates if path.exists()), None)
 
 
-def file_in(given: Path | str, names: Sequence[str], kind: str) -> Path:
-    """Return a file, or the one of these names, or patterns, in a folder.
+def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
+    """Return a file, or the one of these names, or of one pattern, in a folder.
 
     Raises:
-        InputError: There is none, or several fit a pattern.
+        InputError: There is none, or several fit the pattern.
     """
     given = Path(given)
     if given.is_file():
-        return given
-    found = [given / name for name in names if (given / name).exists()]
+        return DataSetPath(given, kind)
+    folder, found = DataSetPath(given, kind), [given / name for name in names]
     if names[0].startswith("*"):
         found = sorted(given.glob(names[0])) if given.is_dir() else []
-        expect(len(found) == 1, given, kind, f"one file named {names[0]}")
-    expect(bool(found), given, kind, f"a file {' or '.join(names)}")
-    return found[0]
-
-
-def read_text(path: Path, kind: str) -> str:
-    """Read a text file of a data set.
-
-    Raises:
-        InputError: There is no such file, or it is no UTF-8 text.
-    """
-    expect(path.is_file(), path, kind, "a text file", contents(path))
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read as text ({error}); needed: the text file of {kind}, as UTF-8. "
-            "Copy it again."
-        ) from error
-
-
-def read_json(path: Path, kind: str) -> dict[str, object]:
-    """Read a JSON file that holds one object.
-
-    Raises:
-        InputError: There is no such file, or it holds something else.
-    """
-    try:
-        found = json.loads(read_text(path, kind))
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: is no valid JSON ({error}); needed: the JSON file of {kind}. Copy it again, "
-            "or write it anew."
-        ) from error
-    expect(isinstance(found, dict), path, kind, "a JSON object", f"a {type(found).__name__}")
-    return dict(found)
-
-
-def objects(value: object, what: str, path: Path, kind: str) -> list[dict[str, object]]:
-    """Check that a value of a file is a list of objects, and give it.
-
-    Raises:
-        InputError: It is something else, or empty.
-    """
-    entries = list(value) if isinstance(value, list) else []
-    expect(
-        bool(entries) and all(isinstance(entry, dict) for entry in entries),
-        path,
-        kind,
-        f"a list of objects as {what}",
-        _shown(value),
-    )
-    return entries
-
-
-def numbers(
-    value: object, count: int, what: str, path: Path, kind: str
-) -> Float[Tensor, " number"]:
-    """Check that a value of a file is so many numbers, and give them in float64.
-
-    Args:
-        value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
-        kind: The data set, as its users call it.
-
-    Raises:
-        InputError: They are more, fewer, not finite, or no numbers.
-    """
-    pieces = value.split() if isinstance(value, str) else value
-    try:
-        array = np.asarray(pieces, dtype=np.float64).reshape(-1)
-    except (ValueError, TypeError, OverflowError):
-        array = np.full(1, np.nan)
-    expect(
-        len(array) == count and bool(np.isfinite(array).all()),
-        path,
-        kind,
-        f"{count} finite number{'s' if count > 1 else ''} as {what}",
-        _shown(value),
-    )
-    return torch.from_numpy(array.copy())
+        folder.expect(len(found) == 1, f"one file named {names[0]}")
+    path = first_of(found)
+    if path is None:
+        folder.refuse(f"a file {' or '.join(names)}")
+    return DataSetPath(path, kind)
 
 
 def _shown(value: object) -> str:
-    text = "nothing" if value is None else repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return "nothing" if value is None else _shortened(repr(value), _MAX_VALUE)
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."

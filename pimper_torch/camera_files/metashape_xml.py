@@ -8,7 +8,7 @@ from xml.parsers import expat
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect, numbers
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.errors import InputError, caution, some
 from pimper_torch.geometry.frames import invert_rigid, rigid
@@ -35,66 +35,63 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
         InputError: The file is something else, defines entities, or describes a lens or rig
             that cannot be read.
     """
-    chunk = _chunk(path)
+    file = DataSetPath(path, KIND)
+    chunk = _chunk(file)
     lenses = {
         str(sensor.get("id")): (sensor, number)
         for number, sensor in enumerate(chunk.iterfind("sensors//sensor"), start=1)
     }
     for camera in chunk.iterfind("cameras//camera"):
         rig = camera.get("master_id") not in (None, camera.get("id"))
-        what = f"a transform of its own for {camera.get('label')}"
-        expect(not rig, path, KIND, what, "a camera of a rig")
+        file.expect(
+            not rig, f"a transform of its own for {camera.get('label')}", "a camera of a rig"
+        )
     cameras = []
     for camera in _component(_placed(chunk), path):
         label = str(camera.get("label"))
         sensor = lenses.get(str(camera.get("sensor_id")))
-        expect(sensor is not None, path, KIND, f"the sensor of {label}", "no such sensor")
-        assert sensor is not None
-        lens, skew_px = _lens(*sensor, path)
-        pose = _cam_from_world(camera, chunk, path)
+        if sensor is None:
+            file.refuse(f"the sensor of {label}", "no such sensor")
+        lens, skew_px = _lens(*sensor, file)
+        pose = _cam_from_world(camera, chunk, file)
         cameras.append(PosedCamera(name=label, cam_from_world=pose, lens=lens, skew_px=skew_px))
-    expect(bool(cameras), path, KIND, "cameras with a transform", "none")
+    file.expect(bool(cameras), "cameras with a transform", "none")
     return cameras
 
 
-def parse_without_entities(path: Path, kind: str) -> ElementTree.Element:
+def parse_without_entities(path: Path) -> ElementTree.Element:
     """Parse XML from a stranger: a file that declares a document type is refused.
 
     Entities need such a declaration, and with them a small file can grow without bound or
     name other files.
 
     Raises:
-        InputError: The file is no XML, or declares a document type.
+        InputError: The file declares a document type.
     """
 
     def refuse(name: str, *_: object) -> None:
         raise InputError(
-            f"{path}: declares the document type {name}; needed: plain XML without one, as {kind} "
-            "has. Export it again."
+            f"{path}: declares the document type {name}; needed: plain XML without one. Export it "
+            "again."
         )
 
-    try:
-        content = path.read_bytes()
-        checker = expat.ParserCreate()
-        checker.StartDoctypeDeclHandler = refuse
-        checker.Parse(content, True)
-        return ElementTree.fromstring(content)
-    except (OSError, expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(
-            f"{path}: cannot be read as XML ({error}); needed: {kind}. Export it again."
-        ) from error
+    content = path.read_bytes()
+    checker = expat.ParserCreate()
+    checker.StartDoctypeDeclHandler = refuse
+    checker.Parse(content, True)
+    return ElementTree.fromstring(content)
 
 
-def _chunk(path: Path) -> ElementTree.Element:
-    root = parse_without_entities(path, KIND)
+def _chunk(file: DataSetPath) -> ElementTree.Element:
+    root = file.read(parse_without_entities, "XML")
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
-    expect(bool(chunks), path, KIND, "a document of one chunk", f"<{root.tag}> without one")
+    file.expect(bool(chunks), "a document of one chunk", f"<{root.tag}> without one")
     aligned = [chunk for chunk in chunks if _placed(chunk)] or chunks
     if len(aligned) > 1:
         labels = [f"{chunk.get('label')} ({len(_placed(chunk))} cameras)" for chunk in aligned]
         raise InputError(
-            f"{path}: has {len(aligned)} chunks: {some(labels)}; needed: one, as each has a frame "
-            "of its own. Export the cameras of the chunk that is meant, or merge the chunks."
+            f"{file.path}: has {len(aligned)} chunks: {some(labels)}; needed: one, as each has a "
+            "frame of its own. Export the cameras of the chunk that is meant, or merge the chunks."
         )
     return aligned[0]
 
@@ -124,15 +121,15 @@ def _component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTr
 
 
 def _cam_from_world(
-    camera: ElementTree.Element, chunk: ElementTree.Element, path: Path
+    camera: ElementTree.Element, chunk: ElementTree.Element, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
     what = f"transform of {camera.get('label')}"
-    chunk_from_cam = numbers(camera.findtext("transform"), 16, what, path, KIND).reshape(4, 4)
-    pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, path, KIND)
+    chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
+    pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, file)
     similarity = _similarity_of(camera, chunk)
     if similarity is not None:
         # Metres or whatever: the scale moves the camera and leaves its axes unit.
-        world_from_chunk, scale = _rigid_and_scale(similarity, path)
+        world_from_chunk, scale = _rigid_and_scale(similarity, file)
         pose = world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3])
     return invert_rigid(pose)
 
@@ -149,43 +146,38 @@ def _similarity_of(
 
 
 def _rigid_and_scale(
-    element: ElementTree.Element, path: Path
+    element: ElementTree.Element, file: DataSetPath
 ) -> tuple[Float[Tensor, "4 4"], float]:
     def values(tag: str, count: int, default: str) -> Float[Tensor, " value"]:
-        what = f"{tag} of the chunk"
-        return numbers(element.findtext(tag, default), count, what, path, KIND)
+        return file.numbers(element.findtext(tag, default), count, f"{tag} of the chunk")
 
     rotation = values("rotation", 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
     translation = values("translation", 3, "0 0 0")
     scale = float(values("scale", 1, "1"))
-    expect(scale > 0, path, KIND, "a positive scale of the chunk", f"{scale}")
-    return rigid_or_refuse(rotation, translation, "the chunk's transform", path, KIND), scale
+    file.expect(scale > 0, "a positive scale of the chunk", f"{scale}")
+    return rigid_or_refuse(rotation, translation, "the chunk's transform", file), scale
 
 
-def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, float]:
-    """Translate a sensor's calibration, and give its skew."""
+def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[Lens, float]:
+    """Translate a sensor's calibration; return the skew, too."""
     label = sensor.get("label") or sensor.get("id")
     given = sensor.findall("calibration")
     adjusted = [one for one in given if one.get("class") == "adjusted"] or given
-    expect(bool(adjusted), path, KIND, f"a calibration of the sensor {label}", "none")
+    file.expect(bool(adjusted), f"a calibration of the sensor {label}", "none")
     calibration = adjusted[0]
 
     def value(tag: str) -> float:
         text = calibration.findtext(tag, "0")
-        return float(numbers(text, 1, f"{tag} of the sensor {label}", path, KIND))
+        return float(file.numbers(text, 1, f"{tag} of the sensor {label}"))
 
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
-    resolution_px = (
-        None if resolution is None else [resolution.get("width"), resolution.get("height")]
-    )
-    width, height = (
-        int(side)
-        for side in numbers(resolution_px, 2, f"resolution of the sensor {label}", path, KIND)
-    )
+    sides = None if resolution is None else [resolution.get("width"), resolution.get("height")]
+    size_px = file.numbers(sides, 2, f"resolution of the sensor {label}")
+    width, height = (int(side) for side in size_px)
     old = calibration.find("f") is None and calibration.find("fx") is not None
     other = "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none"
-    expect(value("f") > 0 and not old, path, KIND, f"a positive f of the sensor {label}", other)
+    file.expect(value("f") > 0 and not old, f"a positive f of the sensor {label}", other)
     f, b1, b2 = value("f"), value("b1"), value("b2")
     k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
@@ -200,10 +192,8 @@ def _lens(sensor: ElementTree.Element, number: int, path: Path) -> tuple[Lens, f
         readable = kind == "frame" and not any((k4, p3, p4)) and not (b2 and distorted)
         if distorted:
             model, params = "FULL_OPENCV", (k1, k2, p2, p1, k3, 0.0, 0.0, 0.0)
-    expect(
+    file.expect(
         readable,
-        path,
-        KIND,
         f"a frame camera with k1, k2, k3, p1, p2, b1, or a fisheye with k1 to k4 and b1, for the "
         f"sensor {label}",
         f"a {kind} camera with {_nonzero(calibration)}; export undistorted photographs with their "

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.geometry.frames import rigid
 from pimper_torch.records import Lens, Record
 
@@ -16,7 +15,7 @@ from pimper_torch.records import Lens, Record
 _MAX_FROM_ROTATION = 1e-2
 
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
-"""Gives width and height of photographs by their names in a file; none for those not there."""
+"""Width and height of photographs by their names in a file; ``None`` for those not there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -45,25 +44,15 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
     ]
 
 
-def pinhole_lens(
-    intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int], camera: int = 1
-) -> Lens:
+def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> Lens:
     """Return the lens of a pinhole's ``K``, but for its skew."""
-    fx, fy, cx, cy = (float(intrinsics[row, column]) for row, column in _PINHOLE)
-    return Lens(
-        camera=camera, model="PINHOLE", params=(fx, fy, cx, cy), width=size_px[0], height=size_px[1]
-    )
-
-
-_PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
+    K = intrinsics.tolist()
+    params = (K[0][0], K[1][1], K[0][2], K[1][2])
+    return Lens(camera=1, model="PINHOLE", params=params, width=size_px[0], height=size_px[1])
 
 
 def rigid_or_refuse(
-    rotation: Float[Tensor, "3 3"],
-    translation: Float[Tensor, "3"],
-    what: str,
-    path: Path,
-    kind: str,
+    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
     """Put a file's rotation and translation together, the rotation made exact.
 
@@ -74,11 +63,6 @@ def rigid_or_refuse(
     nearest = U @ Vh
     off = float((rotation - nearest).abs().max())
     mirrored = bool(torch.linalg.det(nearest) < 0)
-    expect(
-        off <= _MAX_FROM_ROTATION and not mirrored,
-        path,
-        kind,
-        f"a rotation in {what}",
-        "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation",
-    )
+    found = "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation"
+    file.expect(off <= _MAX_FROM_ROTATION and not mirrored, f"a rotation in {what}", found)
     return rigid(nearest, translation)

@@ -1,11 +1,10 @@
 """Cameras of a file, whichever program wrote it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from pimper_torch.camera_files.camera_arrays import read_camera_arrays
-from pimper_torch.camera_files.layout import read_text
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.meshroom_sfm import read_meshroom_cameras
 from pimper_torch.camera_files.metashape_xml import read_metashape_cameras
 from pimper_torch.camera_files.posed_camera import PosedCamera, SizesOf
@@ -31,19 +30,10 @@ def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> l
         return read_camera_arrays(path, photographs, sizes_of)
     if suffix == ".xml":
         return read_metashape_cameras(path)
-    if suffix == ".sfm" or (suffix == ".json" and "frames" not in _keys(path)):
-        return read_meshroom_cameras(path)
-    if suffix == ".json":
-        return read_transforms_cameras(path, sizes_of)
+    if suffix in (".sfm", ".json"):
+        framed = suffix == ".json" and "frames" in DataSetPath(path, _KIND).read_json()
+        return read_transforms_cameras(path, sizes_of) if framed else read_meshroom_cameras(path)
     raise InputError(
         f"{path}: is no file of cameras; needed: the folder of a COLMAP model, or a file "
         "transforms.json, cameras.xml (Metashape), cameras.sfm (Meshroom) or cameras.npz (arrays)."
     )
-
-
-def _keys(path: Path) -> set[str]:
-    try:
-        found = json.loads(read_text(path, _KIND))
-    except (ValueError, RecursionError):
-        return set()  # which the reader says
-    return set(found) if isinstance(found, dict) else set()

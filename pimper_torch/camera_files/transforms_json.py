@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.camera_files.layout import expect, numbers, objects, read_json
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
@@ -30,11 +30,12 @@ def read_frames(path: Path) -> list[dict[str, object]]:
     Raises:
         InputError: The file has another structure, or a frame names no photograph.
     """
-    whole = read_json(path, KIND)
-    frames = [{**whole, **frame} for frame in objects(whole.get("frames"), "frames", path, KIND)]
+    file = DataSetPath(path, KIND)
+    whole = file.read_json()
+    frames = [{**whole, **frame} for frame in file.objects(whole.get("frames"), "frames")]
     for frame in frames:
         name = frame.get("file_path")
-        expect(isinstance(name, str) and name != "", path, KIND, "a text as file_path", repr(name))
+        file.expect(isinstance(name, str) and name != "", "a text as file_path", repr(name))
     return frames
 
 
@@ -59,17 +60,18 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
         InputError: The file has another structure.
     """
     frames = read_frames(path)
-    names = [str(frame["file_path"]) for frame in frames]
-    sizes = sizes_of(names) if any(stated_size(frame) is None for frame in frames) else None
-    cameras = []
-    for index, (frame, name) in enumerate(zip(frames, names, strict=True)):
-        size = stated_size(frame) or (sizes[index] if sizes else None)
-        if size is not None:
-            cameras.append(frame_camera(frame, name, size, path))
+    names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
+    sizes = [_stated_size(frame) for frame in frames]
+    read = sizes if all(sizes) else sizes_of(names)
+    cameras = [
+        _camera(frame, name, size, DataSetPath(path, KIND))
+        for frame, name, *both in zip(frames, names, sizes, read, strict=True)
+        if (size := both[0] or both[1])
+    ]
     return number_lenses(cameras)
 
 
-def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
+def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
     """Return a frame's width and height, where the file says them."""
     sides = frame.get("w"), frame.get("h")
     if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
@@ -77,30 +79,26 @@ def stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
     return round(float(str(sides[0]))), round(float(str(sides[1])))
 
 
-def frame_camera(
-    frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path
+def _camera(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
 ) -> PosedCamera:
-    """Read one frame.
-
-    Args:
-        frame: Of :func:`read_frames`.
-        name: Of its photograph, for messages too.
-    """
     matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
     rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
-    expect(bool(rows), path, KIND, f"4 rows of 4 numbers as {what}", type(matrix).__name__)
-    world_from_cam = numbers(rows, 12, what, path, KIND).reshape(3, 4)
+    file.expect(bool(rows), f"4 rows of 4 numbers as {what}", type(matrix).__name__)
+    world_from_cam = file.numbers(rows, 12, what).reshape(3, 4)
     turn, shift = world_from_cam[:, :3] * FLIP, world_from_cam[:, 3]
-    pose = invert_rigid(rigid_or_refuse(turn, shift, what, path, KIND))
-    return PosedCamera(name=name, lens=_lens(frame, name, size_px, path), cam_from_world=pose)
+    pose = invert_rigid(rigid_or_refuse(turn, shift, what, file))
+    return PosedCamera(name=name, lens=_lens(frame, name, size_px, file), cam_from_world=pose)
 
 
-def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path: Path) -> Lens:
+def _lens(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
+) -> Lens:
     def value(key: str, default: float = 0.0) -> float:
         given = frame.get(key)
         if given is None:
             return default
-        return float(numbers(given, 1, f"{key} of {name}", path, KIND))
+        return float(file.numbers(given, 1, f"{key} of {name}"))
 
     def focal_px(axis: str, side_px: float) -> float:
         stated_px, angle = value(f"fl_{axis}"), value(f"camera_angle_{axis}")
@@ -108,15 +106,15 @@ def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path
             return max(stated_px, 0.0)
         if angle >= math.pi:
             raise InputError(
-                f"{path}: camera_angle_{axis} of {name} is {angle:g}; needed: radians, below pi. "
-                f"If these are degrees, write {math.radians(angle):.6g}."
+                f"{file.path}: camera_angle_{axis} of {name} is {angle:g}; needed: radians, below "
+                f"pi. If these are degrees, write {math.radians(angle):.6g}."
             )
         return side_px / 2 / math.tan(angle / 2)
 
     width, height = size_px
     focal, focal_y = focal_px("x", width), focal_px("y", height)
     what = f"fl_x or camera_angle_x, in the file or for {name}"
-    expect(focal > 0 or focal_y > 0, path, KIND, what, "neither, or no positive one")
+    file.expect(focal > 0 or focal_y > 0, what, "neither, or no positive one")
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -125,8 +123,8 @@ def _lens(frame: Mapping[str, object], name: str, size_px: tuple[int, int], path
     if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
         kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     else:
-        expect(model in _POLYNOMIAL, path, KIND, f"a camera_model of {_POLYNOMIAL}", model)
-        expect(k4 == 0, path, KIND, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
+        file.expect(model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
+        file.expect(k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
         if any((k1, k2, k3, p1, p2)):
             kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)

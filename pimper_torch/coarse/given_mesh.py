@@ -5,7 +5,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.coarse.mesh_frame import compare_with_scene
 from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
@@ -14,6 +13,7 @@ from pimper_torch.geometry.topology import face_components, first_of_each
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.geometry.welding import welded
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
+from pimper_torch.sfm.conventions.mesh_frame import compare_with_scene
 
 # Rays cast along each photograph's longer side. A choice: some 20,000 rays a photograph see every
 # component that is not smaller than a hundredth of it, in milliseconds.

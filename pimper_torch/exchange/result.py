@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import read_json
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build, read_mapping
 from pimper_torch.errors import InputError, PimperWarning, some
 from pimper_torch.io.estimates import mask_path, read_lights, read_reference
@@ -76,7 +76,7 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
     """
     folder = Path(folder)
     _require_result(folder)
-    summary = read_json(folder / "summary.json", _KIND)
+    summary = DataSetPath(folder / "summary.json", _KIND).read_json()
     model = read_model(folder / "sparse")
     views = _photographs(folder, photographs or summary.get("photographs"), model)
     scene = assemble_scene(views, model)

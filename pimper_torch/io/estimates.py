@@ -1,19 +1,22 @@
 """Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
 
-import json
 from pathlib import Path, PurePosixPath
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights
 from pimper_torch.numpy_files import read_npz
-from pimper_torch.records import Cameras, Estimate, Reconstruction
-from pimper_torch.sfm.colmap import pinhole_of, read_model
+from pimper_torch.records import Estimate, Reconstruction
+from pimper_torch.sfm.agreement import pinholes_of
+from pimper_torch.sfm.colmap import read_model
+
+_KIND = "a result of `pimper reconstruct`"
 
 
 def estimate_of(result: Reconstruction) -> Estimate:
@@ -64,7 +67,8 @@ def read_estimate(path: Path | str) -> Estimate:
     names: tuple[str, ...] = ()
     cameras = None
     if (path / "sparse").is_dir():
-        names, cameras = read_cameras(path / "sparse")
+        model = read_model(path / "sparse")
+        names, cameras = model.names, pinholes_of(model)
     lights = read_lights(path / "lights.json", names)
     return Estimate(
         mesh=mesh,
@@ -75,55 +79,33 @@ def read_estimate(path: Path | str) -> Estimate:
     )
 
 
-def read_cameras(folder: Path | str) -> tuple[tuple[str, ...], Cameras]:
-    """Read the views of a COLMAP model as pinholes; a lens's distortion is left out."""
-    folder = Path(folder)
-    model = read_model(folder)
-    intrinsics = [pinhole_of(lens) for lens in model.lenses]
-    sizes = [[lens.width, lens.height] for lens in model.lenses]
-    cameras = Cameras(
-        intrinsics=torch.stack(intrinsics) if intrinsics else torch.zeros(0, 3, 3).double(),
-        cam_from_world=model.cam_from_world,
-        sizes_px=torch.tensor(sizes).reshape(-1, 2).long(),
-    )
-    return model.names, cameras
-
-
 def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
     """Read the light of every named view; NaN where the file has none.
 
     Returns:
         ``None`` where there is no such file, no view, or no light.
     """
-    path = Path(path)
-    if not path.is_file() or not names:
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file() or not names:
         return None
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-        known = {view["name"]: view["light"] for view in report["views"]}
-        rows = [known.get(name) or [float("nan")] * 4 for name in names]
-        lights = torch.tensor(rows, dtype=torch.float64).reshape(len(names), 4)
-    except (OSError, ValueError, LookupError, TypeError, RuntimeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: cannot be read as lights ({error}); needed: JSON with `views`, each with "
-            "`name` and `light`, four numbers or null. Remove the file to do without lights."
-        ) from error
+    views = file.objects(file.read_json().get("views"), "views")
+    known = {str(view.get("name")): view.get("light") for view in views}
+    unknown = torch.full((4,), torch.nan, dtype=torch.float64)
+    rows = [
+        file.numbers(known[name], 4, f"light of {name}") if known.get(name) else unknown
+        for name in names
+    ]
+    lights = torch.stack(rows)
     return lights if bool(lights.isfinite().any()) else None
 
 
 def read_reference(path: Path | str) -> str | None:
     """Read the name of the reference view; ``None`` where there is no such file."""
-    path = Path(path)
-    if not path.is_file():
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file():
         return None
-    try:
-        found = read_npz(path, lambda name: name == "name").get("name")
-        return None if found is None else str(found)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); needed: an .npz file with `name`, the reference "
-            "view. Remove the file to do without one."
-        ) from error
+    found = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")
+    return str(found["name"]) if "name" in found else None
 
 
 def mask_path(folder: Path | str, name: str) -> Path:

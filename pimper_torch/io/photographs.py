@@ -14,16 +14,16 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, PimperWarning, caution, some
 from pimper_torch.file_names import match_files
-from pimper_torch.io.decode import SUFFIXES, decode, read_header
+from pimper_torch.io.decode import SUFFIXES, decode, read_header, rotated
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
 from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.focal_lengths import focals_px
 from pimper_torch.io.header import Header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
-from pimper_torch.io.turned_masks import choose_ways, mask_ways
 from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
+from pimper_torch.sfm.conventions.turned_masks import drawn_as_stored
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
@@ -444,7 +444,27 @@ def _read_masks(
         if sorted((mask.width, mask.height)) == sorted((header.width, header.height)):
             level.copy_(_brightness(path))
     drawn = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
-    return [mask_ways(*one) for one in drawn]
+    return [_mask_ways(*one) for one in drawn]
+
+
+def _mask_ways(
+    drawn: Float[Tensor, "_ _"], path: Path, mask: Header, photograph: Path, header: Header
+) -> list[Float[Tensor, "_ _"]]:
+    """Return the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
+
+    Args:
+        drawn: As the mask's file has it, turned by an EXIF of its own.
+    """
+    ways = [drawn]
+    if header.orientation != 1 and mask.orientation == 1:
+        ways.append(torch.from_numpy(rotated(drawn.numpy(), header.orientation)))
+    fitting = [way for way in ways if way.shape == (header.height, header.width)]
+    if fitting:
+        return fitting
+    raise InputError(
+        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} is "
+        f"{header.width} x {header.height}; needed: a mask of the same size."
+    )
 
 
 def _laid(
@@ -461,7 +481,7 @@ def _laid(
         for several, size in zip(ways, sizes, strict=True)
     ]
     pictures = [image[:, :high, :wide] for image, (wide, high) in zip(images, sizes, strict=True)]
-    stored = choose_ways(drawn, pictures, str(folder))
+    stored = drawn_as_stored(drawn, pictures, str(folder))
     return [several[-1 if stored else 0] for several in ways]
 
 

@@ -15,7 +15,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.priors.at_points import AtPoints, at_points, means_by
 from pimper_torch.records import DepthPrior, SparseScene
-from pimper_torch.sfm.squares import ERRORS, standard_errors
+from pimper_torch.sfm.conventions.choice import surely_better
 
 Along = Literal["axis", "ray"]
 Gauge = Literal["scene", "scale", "affine"]
@@ -62,15 +62,12 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
     worth = means_by(size / (size + errors), seen.point)
     best = int(medians[:-1, -1].argmin())
 
-    def far_better(one: Tensor, other: Tensor) -> bool:
-        return standard_errors(one - other) > ERRORS
-
     def at(reading: int, gauge: int = -1) -> str:
         return f"{float(medians[reading, gauge]):.1%}"
 
     if not told and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
-    helps = told and far_better(worth[best, -1], worth[-1, -1])
+    helps = told and surely_better(worth[best, -1], worth[-1, -1])
     if medians[-1, -1] > _FLAT and not helps:
         raise InputError(
             f"{where} fits the cloud no better than a plane across the view, as depth or as one "
@@ -84,13 +81,13 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         )
     if prior.inverse is not None:
         stated, gauge = ways.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
-        if helps and far_better(worth[best, -1], worth[stated, -1]):
+        if helps and surely_better(worth[best, -1], worth[stated, -1]):
             raise InputError(
                 f"{where} is {_READINGS[ways[best]]}, given as {_READINGS[ways[stated]]}: the "
                 f"cloud shows it (median error {at(best)} against {at(stated)}). State what it is."
             )
         worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
-        if helps and worse and far_better(worth[stated, -1], worth[stated, gauge]):
+        if helps and worse and surely_better(worth[stated, -1], worth[stated, gauge]):
             raise InputError(
                 f"{where} is no depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
                 f"{at(stated, gauge)}, and {at(stated)} {_GAUGES['affine']} (`gauge` affine)."
@@ -98,9 +95,9 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         best = stated
     else:
         plain = ways.index((ways[best][0], "axis"))
-        if not far_better(worth[best, -1], worth[plain, -1]):
+        if not surely_better(worth[best, -1], worth[plain, -1]):
             best = plain
-        gauge = [far_better(worth[best, -1], one) for one in worth[best]].index(False)
+        gauge = [surely_better(worth[best, -1], one) for one in worth[best]].index(False)
         caution(
             f"{where} is taken to be {_READINGS[ways[best]]} {_GAUGES[gauges[gauge]]}, as the "
             f"cloud shows: its median error at {errors.shape[-1]} observations is "

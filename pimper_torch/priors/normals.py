@@ -17,7 +17,7 @@ from pimper_torch.errors import InputError, caution, some
 from pimper_torch.priors.at_points import at_points, means_by, places
 from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
-from pimper_torch.sfm.squares import ERRORS, standard_errors
+from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.silhouettes.rays import RayConfig, contour_rays
 
 _NAMED: list[tuple[int, ...]] = [signs for signs, _ in AXES.values()]
@@ -66,7 +66,7 @@ def settled_normals(
     best = int(means.argmax())
 
     def far_better(one: int, other: int) -> bool:
-        return standard_errors(worth[one] - worth[other]) > ERRORS
+        return surely_better(worth[one], worth[other])
 
     def refused(found: str, needed: str) -> InputError:
         return InputError(f"{where} {found}. Cloud, outlines and cameras show it. {needed}")

@@ -113,10 +113,12 @@ def undistorted_pairs(
 
 def pinholes_of(model: SparseModel) -> Cameras:
     """Return the pinholes behind a model's lenses."""
+    intrinsics = [pinhole_of(lens) for lens in model.lenses]
+    sizes = [[lens.width, lens.height] for lens in model.lenses]
     return Cameras(
-        intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
+        intrinsics=torch.stack(intrinsics) if intrinsics else torch.zeros(0, 3, 3).double(),
         cam_from_world=model.cam_from_world,
-        sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
+        sizes_px=torch.tensor(sizes).reshape(-1, 2).long(),
     )
 
 

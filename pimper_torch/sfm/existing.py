@@ -13,10 +13,18 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.crops import REACHES, changed_views, points_tell, possible_crops, tell_crop
+from pimper_torch.sfm.conventions.pictures import (
+    REACHES,
+    allowed_turns,
+    changed_views,
+    find_turns,
+    points_tell,
+    possible_crops,
+    possible_turns,
+    tell_crop,
+)
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
-from pimper_torch.sfm.orientation import allowed_turns, find_turns, possible_turns
 from pimper_torch.sfm.quarter_turns import (
     turned_lens,
     turned_pixels,
@@ -36,10 +44,12 @@ class Ways(NamedTuple):
         plain: Resized; in the pixels of photographs as they stand, then as files store them, where
             no points tell. Empty where no resize leads to a photograph's shape.
         cropped: Cut out in the usual ways, where sizes differ and no points tell of a resize.
+        changed: Numbers of the photographs of another size.
     """
 
     plain: list[SparseModel]
     cropped: list[SparseModel]
+    changed: list[int]
 
 
 def existing_ways(views: Views, path: Path) -> Ways:
@@ -67,14 +77,8 @@ def existing_ways(views: Views, path: Path) -> Ways:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    sizes = _whole_sizes(shown)
-    crops = possible_crops(model, shown, sizes)
-
-    def by_points(one: SparseModel) -> Ways:
-        return Ways([follow_pictures(one, shown, find_turns(one, shown, where))], [])
-
-    if len(model.points_world) and not crops:
-        return by_points(model)
+    sizes = _whole_sizes(shown, model)
+    changed = changed_views(model, sizes)
     fits = bool(allowed_turns(model, shown).any(dim=1).all())
     plain, cropped = (
         [
@@ -82,19 +86,22 @@ def existing_ways(views: Views, path: Path) -> Ways:
             for one in some
             for way in possible_turns(one, shown)
         ]
-        for some in ([model] if fits else [], crops)
+        for some in ([model] if fits else [], possible_crops(model, sizes))
     )
-    changed = changed_views(crops) if crops else []
     # That photographs were resized is the plain explanation: it may be told in larger steps.
     reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
-    if any(points_tell(one, shown, changed, reaches) for _, one in plain):
-        return by_points(model)
-    told = [points_tell(one, shown, changed) for _, one in cropped]
-    if any(told):
-        ways = by_points(cropped[told.index(max(told))][0])
-        tell_crop(where, ways.plain[0], crops, "what they show round its points")
-        return ways
-    return Ways([one for _, one in plain], [one for _, one in cropped])
+    told = model
+    if changed and not any(points_tell(one, shown, changed, reaches) for _, one in plain):
+        scores = [points_tell(one, shown, changed) for _, one in cropped]
+        if not any(scores):
+            return Ways([one for _, one in plain], [one for _, one in cropped], changed)
+        told = cropped[scores.index(max(scores))][0]
+    if not len(model.points_world):
+        return Ways([one for _, one in plain], [], [])
+    placed = follow_pictures(told, shown, find_turns(told, shown, where))
+    if told is not model:
+        tell_crop(where, placed, changed, "what they show round its points")
+    return Ways([placed], [], [])
 
 
 def _largest(views: Views, folder: Path) -> Path:
@@ -184,13 +191,12 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
         return width, height
 
 
-def _whole_sizes(views: Views) -> list[tuple[int, int]]:
-    """Return the sizes of photographs before they were shrunk on reading, in their orientation."""
+def _whole_sizes(views: Views, model: SparseModel) -> list[tuple[int, int]]:
+    """Return the sizes of photographs before they were shrunk on reading, as the pictures lie."""
     sizes = []
-    for view in range(views.num_views):
-        width, height = (int(side) for side in views.sizes_px[view])
+    for view, lens in enumerate(model.lenses):
         whole = _stored_size(views, view)
-        across = (whole[0] > whole[1]) != (width > height)
+        across = (whole[0] > whole[1]) != (lens.width > lens.height)
         sizes.append(turned_size(*whole, int(across)))
     return sizes
 

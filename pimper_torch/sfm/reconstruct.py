@@ -21,7 +21,7 @@ from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.doubt import doubt
-from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
+from pimper_torch.sfm.existing import Ways, existing_ways, follow_pictures, place, taken
 from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small
 from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
 from pimper_torch.sfm.model import SparseModel, select_views
@@ -100,31 +100,25 @@ class Reconstruct(Stage):
         if not lacks_points(model) or not scene.lenses:
             return scene
         bare = scene.views.replace(priors=())
-        found = self._triangulated(bare, [model], "The scene")
+        found = self._triangulated(bare, Ways([model], [], []), "The scene")
         return scene if found is model else with_model_points(scene, found)
 
     def _given(self, views: Views, path: Path) -> SparseModel:
         """Read cameras, and triangulate points where they come without."""
-        plain, cropped = existing_ways(views, path)
-        first = (plain or cropped)[0]
-        if not cropped and not lacks_points(first):
+        ways = existing_ways(views, path)
+        first = (ways.plain or ways.cropped)[0]
+        if not ways.cropped and not lacks_points(first):
             return first
-        return self._triangulated(taken(views, first), plain, place(path), cropped)
+        return self._triangulated(taken(views, first), ways, place(path))
 
-    def _triangulated(
-        self,
-        views: Views,
-        ways: list[SparseModel],
-        where: str,
-        crops: Sequence[SparseModel] = (),
-    ) -> SparseModel:
+    def _triangulated(self, views: Views, ways: Ways, where: str) -> SparseModel:
         """Take points that were kept, or triangulate them and keep them."""
         alone = replace(self.config, threads=0)
-        hashed = digest(code(), views, ways, crops, alone) if self.store else None
+        hashed = digest(code(), views, *ways, alone) if self.store else None
         found, _ = kept_model(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
-            lambda: triangulate(views, ways, self.config, where, crops),
+            lambda: triangulate(views, ways.plain, self.config, where, ways.cropped, ways.changed),
         )
         return found
 

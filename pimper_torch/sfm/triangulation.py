@@ -21,7 +21,12 @@ from pimper_torch.sfm.agreement import (
 )
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
-from pimper_torch.sfm.crops import find_crop
+from pimper_torch.sfm.conventions.by_matches import (
+    choose_turns,
+    explained,
+    find_crop,
+    require_agreement,
+)
 from pimper_torch.sfm.features import find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -34,15 +39,10 @@ from pimper_torch.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.photograph_agreement import (
-    explained,
-    explained_fraction,
-    require_agreement,
-)
 from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace, workspace
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
@@ -65,6 +65,7 @@ def triangulate(
     settings: ReconstructConfig,
     where: str,
     crops: Sequence[SparseModel] = (),
+    changed: Sequence[int] = (),
 ) -> SparseModel:
     """Triangulate what photographs show, with cameras held fixed.
 
@@ -76,7 +77,8 @@ def triangulate(
     Args:
         models: Of them, in their order: cameras in the ways in which they may be meant; the one
             that fits best is taken. Points that it has are replaced where more are found.
-        crops: Of them, those of photographs that may have been cropped.
+        crops: Cameras of photographs that may have been cropped.
+        changed: Numbers of these.
 
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
@@ -96,9 +98,9 @@ def triangulate(
             match_pairs(space, pairs_to_match(space), settings)
             enter_room(leave_out_room(space.database, settings))
         verified = verified_pairs(space)
-        given = _way(models, verified, settings, where) if models else None
         limit = settings.max_error_px
-        crop = find_crop(given, crops, verified, limit, where) if crops else None
+        given = choose_turns(models, verified, limit, where) if models else None
+        crop = find_crop(given, crops, changed, verified, limit, where) if crops else None
         given = given if crop is None else crop
         assert given is not None, "a crop is found, or refused, where no resize is possible"
         require_agreement(given, verified, limit, where)
@@ -118,34 +120,6 @@ def triangulate(
         return given
     _tell(found, where)
     return found
-
-
-def _way(
-    models: Sequence[SparseModel],
-    verified: Sequence[VerifiedPair],
-    settings: ReconstructConfig,
-    where: str,
-) -> SparseModel:
-    """Choose between cameras of photographs as they stand, and as their files store them."""
-    if len(models) == 1:
-        return models[0]
-    scores = [explained_fraction(model, verified, settings.max_error_px) for model in models]
-    best = scores.index(max(scores))
-    if sum(pair.num_matches for pair in verified) < MIN_MATCHES:
-        caution(
-            f"{where}: EXIF turns photographs, and neither sizes nor matches tell whether its "
-            "cameras are of them before or after that; they are taken as after. If the result is "
-            "wrong, save the photographs turned, without EXIF's orientation.",
-            stacklevel=5,
-        )
-    elif best:
-        caution(
-            f"{where}: its cameras are of pictures that stand otherwise than the photographs, such "
-            "as the pixels that files store before EXIF turns them. They are turned with these, as "
-            "matches between photographs tell.",
-            stacklevel=5,
-        )
-    return models[best]
 
 
 def _match_along_lines(

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pimper_torch.camera_files.layout import read_json
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError, caution
 from pimper_torch.exchange.result import Result, read_result
 from pimper_torch.geometry.local_frame import NO_OFFSET
@@ -64,7 +64,7 @@ def _add_without_photographs(viewer: Viewer, path: Path, error: InputError) -> N
     names, reference = estimate.names, estimate.reference
     if estimate.cameras is not None and names:
         file = path / "summary.json"
-        summary = read_json(file, "figures of a result") if file.is_file() else {}
+        summary = DataSetPath(file, "figures of a result").read_json() if file.is_file() else {}
         place = names.index(reference) if reference in names else 0
         points = read_model(path / "sparse").points_world
         if estimate.lights_world is not None:

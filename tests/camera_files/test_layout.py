@@ -1,14 +1,14 @@
 import pytest
 import torch
 
-from pimper_torch.camera_files.layout import expect, inside, numbers, objects, read_json
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
 
 
 def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
     (tmp_path / "one.txt").touch()
     with pytest.raises(InputError, match=r"not the layout of a toy.*a spoon.*one\.txt") as refusal:
-        expect(False, tmp_path, "a toy", "a spoon")
+        DataSetPath(tmp_path, "a toy").expect(False, "a spoon")
     assert str(tmp_path) in str(refusal.value)
 
 
@@ -20,8 +20,8 @@ def test_a_path_that_leads_out_of_the_folder_is_refused(tmp_path, name):
     folder.mkdir()
     (folder / "link").symlink_to(tmp_path)
     with pytest.raises(InputError, match="leads out of it"):
-        inside(folder, name, "a toy")
-    assert inside(folder, "a/../b.png", "a toy").resolve() == folder / "b.png"
+        DataSetPath(folder, "a toy").inside(name)
+    assert DataSetPath(folder, "a toy").inside("a/../b.png").resolve() == folder / "b.png"
 
 
 def test_links_in_the_folder_are_followed_and_not_left_by_dots(tmp_path):
@@ -32,23 +32,24 @@ def test_links_in_the_folder_are_followed_and_not_left_by_dots(tmp_path):
     (elsewhere.parent / "secret.png").touch()
     (folder / "images").symlink_to(elsewhere)
     (folder / "one.png").symlink_to(elsewhere / "x.png")
-    assert inside(folder, "images/x.png", "a toy").is_file()
-    assert inside(folder, "one.png", "a toy").is_file()
+    place = DataSetPath(folder, "a toy")
+    assert place.inside("images/x.png").is_file()
+    assert place.inside("one.png").is_file()
     # To the system, images/.. is the folder that the link's end lies in.
     assert (folder / "images" / ".." / "secret.png").is_file()
-    assert not inside(folder, "images/../secret.png", "a toy").exists()
+    assert not place.inside("images/../secret.png").exists()
 
 
 @pytest.mark.parametrize("value", ["1 2.5 -3e1", ["1", "2.5", "-30"], [[1, 2.5, -30]]])
 def test_numbers_come_as_texts_or_lists(tmp_path, value):
     expected = torch.tensor([1.0, 2.5, -30.0], dtype=torch.float64)
-    assert torch.equal(numbers(value, 3, "x", tmp_path, "a toy"), expected)
+    assert torch.equal(DataSetPath(tmp_path, "a toy").numbers(value, 3, "x"), expected)
 
 
 @pytest.mark.parametrize("value", [None, "1 2", [1, 2, "nan"], [[1], [2, 3]], {"a": 1}, [1, 2, {}]])
 def test_anything_but_so_many_finite_numbers_is_refused(tmp_path, value):
     with pytest.raises(InputError, match="3 finite numbers as x"):
-        numbers(value, 3, "x", tmp_path, "a toy")
+        DataSetPath(tmp_path, "a toy").numbers(value, 3, "x")
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "{", "[" * 100000, "\ufeff3"])
@@ -56,22 +57,22 @@ def test_json_of_anything_but_an_object_is_refused(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"a\.json"):
-        read_json(path, "a toy")
+        DataSetPath(path, "a toy").read_json()
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     (tmp_path / "a.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="UTF-8"):
-        read_json(tmp_path / "a.json", "a toy")
+        DataSetPath(tmp_path / "a.json", "a toy").read_json()
 
 
 @pytest.mark.parametrize("value", [None, [], "", [1], {"a": 1}])
 def test_anything_but_a_list_of_objects_is_refused(tmp_path, value):
     with pytest.raises(InputError, match="a list of objects as frames"):
-        objects(value, "frames", tmp_path, "a toy")
+        DataSetPath(tmp_path, "a toy").objects(value, "frames")
 
 
 def test_a_name_longer_than_file_systems_have_is_refused_shortly(tmp_path):
     with pytest.raises(InputError, match="names of files") as told:
-        inside(tmp_path, "x" * 9000, "a set")
+        DataSetPath(tmp_path, "a set").inside("x" * 9000)
     assert len(str(told.value)) < 1000

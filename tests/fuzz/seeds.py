@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 from dng import write_dng
 from heic_files import UPRIGHT
 
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.read_cameras import read_cameras
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.config import build, read_mapping, to_yaml
@@ -259,8 +260,9 @@ def _tables(root: Path) -> list[Seed]:
 
     def matlab(folder: Path) -> object:
         name = next(folder.iterdir()).name
-        read_matlab(folder / name, ("fc",), "a test")
-        return read_toolbox_projections(folder / name, (1, 2), "a test")
+        file = DataSetPath(folder / name, "a test")
+        read_matlab(file, ("fc",))
+        return read_toolbox_projections(file, (1, 2))
 
     def settings(folder: Path) -> object:
         path = folder / "settings.yaml"

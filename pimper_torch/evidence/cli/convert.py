@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import torch
 import tyro
@@ -31,6 +31,7 @@ from pimper_torch.evidence.datasets import (
     write_transforms,
 )
 from pimper_torch.evidence.datasets.posed import assemble
+from pimper_torch.evidence.datasets.sampling import LightOptions, read_shots
 from pimper_torch.exchange.nerfstudio import thinned
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import Encoding
@@ -170,7 +171,9 @@ def read(job: Job) -> Capture:
     reader = readers()[job.source]
     known = dict(inspect.signature(reader).parameters)
     if "options" in known:
-        known |= inspect.signature(assemble).parameters
+        (shared,) = get_args(known["options"].annotation)
+        whole = read_shots if shared is LightOptions else assemble
+        known |= inspect.signature(whole).parameters
     plain = ReadOptions()
     given = {
         name: getattr(job.options, name)

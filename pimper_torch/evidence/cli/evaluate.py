@@ -16,8 +16,8 @@ from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.config import to_mapping
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
-from pimper_torch.evidence.datasets.dtu_mvs import read_dtu_mvs, read_dtu_protocol
+from pimper_torch.evidence.datasets.diligent import read_diligent_mv
+from pimper_torch.evidence.datasets.dtu_sets import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics.evaluate import (
     EvaluateConfig,

@@ -1,76 +1,21 @@
-"""IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``; read and written."""
+"""IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``, written."""
 
 from pathlib import Path
-from typing import Unpack
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.camera_files.camera_arrays import IDR, read_world_mats
-from pimper_torch.camera_files.layout import expect, file_in
-from pimper_torch.camera_files.posed_camera import pinhole_lens
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.posed import (
-    PosedOptions,
-    PosedPhotograph,
-    assemble,
-    image_files,
-)
 from pimper_torch.exchange.pictures import write_mask, write_picture
 from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.geometry.projection import project
-from pimper_torch.io.decode import read_header
-from pimper_torch.records import Cameras, Capture, Views
+from pimper_torch.records import Cameras, Views
 
-_CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
+_CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz")
 # The object takes this fraction of the unit sphere, so that nothing of it touches the rim.
 _FRACTION = 0.9
-
-
-def read_idr(
-    folder: Path | str,
-    *,
-    camera_file: str | None = None,
-    **options: Unpack[PosedOptions],
-) -> Capture:
-    """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
-
-    ``world_mat_i`` is ``K [R t]`` as a 4x4 matrix, from the world to pixels, with our camera
-    axes; ``scale_mat_i``, from the unit sphere round the object to the world, is left out:
-    cameras and truth are in the world's units.
-    Arrays belong to the images in plain order of their names. IDR and NeuS cast rays through
-    whole numbers (``uv`` of ``mgrid``, ``pixels_x`` of ``arange``): they count centres from
-    0, so half a pixel is added.
-
-    Args:
-        camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
-            ``cameras_large.npz``.
-        options: See :class:`~pimper_torch.evidence.datasets.posed.PosedOptions`. A mesh has the
-            world's units.
-
-    Raises:
-        InputError: The folder is laid out otherwise, or a file is missing or damaged.
-    """
-    folder = Path(folder)
-    path = _camera_file(folder, camera_file)
-    files = image_files(folder / "image", IDR)
-    masks: list[Path | None] = [None] * len(files)
-    if (folder / "mask").is_dir():
-        masks = list(image_files(folder / "mask", IDR))
-    expect(
-        len(masks) == len(files),
-        folder / "mask",
-        IDR,
-        f"{len(files)} masks, one for each image",
-        f"{len(masks)}",
-    )
-    photographs = [
-        _photograph(*one)
-        for one in zip(files, masks, *read_world_mats(path, len(files)), strict=True)
-    ]
-    return assemble(photographs, folder, IDR, **options)
 
 
 def write_idr(
@@ -108,7 +53,7 @@ def write_idr(
     for index, matrix in enumerate(world_mat):
         arrays[f"world_mat_{index}"] = matrix.numpy()
         arrays[f"scale_mat_{index}"] = scale_mat.numpy()
-    for name in _CAMERA_FILES[:2]:
+    for name in _CAMERA_FILES:
         np.savez(folder / name, allow_pickle=False, **arrays)
 
 
@@ -188,21 +133,3 @@ def _reach(
     if not len(pixels) or float(depth) <= 0:
         return 0.0
     return float(((pixels - here) / K.diagonal()[:2]).norm(dim=-1).max() * depth)
-
-
-def _camera_file(folder: Path, name: str | None) -> Path:
-    return file_in(folder, _CAMERA_FILES if name is None else (name,), IDR)
-
-
-def _photograph(
-    image: Path, mask: Path | None, K: Float[Tensor, "3 3"], cam_from_world: Float[Tensor, "4 4"]
-) -> PosedPhotograph:
-    header = read_header(image)
-    return PosedPhotograph(
-        name=image.name,
-        image=image,
-        mask=mask,
-        lens=pinhole_lens(K, (header.width, header.height)),
-        skew_px=float(K[0, 1]),
-        cam_from_world=cam_from_world,
-    )

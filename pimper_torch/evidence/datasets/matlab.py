@@ -1,61 +1,47 @@
 """Arrays from MATLAB files, and cameras as its calibration toolbox writes them."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect
-from pimper_torch.errors import InputError, some
-from pimper_torch.io.matlab import read_variables
+from pimper_torch.camera_files.layout import DataSetPath
+from pimper_torch.errors import some
+from pimper_torch.evidence.datasets.mat_files import read_variables
+
+_FORMAT = "a MATLAB file of version 5 to 7"
 
 
-def read_matlab(path: Path, names: Sequence[str], kind: str) -> dict[str, np.ndarray]:
-    """Read numeric arrays of a MATLAB file (up to version 7).
+def read_matlab(file: DataSetPath, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read arrays of numbers of a MATLAB file (up to version 7).
 
     Raises:
         InputError: No such file, not a MATLAB file, or a variable is absent or no array of
             numbers; lists what the file holds.
     """
-    found = _variables(path, kind, names)
+    found = _variables(file, names)
     absent = [name for name in names if name not in found]
-    expect(
-        not absent,
-        path,
-        kind,
-        f"the variables {some(absent)}",
-        f"variables {some(sorted(found), most=12)}" if found else "no variables",
-    )
+    there = some(sorted(found), most=12) or "none"
+    file.expect(not absent, f"the variables {some(absent)}", f"variables {there}")
     arrays = {}
     for name in names:
         array = found[name]
-        expect(array is not None, path, kind, f"real numbers in {name}", "another class")
-        assert array is not None
+        if array is None:
+            file.refuse(f"real numbers in {name}", "another class")
         arrays[name] = array
     return arrays
 
 
-def variables(path: Path, kind: str) -> set[str]:
-    """Name the variables of a MATLAB file."""
-    return set(_variables(path, kind, ()))
-
-
-def _variables(path: Path, kind: str, names: Sequence[str]) -> dict[str, np.ndarray | None]:
-    expect(path.is_file(), path.parent, kind, f"the MATLAB file {path.name}")
-    try:
-        return {one.name: one.array for one in read_variables(path, lambda name: name in names)}
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read as a MATLAB file: {error}. Needed: version 5 to 7, not 7.3. "
-            "Unpack the data set again, or save the file with `-v7`."
-        ) from error
+def _variables(file: DataSetPath, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
+    """Read arrays of these names, and name the other variables."""
+    read = file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
+    return {one.name: one.array for one in read}
 
 
 def read_toolbox_projections(
-    path: Path, numbers: Sequence[int], kind: str
+    file: DataSetPath, numbers: Sequence[int]
 ) -> Float[Tensor, "view 3 4"]:
     """Read ``K [R | t]`` from what Bouguet's calibration toolbox for MATLAB saves.
 
@@ -64,7 +50,7 @@ def read_toolbox_projections(
     (``kc``) is not looked at: the sets that come in this form are used without it.
 
     Args:
-        path: ``Calib_Results.mat``.
+        file: ``Calib_Results.mat``.
 
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
@@ -72,40 +58,25 @@ def read_toolbox_projections(
         :func:`~pimper_torch.camera_files.projections.decompose_projections` settles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
-    intrinsic = ["KK"] if "KK" in variables(path, kind) else ["fc", "cc"]
-    arrays = read_matlab(path, [*intrinsic, *poses], kind)
+    intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]
+    arrays = read_matlab(file, [*intrinsic, *poses])
+
+    def shaped(name: str, *shape: int) -> Float[Tensor, "..."]:
+        array = arrays[name]
+        fits = array.shape == shape or (1 in shape and array.size == max(shape))
+        expected, found = (" x ".join(map(str, sides)) for sides in (shape, array.shape))
+        needed = f"{name} as finite numbers of shape {expected}"
+        file.expect(fits and bool(np.isfinite(array).all()), needed, f"shape {found}")
+        return torch.from_numpy(array.astype(np.float64).reshape(shape))
+
     if "KK" in arrays:
-        K = _shaped(arrays["KK"], (3, 3), path, "KK", kind)
+        K = shaped("KK", 3, 3)
     else:
-        focal = _shaped(arrays["fc"], (2,), path, "fc", kind)
-        center = _shaped(arrays["cc"], (2,), path, "cc", kind)
-        K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
-    projections = [
-        K
-        @ np.concatenate(
-            [
-                _shaped(arrays[f"Rc_{number}"], (3, 3), path, f"Rc_{number}", kind),
-                _shaped(arrays[f"Tc_{number}"], (3, 1), path, f"Tc_{number}", kind),
-            ],
-            axis=1,
-        )
-        for number in numbers
-    ]
-    return torch.from_numpy(np.stack(projections))
-
-
-def _shaped(
-    array: np.ndarray, shape: tuple[int, ...], path: Path, name: str, kind: str
-) -> np.ndarray:
-    values = array.astype(np.float64)
-    fits = values.size == int(np.prod(shape)) and bool(np.isfinite(values).all())
-    if fits and len(shape) == 2 and min(shape) > 1:
-        fits = values.shape == shape
-    expect(
-        fits,
-        path,
-        kind,
-        f"{name} as finite numbers of shape {' x '.join(str(side) for side in shape)}",
-        f"shape {' x '.join(str(side) for side in array.shape)}",
+        K = torch.eye(3, dtype=torch.float64)
+        K[[0, 1], [0, 1]], K[:2, 2] = shaped("fc", 2, 1)[:, 0], shaped("cc", 2, 1)[:, 0]
+    return torch.stack(
+        [
+            K @ torch.cat([shaped(f"Rc_{number}", 3, 3), shaped(f"Tc_{number}", 3, 1)], dim=1)
+            for number in numbers
+        ]
     )
-    return values.reshape(shape)

@@ -9,20 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera
 from pimper_torch.errors import InputError, some
-from pimper_torch.io.decode import SUFFIXES, decode, read_header
-from pimper_torch.io.file_cautions import tell_cautions
+from pimper_torch.evidence.datasets.raster import read_photographs
+from pimper_torch.io.decode import SUFFIXES
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import shrunk_focals, shrunk_size
-from pimper_torch.io.radiance import read_pictures, resized_mask
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
 from pimper_torch.sfm.undistort import pinhole_for, undistort
-
-_HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -54,7 +50,15 @@ class PosedPhotograph(PosedCamera):
 
 
 class PosedOptions(TypedDict, total=False):
-    """Options of every reader of posed photographs; see :func:`assemble`."""
+    """Options of every reader of posed photographs.
+
+    Attributes:
+        names: Keep these photographs, in this order; ``None`` for all.
+        mesh: File of the true surface, in the data set's frame.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0 leaves
+            them as they are.
+    """
 
     names: Sequence[str] | None
     mesh: Path | str | None
@@ -64,14 +68,12 @@ class PosedOptions(TypedDict, total=False):
 
 def assemble(
     photographs: Sequence[PosedPhotograph],
-    path: Path,
-    kind: str,
+    data_set: DataSetPath,
     *,
     names: Sequence[str] | None = None,
     mesh: Path | str | None = None,
     encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
-    one_light: bool = False,
 ) -> Capture:
     """Read photographs, undistort them and put them beside their cameras.
 
@@ -80,12 +82,7 @@ def assemble(
 
     Args:
         photographs: All that the data set has.
-        names: Keep these, in this order; ``None`` for all.
-        mesh: File of the true surface, in the data set's frame.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
-            leaves them as they are.
-        one_light: All were taken under the same light; else each is taken to have its own.
+        names: And the others, see :class:`PosedOptions`.
 
     Returns:
         Photographs in float32, cameras and truth in float64, on the CPU.
@@ -94,10 +91,14 @@ def assemble(
         InputError: A name that is not there or there twice, a missing or damaged file, or a
             photograph whose shape is not its camera's.
     """
-    if max_size_px < 0:
-        raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
-    chosen = _select(photographs, names, path, kind)
-    views = read_views(chosen, encoding=encoding, max_size_px=max_size_px)
+    chosen = _select(photographs, names, data_set)
+    views = read_photographs(
+        [one.image for one in chosen],
+        [one.name for one in chosen],
+        encoding=encoding,
+        max_size_px=max_size_px,
+        masks=[one.mask for one in chosen],
+    )
     lenses = fitted_lenses(chosen, views)
     undistorted, _ = undistort(views, lenses)
     count = views.num_views
@@ -112,45 +113,7 @@ def assemble(
         ),
         truth=Truth(mesh=None if mesh is None else read_mesh(mesh)),
         position=torch.arange(count),
-        light=torch.zeros(count, dtype=torch.long) if one_light else torch.arange(count),
-    )
-
-
-def read_views(
-    photographs: Sequence[PosedPhotograph], *, encoding: Encoding = FROM_FILES, max_size_px: int = 0
-) -> Views:
-    """Read photographs as their lenses saw them, linear, padded to one raster.
-
-    Args:
-        photographs: At least one.
-        encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-
-    Raises:
-        InputError: Names a file that is damaged, or a mask without anything in it.
-    """
-    headers = [read_header(one.image) for one in photographs]
-    sizes = [shrunk_size(header, max_size_px) for header in headers]
-    paths = [one.image for one in photographs]
-    tell_cautions(paths[0].parent, paths, headers, encoding)
-    pictures = read_pictures(paths, headers, sizes, encoding)
-    images = pictures.images
-    masks = torch.zeros(images.shape[0], *images.shape[-2:], dtype=torch.bool)
-    has_masks = False
-    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
-        mask = photographs[index].mask
-        has_masks = has_masks or opaque is not None or mask is not None
-        if mask is None and opaque is not None:
-            masks[index] = opaque
-        else:
-            drawn = None if mask is None else _read_mask(mask)
-            masks[index, :high, :wide] = resized_mask(drawn, wide, high)
-    return Views(
-        images=images,
-        sizes_px=torch.tensor(sizes),
-        names=tuple(one.name for one in photographs),
-        masks=masks if has_masks else None,
-        focals_px=shrunk_focals(headers, sizes),
+        light=torch.arange(count),
     )
 
 
@@ -174,16 +137,16 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
     return tuple(lenses)
 
 
-def image_files(folder: Path, kind: str) -> list[Path]:
+def image_files(folder: DataSetPath) -> list[Path]:
     """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
 
     Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
     are followed wherever they lie.
     """
-    expect(folder.is_dir(), folder, kind, "a folder of images")
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    folder.expect(folder.path.is_dir(), "a folder of images")
+    paths = [path for path in folder.path.iterdir() if path.suffix.lower() in SUFFIXES]
     paths = sorted(path for path in paths if not path.name.startswith(".") and path.is_file())
-    expect(bool(paths), folder, kind, f"images ({', '.join(SUFFIXES)})")
+    folder.expect(bool(paths), f"images ({', '.join(SUFFIXES)})")
     return paths
 
 
@@ -199,43 +162,38 @@ def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path |
     """
     if folder is None:
         return lambda photograph: None
-    place = Path(folder)
-    paths = image_files(place, kind)
+    place = DataSetPath(Path(folder), kind)
+    paths = image_files(place)
 
     def find(photograph: Path) -> Path | None:
         stem = photograph.stem
         exact = [path for path in paths if path.stem in (stem, photograph.name)]
         longer = [path for path in paths if path.name.startswith((f"{stem}-", f"{stem}_"))]
         found = exact or longer
-        expect(
-            len(found) == 1,
-            place,
-            kind,
-            f"one mask for {photograph.name}, such as {stem}.png",
-            some([path.name for path in found or paths]),
-        )
+        there = some([path.name for path in found or paths])
+        place.expect(len(found) == 1, f"one mask for {photograph.name}, such as {stem}.png", there)
         return found[0]
 
     return find
 
 
 def _select(
-    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, path: Path, kind: str
+    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, data_set: DataSetPath
 ) -> list[PosedPhotograph]:
     by_name = {one.name: one for one in photographs}
     repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})
-    expect(not repeated, path, kind, "photographs of unlike names", f"several {some(repeated)}")
-    expect(bool(photographs), path, kind, "photographs with cameras", "none")
+    data_set.expect(not repeated, "photographs of unlike names", f"several {some(repeated)}")
+    data_set.expect(bool(photographs), "photographs with cameras", "none")
     wanted = list(by_name) if names is None else list(names)
     unknown = [name for name in wanted if name not in by_name]
     if unknown or not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            f"{path}: asked for {some(unknown or wanted) or 'no photographs'}; needed: some of "
-            f"its {len(by_name)} photographs, each once: {some(list(by_name))}."
+            f"{data_set.path}: asked for {some(unknown or wanted) or 'no photographs'}; needed: "
+            f"some of its {len(by_name)} photographs, each once: {some(list(by_name))}."
         )
     chosen = [by_name[name] for name in wanted]
     missing = [one.image.name for one in chosen if not one.image.is_file()]
-    expect(not missing, path, kind, "the files of its photographs", f"no {some(missing)}")
+    data_set.expect(not missing, "the files of its photographs", f"no {some(missing)}")
     return chosen
 
 
@@ -249,21 +207,3 @@ def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
             f"{K.tolist()}; needed: distortion of a real lens. Export the cameras again."
         )
     return K
-
-
-def _read_mask(path: Path) -> Float[Tensor, "height width"]:
-    """Return 1 on the object: where a mask is opaque, or at least half as bright as it gets."""
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; needed: the mask of a photograph.")
-    decoded = decode(path)
-    if decoded.alpha is not None and bool((decoded.alpha < _HALF).any()):
-        drawn = decoded.alpha >= _HALF
-    else:
-        brightness = decoded.samples.amax(dim=0)
-        drawn = (brightness > 0) & (brightness >= _HALF * brightness.max())
-    if not bool(drawn.any()):
-        raise InputError(
-            f"{path}: marks no pixel as object; needed: bright (or opaque) on the object, black "
-            "off it. Draw it again, or leave the photograph out."
-        )
-    return drawn.float()

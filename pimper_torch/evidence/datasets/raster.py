@@ -1,16 +1,17 @@
-"""Photographs and maps of a data set, read by path and shrunk by the same factor."""
+"""Photographs and maps of a data set, read by path."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header
-from pimper_torch.io.photographs import read_mask, shrunk_size
+from pimper_torch.io.file_cautions import tell_cautions
+from pimper_torch.io.photographs import read_mask, shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Views
@@ -22,41 +23,65 @@ def read_photographs(
     *,
     encoding: Encoding,
     max_size_px: int = 0,
-    masks: Sequence[Path] | None = None,
+    masks: Sequence[Path | None] | None = None,
 ) -> Views:
-    """Read photographs of one size as linear radiance.
+    """Read photographs as linear radiance, padded to one raster.
 
     Args:
-        paths: JPEG, PNG, TIFF, BMP or PGM.
+        paths: At least one.
         names: Unique, one a path.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        masks: One a path, brighter than half on the object; a mask that several
-            photographs share is decoded once.
+        masks: One a path, of any size: it is stretched over the photograph. Where there is none, a
+            photograph shows the object where it is opaque.
 
     Raises:
-        InputError: Names files that are missing, damaged or of another size.
+        InputError: Names files that are missing or damaged, or a mask without anything in it.
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     headers = [read_header(there(path)) for path in paths]
-    full, channels = (headers[0].width, headers[0].height), headers[0].channels
-    for path, header in zip(paths, headers, strict=True):
-        _same_size(path, (header.width, header.height), paths[0], full)
-        if header.channels != channels:
-            raise InputError(
-                f"{path}: has {header.channels} colours, but {paths[0].name} has {channels}; "
-                "needed: photographs of one kind. Unpack the data set again."
-            )
-    width, height = shrunk_size(headers[0], max_size_px)
-    images = read_pictures(paths, headers, [(width, height)] * len(paths), encoding).images
+    sizes = [shrunk_size(header, max_size_px) for header in headers]
+    tell_cautions(paths[0].parent, paths, headers, encoding)
+    pictures = read_pictures(paths, headers, sizes, encoding)
+    files = [None] * len(paths) if masks is None else masks
+    drawn = {path: _read_mask(path) for path in dict.fromkeys(files) if path is not None}
+    inside = torch.zeros(len(paths), *pictures.images.shape[-2:], dtype=torch.bool)
+    for view, (path, opaque, (wide, high)) in enumerate(
+        zip(files, pictures.opaque, sizes, strict=True)
+    ):
+        if path is None and opaque is not None:
+            inside[view] = opaque
+        else:
+            mask = None if path is None else drawn[path]
+            inside[view, :high, :wide] = resized_mask(mask, wide, high)
+    has_masks = bool(drawn) or any(opaque is not None for opaque in pictures.opaque)
     return Views(
-        images=images,
-        sizes_px=torch.tensor([[width, height]]).repeat(len(paths), 1),
+        images=pictures.images,
+        sizes_px=torch.tensor(sizes),
         names=tuple(names),
-        masks=None if masks is None else _read_masks(masks, width, height, paths[0], full),
-        focals_px=torch.full((len(paths),), torch.nan),
+        masks=inside if has_masks else None,
+        focals_px=shrunk_focals(headers, sizes),
     )
+
+
+def require_one_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return the size of photographs before they are shrunk; refuse those of unlike kinds."""
+    headers = [read_header(there(path)) for path in paths]
+    first = headers[0]
+    for path, header in zip(paths, headers, strict=True):
+        if (header.width, header.height) != (first.width, first.height):
+            raise InputError(
+                f"{path}: is {header.width} x {header.height}, but {paths[0].name} is "
+                f"{first.width} x {first.height}; needed: files of one size, as the data set has "
+                "them. Unpack it again."
+            )
+        if header.channels != first.channels:
+            raise InputError(
+                f"{path}: has {header.channels} colours, but {paths[0].name} has "
+                f"{first.channels}; needed: photographs of one kind. Unpack the data set again."
+            )
+    return first.width, first.height
 
 
 def nearest(
@@ -77,18 +102,6 @@ def intrinsics_from_indices(
     return moved
 
 
-def _read_masks(
-    paths: Sequence[Path], width: int, height: int, photograph: Path, size: tuple[int, int]
-) -> Bool[Tensor, "view {height} {width}"]:
-    drawn: dict[Path, Tensor] = {}
-    for path in paths:
-        if path not in drawn:
-            mask = read_mask(there(path))
-            _same_size(path, (mask.shape[1], mask.shape[0]), photograph, size)
-            drawn[path] = resized_mask(mask.float(), width, height)
-    return torch.stack([drawn[path] for path in paths])
-
-
 def there(path: Path) -> Path:
     """Return the path of a file that a data set should hold, or refuse."""
     if not path.is_file():
@@ -99,9 +112,13 @@ def there(path: Path) -> Path:
     return path
 
 
-def _same_size(path: Path, size: tuple[int, int], other: Path, expected: tuple[int, int]) -> None:
-    if size != expected:
+def _read_mask(path: Path) -> Float[Tensor, "height width"]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; needed: the mask of a photograph.")
+    drawn = read_mask(path)
+    if not bool(drawn.any()):
         raise InputError(
-            f"{path}: is {size[0]} x {size[1]}, but {other.name} is {expected[0]} x {expected[1]}; "
-            "needed: files of one size, as the data set has them. Unpack it again."
+            f"{path}: marks no pixel as object; needed: bright (or opaque) on the object, black "
+            "off it. Draw it again, or leave the photograph out."
         )
+    return drawn.float()

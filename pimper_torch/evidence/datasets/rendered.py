@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import expect, inside, read_json
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes.config import SceneConfig
@@ -19,7 +19,8 @@ from pimper_torch.numpy_files import read_npz
 from pimper_torch.progress import track
 from pimper_torch.radiometry import Linear, Srgb
 from pimper_torch.records import Cameras, Capture, Truth, Views
-from pimper_torch.sfm.colmap import pinhole_of, read_model
+from pimper_torch.sfm.agreement import pinholes_of
+from pimper_torch.sfm.colmap import read_model
 
 _KIND = "a rendered scene (`pimper render`)"
 
@@ -48,30 +49,28 @@ def read_rendered(
     Raises:
         InputError: Not such a folder, or something in it is missing or damaged.
     """
-    folder = Path(folder)
-    names, settings = _read_report(folder)
+    root = DataSetPath(Path(folder), _KIND)
+    names, settings = _read_report(root)
     chosen = list(range(len(names)) if views is None else views)
-    expect(
+    root.expect(
         len(set(chosen)) == len(chosen) > 0 and all(0 <= one < len(names) for one in chosen),
-        folder,
-        _KIND,
         f"different views between 0 and {len(names) - 1}",
         f"a wish for {chosen}",
     )
     named = [names[one] for one in chosen]
-    cameras = _read_cameras(folder, named)
-    pictures = _read_views(folder, named, settings, cameras, photographs)
-    point_lights, lights = _read_lights(folder, names, chosen)
+    truth_of = root.inner("truth")
+    cameras = _read_cameras(truth_of.inner("sparse"), named)
+    pictures = _read_views(root, named, settings, cameras, photographs)
+    point_lights, lights = _read_lights(truth_of.inner("lights.json"), len(names))
+    moving = settings.fixed_table or settings.turned_over
     truth = Truth(
-        mesh=read_mesh(folder / "truth" / "mesh.ply"),
-        surroundings=None
-        if settings.fixed_table or settings.turned_over
-        else read_mesh(folder / "truth" / "surroundings.ply"),
-        lights_world=lights,
-        point_lights_world=point_lights,
+        mesh=read_mesh(truth_of.path / "mesh.ply"),
+        surroundings=None if moving else read_mesh(truth_of.path / "surroundings.ply"),
+        lights_world=lights[chosen],
+        point_lights_world=point_lights[chosen],
     )
     if maps:
-        truth = truth.replace(**_read_maps(folder, named, settings))
+        truth = truth.replace(**_read_maps(truth_of.inner("maps"), named, settings))
     order = torch.tensor(chosen)
     position = order // settings.lights_per_pose
     if settings.lights_per_pose > 1:
@@ -79,64 +78,38 @@ def read_rendered(
     return Capture(views=pictures, cameras=cameras, truth=truth, position=position, light=order)
 
 
-def _read_report(folder: Path) -> tuple[tuple[str, ...], SceneConfig]:
-    path = folder / "truth" / "scene.json"
-    report = read_json(path, _KIND)
-    expect(
-        report.get("format") == FORMAT and report.get("format_version") == FORMAT_VERSION,
-        path,
-        _KIND,
-        f"format {FORMAT!r}, version {FORMAT_VERSION}",
-        f"{report.get('format')!r}, version {report.get('format_version')!r}",
-    )
+def _read_report(root: DataSetPath) -> tuple[tuple[str, ...], SceneConfig]:
+    file = root.inner("truth/scene.json")
+    report = file.read_json()
+    found = (report.get("format"), report.get("format_version"))
+    needed = f"format {FORMAT!r}, version {FORMAT_VERSION}"
+    file.expect(found == (FORMAT, FORMAT_VERSION), needed, "{!r}, version {!r}".format(*found))
     names, settings = report.get("names"), report.get("settings")
-    expect(
-        isinstance(settings, dict)
-        and isinstance(names, list)
-        and all(
-            isinstance(name, str) and Path(name).name and ".." not in Path(name).parts
-            for name in names
-        ),
-        path,
-        _KIND,
-        "a list `names` of file names, and `settings`",
-        f"names {names!r}",
-    )
-    assert isinstance(names, list)
-    assert isinstance(settings, dict)
+    if not isinstance(settings, dict) or not isinstance(names, list):
+        file.refuse("a list `names` of file names, and `settings`", f"names {names!r}")
+    for name in names:
+        ok = isinstance(name, str) and Path(name).name and ".." not in Path(name).parts
+        file.expect(bool(ok), "a list `names` of file names, and `settings`", f"names {names!r}")
     try:
         # Settings that have gone since changed nothing that is read here.
         known = {name: settings[name] for name in SceneConfig.__slots__ if name in settings}
-        config = build(SceneConfig, known, str(path))
+        config = build(SceneConfig, known, str(file.path))
     except ConfigError as error:
-        raise InputError(f"{path}: {error}") from error
-    expect(
-        len(names) == config.num_views and len(set(names)) == len(names),
-        path,
-        _KIND,
-        f"num_views = {config.num_views} different names",
-        f"{len(names)} names",
-    )
+        raise InputError(f"{file.path}: {error}") from error
+    ok = len(names) == config.num_views and len(set(names)) == len(names)
+    file.expect(ok, f"num_views = {config.num_views} different names", f"{len(names)} names")
     return tuple(names), config
 
 
-def _read_cameras(folder: Path, names: Sequence[str]) -> Cameras:
-    model = read_model(folder / "truth" / "sparse")
+def _read_cameras(folder: DataSetPath, names: Sequence[str]) -> Cameras:
+    model = read_model(folder.path)
     missing = [name for name in names if name not in model.names]
-    expect(
-        not missing, folder / "truth" / "sparse", _KIND, f"cameras of {names}", f"none of {missing}"
-    )
-    rows = [model.names.index(name) for name in names]
-    lenses = [model.lenses[row] for row in rows]
-    return Cameras(
-        intrinsics=torch.stack([pinhole_of(lens) for lens in lenses]),
-        cam_from_world=model.cam_from_world[rows],
-        sizes_px=torch.tensor([[lens.width, lens.height] for lens in lenses]),
-    )
+    folder.expect(not missing, f"cameras of {names}", f"none of {missing}")
+    return pinholes_of(model).take([model.names.index(name) for name in names])
 
 
 def _read_views(
-    folder: Path,
+    root: DataSetPath,
     names: Sequence[str],
     settings: SceneConfig,
     cameras: Cameras,
@@ -150,9 +123,10 @@ def _read_views(
         images = torch.zeros(len(names), 3, height, width)
         masks = torch.zeros(len(names), height, width, dtype=torch.bool)
         for row in track(range(len(names))):
-            samples = _read_picture(folder / "photos", names[row], width, height)
+            samples = _read_picture(root.inner("photos"), names[row], width, height)
             images[row] = response.linear_from_encoded(samples).expand(3, -1, -1)
-            masks[row] = _read_picture(folder / "masks", names[row], width, height).amax(dim=0) > 0
+            mask = _read_picture(root.inner("masks"), names[row], width, height)
+            masks[row] = mask.amax(dim=0) > 0
     return Views(
         images=images,
         sizes_px=cameras.sizes_px,
@@ -163,67 +137,40 @@ def _read_views(
 
 
 def _read_picture(
-    folder: Path, name: str, width: int, height: int
+    folder: DataSetPath, name: str, width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
-    samples = decode(_file(folder, name)).samples
-    expect(
-        samples.shape[1:] == (height, width),
-        folder / name,
-        _KIND,
-        f"{width} x {height} pixels as scene.json says",
-        f"{samples.shape[2]} x {samples.shape[1]}",
-    )
+    file = folder._replace(path=folder.inside(name))
+    samples = file.read(decode, "a picture").samples
+    needed = f"{width} x {height} pixels as scene.json says"
+    found = f"{samples.shape[2]} x {samples.shape[1]}"
+    file.expect(samples.shape[1:] == (height, width), needed, found)
     return samples
 
 
-def _read_maps(folder: Path, names: Sequence[str], settings: SceneConfig) -> dict[str, Tensor]:
+def _read_maps(
+    folder: DataSetPath, names: Sequence[str], settings: SceneConfig
+) -> dict[str, Tensor]:
     read: dict[str, list[Tensor]] = {name: [] for name in MAP_NAMES}
+    size = f"{settings.width} x {settings.height} pixels as scene.json says"
     for name in track(names):
-        path = _file(folder / "truth" / "maps", Path(name).with_suffix(".npz").as_posix())
-        try:
-            maps = unpack_maps(read_npz(path))
-        except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
-            raise InputError(
-                f"{path}: cannot be read, it seems damaged ({error}). Render the scene again."
-            ) from error
+        inner = folder.inside(Path(name).with_suffix(".npz").as_posix())
+        file = folder._replace(path=inner)
+        maps = file.read(lambda path: unpack_maps(read_npz(path)), "maps")
         for key, values in maps.items():
-            expect(
-                values.shape[:2] == (settings.height, settings.width),
-                path,
-                _KIND,
-                f"{key} of {settings.width} x {settings.height} pixels as scene.json says",
-                f"a shape of {tuple(values.shape)}",
-            )
+            ok = values.shape[:2] == (settings.height, settings.width)
+            file.expect(ok, f"{key} of {size}", f"a shape of {tuple(values.shape)}")
             finite = key == "depth" or bool(values.isfinite().all())  # depth is infinite off it
-            expect(finite, path, _KIND, f"finite numbers as {key}", "others")
+            file.expect(finite, f"finite numbers as {key}", "others")
             read[key].append(values)
     return {key: torch.stack(values) for key, values in read.items()}
 
 
 def _read_lights(
-    folder: Path, names: Sequence[str], chosen: Sequence[int]
+    file: DataSetPath, count: int
 ) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "view 4"]]:
-    path = folder / "truth" / "lights.json"
-    report = read_json(path, _KIND)
-    try:
-        point_lights = torch.tensor(report["positions_world"], dtype=torch.float64)
-        lights = torch.tensor(report["harmonics_world"], dtype=torch.float64)
-    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise InputError(
-            f"{path}: has no numbers in `positions_world` or `harmonics_world` ({error}). Render "
-            "the scene again."
-        ) from error
-    expect(
-        point_lights.shape == (len(names), 3) and lights.shape == (len(names), 4),
-        path,
-        _KIND,
-        f"a position and four harmonics for each of {len(names)} views",
-        f"{tuple(point_lights.shape)} and {tuple(lights.shape)}",
+    report = file.read_json()
+    positions, harmonics = (
+        file.numbers(report.get(name), side * count, f"{name}, for each of {count} views")
+        for name, side in (("positions_world", 3), ("harmonics_world", 4))
     )
-    return point_lights[list(chosen)], lights[list(chosen)]
-
-
-def _file(folder: Path, name: str) -> Path:
-    path = inside(folder, name, _KIND)
-    expect(path.is_file(), folder, _KIND, f"a file {name}")
-    return path
+    return positions.reshape(-1, 3), harmonics.reshape(-1, 4)

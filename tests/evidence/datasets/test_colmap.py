@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.colmap import read_colmap
+from pimper_torch.evidence.datasets import read_colmap
 from pimper_torch.exchange.colmap_workspace import write_colmap
 from pimper_torch.sfm.colmap import read_model
 

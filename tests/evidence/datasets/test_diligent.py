@@ -8,8 +8,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.diligent import read_diligent
-from pimper_torch.evidence.datasets.diligent_mv import read_diligent_mv
+from pimper_torch.evidence.datasets.diligent import read_diligent, read_diligent_mv
 from pimper_torch.geometry.projection import project
 
 WIDTH, HEIGHT = 20, 16

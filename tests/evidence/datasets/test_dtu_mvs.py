@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.dtu_mvs import ALL_LIGHTS, read_dtu_mvs, read_dtu_protocol
+from pimper_torch.evidence.datasets.dtu_sets import ALL_LIGHTS, read_dtu_mvs, read_dtu_protocol
 
 POINTS = """ply
 format ascii 1.0

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.dtu_points import read_dtu_points
+from pimper_torch.evidence.datasets.dtu_sets import read_dtu_points
 from pimper_torch.geometry.projection import project
 from pimper_torch.io import radiance
 

@@ -4,7 +4,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.idr import read_idr, unit_sphere, write_idr
+from pimper_torch.evidence.datasets import read_idr, write_idr
+from pimper_torch.evidence.datasets.idr import unit_sphere
 from pimper_torch.evidence.scenes.cameras import arc_cameras
 from pimper_torch.geometry.frames import transform
 
@@ -54,7 +55,7 @@ def test_other_camera_files_are_found(folder, sees):
 
 def test_matrices_for_other_images_are_refused(folder, paint):
     save(folder, count=3)
-    with pytest.raises(InputError, match=r"world_mat_0 to world_mat_1.*Found: 3"):
+    with pytest.raises(InputError, match=r"2 photographs.*Found: 3 cameras"):
         read_idr(folder)
 
 

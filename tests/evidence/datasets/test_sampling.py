@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.sampling import choose_photographs, one_light_per_position
 
@@ -52,12 +53,12 @@ def test_a_position_with_a_single_light_takes_it_though_its_neighbour_has_it_too
 
 def test_subsets_are_kept_in_order_of_position_and_light():
     position, light = [2, 1, 2, 1, 3], [0, 1, 1, 0, 0]
-    asked = {"path": Path("set"), "kind": "a set", "light_seed": None}
-    assert choose_photographs(position, light, positions=None, lights=None, **asked) == [
+    folder = DataSetPath(Path("set"), "a set")
+    assert choose_photographs(position, light, folder) == [
         3, 1, 0, 2, 4,
     ]  # fmt: skip
-    assert choose_photographs(position, light, positions=[2], lights=None, **asked) == [0, 2]
-    assert choose_photographs(position, light, positions=None, lights=[1], **asked) == [1, 2]
+    assert choose_photographs(position, light, folder, positions=[2]) == [0, 2]
+    assert choose_photographs(position, light, folder, lights=[1]) == [1, 2]
 
 
 def test_lights_that_were_left_out_are_not_sampled_either():
@@ -65,11 +66,10 @@ def test_lights_that_were_left_out_are_not_sampled_either():
     chosen = choose_photographs(
         position.tolist(),
         light.tolist(),
+        DataSetPath(Path("set"), "a set"),
         positions=range(3, 9),
         lights=(2, 5),
         light_seed=3,
-        path=Path("set"),
-        kind="a set",
     )
     assert position[chosen].tolist() == list(range(3, 9))
     assert set(light[chosen].tolist()) == {2, 5}
@@ -80,4 +80,4 @@ def test_lights_that_were_left_out_are_not_sampled_either():
 )
 def test_a_position_or_light_that_is_not_there_is_refused(asked):
     with pytest.raises(InputError, match=r"set: not the layout of a set.*(positions 4|lights 9)"):
-        choose_photographs([1, 2], [0, 1], **asked, light_seed=None, path=Path("set"), kind="a set")
+        choose_photographs([1, 2], [0, 1], DataSetPath(Path("set"), "a set"), **asked)

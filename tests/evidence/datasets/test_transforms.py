@@ -8,7 +8,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets.programs import read_transforms
+from pimper_torch.evidence.datasets import read_transforms
 from pimper_torch.exchange.nerfstudio import write_transforms
 from pimper_torch.io.meshes import read_mesh
 

@@ -1,11 +1,6 @@
-"""Choice among conventions, and the usual mistakes in those of cameras.
+"""The usual mistakes in the conventions of cameras."""
 
-A candidate is the data as another convention has it. One score between 0 and 1 says how well a
-candidate fits what the photographs show, and a candidate is believed where it fits far better than
-the data as they were given.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,21 +14,6 @@ from pimper_torch.records import Cameras
 _OTHER_SIZE = 0.2  # principal points stray by less than this fraction of half the image
 
 Poses = Float[Tensor, "view 4 4"]
-
-
-def far_better(given: float, scores: Sequence[float], left: float, margin: float) -> int | None:
-    """Return the number of the best candidate, if it is far better than the data as given.
-
-    Args:
-        given: Score of the data as given, up to 1.
-        left: Fraction that the best may leave unexplained of what the given data leave.
-        margin: By which its score must be higher, too.
-    """
-    best = max(range(len(scores)), key=lambda index: scores[index], default=None)
-    if best is None:
-        return None
-    better = 1 - scores[best] < left * (1 - given) and scores[best] > given + margin
-    return best if better else None
 
 
 @dataclass(frozen=True, slots=True)

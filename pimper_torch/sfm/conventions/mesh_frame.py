@@ -5,7 +5,6 @@ the part of observed points that is on the mesh, and its overlap with masks.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -13,13 +12,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.camera_files.conventions import far_better
 from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.sfm.conventions.choice import far_better
 
 # Choices. Rays: at most so many to points, and so many along a photograph's longer side; fewer
 # points whose rays meet the mesh than the least say nothing.
@@ -31,9 +30,9 @@ _TRIED, _MIN_SEEN, _WHOLE = 8, 0.2, 0.95
 # A point is on the mesh within this fraction of its diagonal: rough meshes are off by as much.
 _NEAR = 0.03
 # Below the first, a mesh is compared with others: turned, exchanged and scaled ones. It is refused
-# where one of them leaves less than half as much unexplained, and where next to nothing fits and
-# points are a tenth of its diagonal away in the median: the box round an object is off by less.
-_GOOD, _BETTER, _NOTHING, _FAR_OFF = 0.8, 0.5, 0.1, 0.1
+# where next to nothing fits and points are a tenth of its diagonal away in the median: the box
+# round an object is off by less.
+_GOOD, _NOTHING, _FAR_OFF = 0.8, 0.1, 0.1
 # Median distance in diagonals, and overlap with masks, beyond which it is warned of.
 _MAX_DISTANCE, _MIN_OVERLAP = 0.02, 0.8
 # Units that are taken for each other: metres, centimetres, millimetres, inches, feet.
@@ -64,14 +63,18 @@ class Fit:
         hits: Observations of points whose ray meets the mesh.
         on_mesh: Fraction of these that are on it; NaN if too few.
         overlap: Of its silhouettes with the masks, intersection over union; NaN without masks.
-        score: Mean of the fractions that are known; NaN if none is.
     """
 
     rays: int
     hits: int
     on_mesh: float
     overlap: float
-    score: float
+
+    @property
+    def score(self) -> float:
+        """Mean of the fractions that are known; NaN if none is."""
+        known = [value for value in (self.on_mesh, self.overlap) if not math.isnan(value)]
+        return sum(known) / len(known) if known else math.nan
 
 
 def compare_with_scene(
@@ -96,15 +99,19 @@ def compare_with_scene(
     caster = RayCaster(mesh.vertices_world, mesh.faces)
     used = mesh.vertices_world[mesh.faces.flatten()].double()
     diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
-    rays = _rays(scene, silhouettes)
-    offset = used.new_tensor(scene.offset_world)
+    rays, offset = _rays(scene, silhouettes), used.new_tensor(scene.offset_world)
 
-    def fit(world_from_mesh: Float[Tensor, "3 3"], every: int = 1) -> Fit:
-        some = rays.take(slice(None, None, every))
-        return _fit(caster, diagonal, some, world_from_mesh, offset)
+    def score(frame: Float[Tensor, "3 3"]) -> float:
+        fit = _fit(caster, diagonal, rays.take(slice(None, None, _TRIED)), frame, offset)
+        return 0.0 if math.isnan(fit.score) else fit.score
 
-    here = torch.eye(3, dtype=torch.float64)
-    found = fit(here)
+    frames = [
+        scale * torch.diag(torch.tensor(signs))[list(order)].double()
+        for scale, order, signs in product(
+            _SCALES, permutations(range(3)), product((1.0, -1.0), repeat=3)
+        )
+    ]
+    found = _fit(caster, diagonal, rays, frames[0], offset)
     points = rays.take(rays.to_point)
     met = caster.cast(points.origins, points.directions).face >= 0
     distance, reached = math.nan, (points.origins + points.directions)[met]
@@ -112,14 +119,14 @@ def compare_with_scene(
         distance = float(NearestSurface(mesh).query(reached).distance.median()) / diagonal
     told = _told(found, distance, diagonal)
     if not found.score >= _GOOD:
-        frames = [matrix for matrix in _frames() if not torch.equal(matrix, here)]
-        matrix = max(frames, key=lambda matrix: _known(fit(matrix, _TRIED).score))
-        best, score = fit(matrix), _known(found.score)
+        frame = max(frames[1:], key=score)
+        best = _fit(caster, diagonal, rays, frame, offset)
         good = best.score >= _GOOD and best.hits >= _MIN_SEEN * best.rays
-        if good and far_better(score, [best.score], _BETTER, 0.0) is not None:
+        given = 0.0 if math.isnan(found.score) else found.score
+        if good and far_better(given, [best.score]) is not None:
             raise InputError(
-                f"The given mesh is in another frame than the cameras: {told}. {_named(matrix)}, "
-                f"it would fit by {best.score:.0%} in the place of {score:.0%}. Change the mesh "
+                f"The given mesh is in another frame than the cameras: {told}. {_named(frame)}, "
+                f"it would fit by {best.score:.0%} in the place of {given:.0%}. Change the mesh "
                 "so, or export it again in the frame and the unit of the cameras."
             )
         if found.score < _NOTHING and not distance < _FAR_OFF:
@@ -143,31 +150,18 @@ def compare_with_scene(
     return {name: value for name, value in figures.items() if not math.isnan(value)}
 
 
-def _known(score: float) -> float:
-    return 0.0 if math.isnan(score) else score
-
-
 def _told(found: Fit, distance: float, diagonal: float) -> str:
     """State how far off a mesh is, in a part of a sentence."""
-    parts = [f"rays to {found.hits} of {found.rays} observed points meet it"]
+    told = f"rays to {found.hits} of {found.rays} observed points meet it"
     if not math.isnan(found.on_mesh):
-        parts = [
+        told = (
             f"{found.on_mesh:.0%} of {found.hits} observed points whose rays meet it are within "
             f"{_NEAR:.0%} of its diagonal of it, their median distance is {100 * distance:.2g}% of "
             f"the diagonal ({distance * diagonal:.3g})"
-        ]
-    if not math.isnan(found.overlap):
-        parts.append(f"its silhouettes overlap with the masks by {found.overlap:.0%}")
-    return ", and ".join(parts)
-
-
-def _frames() -> Iterator[Float[Tensor, "3 3"]]:
-    """List the ways in which programs exchange axes and units."""
-    eye = torch.eye(3, dtype=torch.float64)
-    for scale, order, signs in product(
-        _SCALES, permutations(range(3)), product((1.0, -1.0), repeat=3)
-    ):
-        yield scale * eye.new_tensor(signs)[:, None] * eye[list(order)]
+        )
+    if math.isnan(found.overlap):
+        return told
+    return f"{told}, and its silhouettes overlap with the masks by {found.overlap:.0%}"
 
 
 def _named(matrix: Float[Tensor, "3 3"]) -> str:
@@ -205,21 +199,12 @@ def _fit(
     on_mesh = met & ((found.distance.double() - 1).abs() * length <= near) & rays.to_point
     hits, count = int(met[rays.to_point].sum()), int(rays.to_point.sum())
     shown, inside = met[~rays.to_point], rays.inside[~rays.to_point]
-    enough = hits >= min(_MIN_HITS, max(1, count // 4))
-    fractions = (
-        int(on_mesh.sum()) / hits if enough else math.nan,
-        int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
-        if len(inside)
-        else math.nan,
-    )
-    known = [value for value in fractions if not math.isnan(value)]
-    return Fit(
-        rays=count,
-        hits=hits,
-        on_mesh=fractions[0],
-        overlap=fractions[1],
-        score=sum(known) / len(known) if known else math.nan,
-    )
+    on, overlap = math.nan, math.nan
+    if hits >= min(_MIN_HITS, max(1, count // 4)):
+        on = int(on_mesh.sum()) / hits
+    if len(inside):
+        overlap = int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
+    return Fit(rays=count, hits=hits, on_mesh=on, overlap=overlap)
 
 
 def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
@@ -236,28 +221,19 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
         column, row = scene.observation_pixels[::step].floor().long().unbind(dim=-1)
         drawn = masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
         point, view = point[drawn], view[drawn]
-    centers = cameras.centers_world.detach().double()
+    centers, poses = cameras.centers_world.detach().double(), cameras.cam_from_world.detach()
     to_points = scene.points_world[point].detach().double() - centers[view]
     parts = [(centers[view], to_points, torch.ones_like(to_points[:, 0], dtype=torch.bool))]
-    for number in range(cameras.num_views):
+    for number in range(cameras.num_views if masked else 0):
         width, height = (int(side) for side in cameras.sizes_px[number])
         step = -(-max(width, height) // _SIDE)
-        mask = masks[number, step // 2 : height : step, step // 2 : width : step].flatten()
-        if masked and bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= _WHOLE:
-            rays = _through(cameras, number, step)
+        raster = slice(step // 2, None, step)
+        mask = masks[number, :height, :width][raster, raster].flatten()
+        if bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= _WHOLE:
+            pose, K = poses[number].double(), cameras.intrinsics[number].detach().double()
+            pixels = pixel_centers(width, height, like=pose)[raster, raster].reshape(-1, 2)
+            rays = rays_through(pixels, pose, K)
             parts.append((centers[number].expand_as(rays), rays, mask))
-    origins, directions, inside = zip(*parts, strict=True)
-    return Rays(
-        origins=torch.cat(origins).cpu(),
-        directions=torch.cat(directions).cpu(),
-        inside=torch.cat(inside).cpu(),
-        to_point=torch.arange(sum(map(len, origins))) < len(point),
-    )
-
-
-def _through(cameras: Cameras, view: int, step: int) -> Float[Tensor, "ray 3"]:
-    """Return rays through a raster of a photograph's pixels, a step apart."""
-    pose = cameras.cam_from_world[view].detach().double()
-    width, height = (int(side) for side in cameras.sizes_px[view])
-    pixels = pixel_centers(width, height, like=pose)[step // 2 :: step, step // 2 :: step]
-    return rays_through(pixels.reshape(-1, 2), pose, cameras.intrinsics[view].detach().double())
+    origins, directions, inside = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
+    to_point = torch.arange(len(origins)) < len(point)
+    return Rays(origins=origins, directions=directions, inside=inside, to_point=to_point)

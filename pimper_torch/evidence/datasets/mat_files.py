@@ -1,5 +1,7 @@
 """MATLAB's files of version 5 to 7, read without memory that they have no room for.
 
+SciPy's reader ends the process on some damaged files.
+
 Source: MathWorks, MAT-File Format, "MAT-File Level 5".
 """
 

@@ -6,45 +6,19 @@ right ends where the photograph changes.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from pimper_torch.errors import InputError, caution
-from pimper_torch.io.decode import rotated
-from pimper_torch.io.header import Header
+from pimper_torch.errors import caution
+from pimper_torch.sfm.conventions.choice import ERRORS
 
-# Standard errors by which the photographs must change more along the outlines of one way; pixels
-# along an outline that are told apart: choices.
-_ERRORS, _APART = 4.0, 8
-Mask = Float[Tensor, "_ _"]
+_APART = 8  # pixels along an outline that are told apart: a choice
 
 
-def mask_ways(
-    drawn: Mask, path: Path | str, found: Header, photograph: Path | str, header: Header
-) -> list[Mask]:
-    """Return the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
-
-    Args:
-        drawn: As the mask's file has it, turned by an EXIF of its own.
-    """
-    ways = [drawn]
-    if header.orientation != 1 and found.orientation == 1:
-        ways.append(torch.from_numpy(rotated(drawn.numpy(), header.orientation)))
-    fitting = [way for way in ways if way.shape == (header.height, header.width)]
-    if fitting:
-        return fitting
-    raise InputError(
-        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph "
-        f"{Path(photograph).name} is {header.width} x {header.height}; needed: a mask of the same "
-        "size."
-    )
-
-
-def choose_ways(
+def drawn_as_stored(
     ways: Sequence[tuple[Bool[Tensor, "_ _"], ...]],
     pictures: Sequence[Float[Tensor, "channel _ _"]],
     where: str,
@@ -57,35 +31,29 @@ def choose_ways(
     Args:
         ways: Of every mask; of two, the first as it is.
     """
-    open_ones = [
-        (masks, picture)
-        for masks, picture in zip(ways, pictures, strict=True)
-        if len(masks) == 2 and not torch.equal(*masks)
-    ]
-    if not open_ones:
+    pairs = zip(ways, pictures, strict=True)
+    both = [(*masks, one) for masks, one in pairs if len(masks) == 2 and not torch.equal(*masks)]
+    if not both:
         return False
-    plain, turned = (
-        torch.cat([_changes(masks[way], picture) for masks, picture in open_ones])
-        for way in range(2)
-    )
+    plain, turned = (torch.cat([_changes(one[way], one[2]) for one in both]) for way in range(2))
     errors = 0.0
     if min(len(plain), len(turned)) >= 2 * _APART:
         variance = _APART * (plain.var() / len(plain) + turned.var() / len(turned))
         errors = float((turned.mean() - plain.mean()) / variance.sqrt().clamp_min(1e-12))
-    told = f"{len(open_ones)} of {len(ways)} masks, whose photographs EXIF turns"
-    if errors > _ERRORS:
+    told = f"{len(both)} of {len(ways)} masks, whose photographs EXIF turns"
+    if errors > ERRORS:
         caution(
             f"{where}: {told}, are drawn on the pixels that the files store, as their outlines "
             "show; they are turned, too.",
             stacklevel=4,
         )
-    elif errors > -_ERRORS:
+    elif errors > -ERRORS:
         caution(
             f"{where}: of {told}, nothing tells whether they are turned already; they are taken as "
             "they are. If that is wrong, turn them.",
             stacklevel=4,
         )
-    return errors > _ERRORS
+    return errors > ERRORS
 
 
 def _changes(

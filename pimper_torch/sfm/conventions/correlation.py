@@ -1,8 +1,10 @@
-"""Squares of the photographs round the points of a model, which views of a point compare.
+"""Squares of the photographs round the points of a model: what views of a point show alike.
 
 A square lies on the plane across a point's mean viewing direction. It is correlated with the mean
 of those of the point's other views.
 """
+
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
@@ -11,6 +13,7 @@ from torch.nn.functional import grid_sample, normalize, one_hot
 
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
@@ -19,9 +22,6 @@ from pimper_torch.sfm.model import SparseModel
 _REACH, _STEP_PX = 3, 1.5
 SAMPLES = (2 * _REACH + 1) ** 2
 """Of a square."""
-
-# Standard errors by which one way must be better than another, and observations it takes: choices.
-ERRORS, _FEWEST = 4.0, 8
 
 
 def others_of(
@@ -38,20 +38,35 @@ def others_of(
     return others, normalize(sums, dim=-1)[..., point - 1, :]
 
 
-def standard_errors(differences: Float[Tensor, " observation"]) -> float:
-    """Compute a mean in standard errors; 0 of too few."""
-    if len(differences) < _FEWEST:
-        return 0.0
-    error = differences.std() / len(differences) ** 0.5
-    return float(differences.mean() / error.clamp_min(1e-9))
-
-
-def sides_of(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2"]:
-    """Compute the sides of each observation's square, a step long, in pixels of the photographs.
+def sampled(
+    model: SparseModel,
+    views: Views,
+    ways: Callable[
+        [int, Float[Tensor, "own 2"], Float[Tensor, "own 2 2"]],
+        tuple[Float[Tensor, "way own 2"], Float[Tensor, "#way own 2 2"]],
+    ],
+    count: int,
+) -> Float[Tensor, "{count} observation sample"]:
+    """Sample the square round each observation in several ways, see :func:`squares_in`.
 
     Args:
-        views: Resized, in the orientation of the model's pictures or turned by quarters.
+        views: The model's, in its order; resized, or turned by quarters.
+        ways: Centres and sides of a view's squares, by its number, its observations as the model
+            has them, and their sides in pixels of the photograph.
     """
+    sides = _sides(model, views)
+    squares = torch.zeros(count, len(sides), SAMPLES)
+    for view, (width, height) in enumerate(views.sizes_px.tolist()):
+        here = (model.observation_view == view).nonzero()[:, 0]
+        picture = views.images[view, :, :height, :width]
+        places = ways(view, model.observation_pixels[here], sides[here])
+        squares[:, here] = squares_in(picture, *places)
+        drop_pages()
+    return squares
+
+
+def _sides(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2"]:
+    """Compute the sides of each observation's square, a step long, in pixels of the photographs."""
     axes = _axes(model, views)
     sides = model.points_world.new_empty(len(model.observation_view), 2, 2)
     for view, lens in enumerate(model.lenses):
@@ -68,7 +83,7 @@ def sides_of(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2
 def squares_in(
     picture: Float[Tensor, "channel height width"],
     centers: Float[Tensor, "*way observation 2"],
-    sides: Float[Tensor, "observation 2 2"],
+    sides: Float[Tensor, "*#way observation 2 2"],
 ) -> Float[Tensor, "*way observation sample"]:
     """Sample squares along two sides, without their mean and with unit length.
 
@@ -94,7 +109,7 @@ def squares_in(
 
 
 def _axes(model: SparseModel, views: Views) -> Float[Tensor, "point 2 3"]:
-    """Give, of each point, the ends of two steps across its mean viewing direction.
+    """Return, of each point, the ends of two steps across its mean viewing direction.
 
     On average over its views a step is as long as samples are apart in the photographs.
     """

@@ -1,0 +1,1 @@
+"""Conventions that data leave open: candidates, their scores, and when one is believed."""
