@@ -40,8 +40,8 @@ from pimper_torch.coarse.trim import point_distances, view_counts
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
-from pimper_torch.evidence.metrics.distances import TrueSurface
 from pimper_torch.evidence.metrics.in_view import compare_along_rays
+from pimper_torch.evidence.metrics.surface_distances import TrueSurface
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views

@@ -28,8 +28,7 @@ from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.hierarchy import sparse_product, torch_product
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.single_view.integration.rasters import RasterSystem
-from pimper_torch.single_view.integration.stencil import Stencil
+from pimper_torch.single_view.integration.raster_system import RasterSystem, Stencil
 
 CASES = ("rectangle", "holes", "plateaus", "decades", "anisotropic", "strips", "mesh")
 SOLVERS = ("cosine", "cholesky", "multigrid", "spsolve", "cg", "cg, diagonal")

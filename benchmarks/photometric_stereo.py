@@ -24,14 +24,14 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
-from pimper_torch.evidence.scenes.lights import Lights
+from pimper_torch.evidence.scenes.scene_lights import Lights
 from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
-from pimper_torch.single_view.photometric_stereo.methods import METHODS
+from pimper_torch.single_view.photometric_stereo.stereo import METHODS
 
 HEIGHT = 240  # pixels of the rendered photographs
 POINT_LIGHTS, SPREAD_DEG = 20, 60.0

@@ -18,16 +18,18 @@ from pimper_torch.geometry.projection import project, rays_through, triangulatio
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.ledger import leave_out
-from pimper_torch.paper.cloud import with_cloud
-from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
-from pimper_torch.paper.filters import (
+from pimper_torch.paper.cloud_filters import (
     behind_others,
+    delaunay,
+    fill_pixels,
+    interpolate_inverse_depth,
     neighbours_agree,
     on_hull,
     spread,
     spread_to_count,
     views_near,
     well_accompanied,
+    with_cloud,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
 from pimper_torch.stage import Stage

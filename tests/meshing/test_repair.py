@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import (
     boundary_loops,

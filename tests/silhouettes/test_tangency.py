@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.metrics.relative import angles_deg
+from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.silhouettes.hull import visual_hull
 from pimper_torch.silhouettes.rays import contour_rays
 from pimper_torch.silhouettes.tangency import TangencyConfig, ambiguous, contour_points

@@ -1,22 +1,269 @@
-"""Everything that is compared along the rays of one view: shape, normals, albedo."""
+"""Errors along the rays of one view: shape, normals, albedo."""
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize, pad
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics.pits import pitted_percent
-from pimper_torch.evidence.metrics.reflectance import AlbedoFigures, compare_albedo
-from pimper_torch.evidence.metrics.relative import Meeting, angles_deg, meet_in_view, relative_error
-from pimper_torch.evidence.metrics.surroundings import without_surroundings
-from pimper_torch.evidence.metrics.visible import joined
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.evidence.metrics.surface_distances import joined
+from pimper_torch.geometry.frames import rotate, transform
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.visibility import cast_view
-from pimper_torch.records import Capture, Mesh, Record
+from pimper_torch.geometry.visibility import Hits, cast_view
+from pimper_torch.records import Cameras, Capture, Mesh, Record, Truth
+
+
+def relative_error(
+    points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
+) -> Float[Tensor, ""]:
+    r"""Return the error of points as a percentage of the true points' spread.
+
+    .. math:: 100 \lVert S - \hat S \rVert_F / \lVert S - \bar S \rVert_F
+
+    Translating both sets, or scaling them, changes nothing. Differentiable where the points
+    differ from the true ones.
+
+    >>> square = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
+    >>> relative_error(square + torch.tensor([0.0, 0, 0.1]), square)
+    tensor(7.0711)
+    """
+    spread = (points_true - points_true.mean(dim=0)).norm()
+    return 100 * (points - points_true).norm() / spread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Meeting(Record):
+    """Where the rays of a view meet a mesh and the truth.
+
+    Attributes:
+        valid: True where a ray meets the truth.
+        both: True where it meets the mesh too.
+        points: Of the mesh, from the camera's centre, frame of the truth.
+        center_world: Of the camera, frame of the truth.
+    """
+
+    valid: Bool[Tensor, "height width"]
+    both: Bool[Tensor, "height width"]
+    points: Float[Tensor, "ray 3"]
+    points_true: Float[Tensor, "ray 3"]
+    center_world: Float[Tensor, " 3"]
+    hits: Hits
+    faces: Int[Tensor, "face 3"]
+
+    @property
+    def coverage(self) -> float:
+        """Fraction of the rays that meet the truth which meet the mesh too."""
+        return float(self.both.sum() / self.valid.sum())
+
+    @property
+    def points_world(self) -> Float[Tensor, "ray 3"]:
+        """Where the rays meet the mesh, frame of the truth."""
+        return self.center_world.to(self.points) + self.points
+
+    def only(self, where: Bool[Tensor, "height width"]) -> "Meeting":
+        """Count all other rays as misses of the mesh."""
+        kept = where[self.both]
+        return self.replace(
+            both=self.both & where, points=self.points[kept], points_true=self.points_true[kept]
+        )
+
+    def interpolate(
+        self, per_vertex: Float[Tensor, "vertex channel"]
+    ) -> Float[Tensor, "ray channel"]:
+        """Blend values of the mesh's vertices where both are met."""
+        return self.hits.interpolate(per_vertex, self.faces)[self.both]
+
+
+def meet_in_view(
+    mesh: Mesh,
+    truth_from_world: Float[Tensor, "4 4"],
+    cameras_true: Cameras,
+    view: int,
+    depth_true: Float[Tensor, "height width"],
+    where: Bool[Tensor, "height width"] | None = None,
+) -> Meeting:
+    """Cast the rays of a true camera on a mesh put in the frame of the truth.
+
+    Args:
+        truth_from_world: Similarity.
+        cameras_true: World frame and scene units of the truth.
+        depth_true: Along that camera's z; infinite where there is nothing.
+
+    Raises:
+        InputError: No pixel is left to compare, or no ray meets the mesh.
+    """
+    valid = depth_true.isfinite() if where is None else depth_true.isfinite() & where
+    moved = mesh.replace(
+        vertices_world=transform(truth_from_world.to(mesh.vertices_world), mesh.vertices_world)
+    )
+    hits = cast_view(moved, cameras_true, view)
+    height, width = hits.face.shape
+    if depth_true.shape != (height, width):  # the views of a set share one raster, padded
+        if depth_true.shape[0] < height or depth_true.shape[1] < width:
+            raise InputError(
+                f"view {view}: its true depth has {tuple(depth_true.shape)} rows and columns, its "
+                f"camera {(height, width)}; needed: one and the same size."
+            )
+        hits = _padded(hits, depth_true.shape[0] - height, depth_true.shape[1] - width)
+    both = valid & (hits.face >= 0)
+    if not both.any():
+        raise InputError(
+            f"view {view}: {int(valid.sum())} pixels have a true depth, and the mesh is met by "
+            f"{int((hits.face >= 0).sum())} rays, none of them at those pixels. Check the frame "
+            "of the mesh."
+        )
+    pixels = pixel_centers(both.shape[1], both.shape[0], like=cameras_true.intrinsics)[both]
+    rays = rays_through(pixels, cameras_true.cam_from_world[view], cameras_true.intrinsics[view])
+    return Meeting(
+        valid=valid,
+        both=both,
+        points=hits.distance[both][:, None].to(rays) * rays,
+        points_true=depth_true[both][:, None].to(rays) * rays,
+        center_world=cameras_true.centers_world[view],
+        hits=hits,
+        faces=mesh.faces,
+    )
+
+
+def _padded(hits: Hits, rows: int, columns: int) -> Hits:
+    """Add pixels that meet nothing, on the right and at the bottom."""
+    return Hits(
+        face=pad(hits.face, (0, columns, 0, rows), value=-1),
+        distance=pad(hits.distance, (0, columns, 0, rows), value=torch.inf),
+        barycentric=pad(hits.barycentric, (0, 0, 0, columns, 0, rows)),
+    )
+
+
+def angles_deg(
+    normals: Float[Tensor, "*batch 3"], normals_true: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch"]:
+    """Return the angles between vectors, accurate also where they nearly agree."""
+    sine = torch.linalg.cross(normals, normals_true).norm(dim=-1)
+    cosine = (normals * normals_true).sum(dim=-1)
+    return torch.rad2deg(torch.atan2(sine, cosine))
+
+
+def without_surroundings(met: Meeting, truth: Truth) -> Meeting:
+    """Count rays that meet the surroundings behind the object as misses.
+
+    Where a surface has a hole on the object and goes on over the table, a ray through the
+    hole meets the table: no error of the object's shape, but a part of it that is not there.
+    Such a point lies behind the true one on its ray, and nearer to the true surroundings than
+    to the true object.
+
+    Args:
+        met: Frame of the truth; of the rays that meet the object.
+        truth: Where it has no mesh or no surroundings, nothing changes.
+    """
+    if truth.mesh is None or truth.surroundings is None or not len(truth.surroundings.faces):
+        return met
+    beside = met.both.clone()
+    beside[met.both] = _beside(met, NearestSurface(truth.mesh), NearestSurface(truth.surroundings))
+    return met.only(~beside)
+
+
+def _beside(
+    met: Meeting, true_object: NearestSurface, surroundings: NearestSurface
+) -> Bool[Tensor, " ray"]:
+    off = (met.points - met.points_true).norm(dim=1)
+    asked = (met.points.norm(dim=1) > met.points_true.norm(dim=1)).nonzero()[:, 0]
+    points = met.points_world[asked]
+    aside = surroundings.query(points).distance
+    # The object is no farther than its point on the ray, so that most need not be asked.
+    unsure = aside < off[asked]
+    asked, points, aside = asked[unsure], points[unsure], aside[unsure]
+    beside = torch.zeros(len(off), dtype=torch.bool, device=off.device)
+    beside[asked] = aside < true_object.query(points).distance
+    return beside
+
+
+# Pixels across the surroundings; how far off these may be in the mean, so that rims which are
+# wrong as a whole are none, and how much further off a pit is, degrees.
+_ACROSS, _SOUND_DEG, _EXCESS_DEG = 21, 3.0, 5.0
+
+
+def pitted_percent(
+    angle_deg: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
+) -> float:
+    """Return the fraction of known pixels that are 5 degrees further off than those around them.
+
+    Those around, 21 x 21 pixels, must be less than 3 degrees off in the mean.
+
+    Args:
+        angle_deg: Of the normal's error; anything where it is not known.
+        known: Where it is; somewhere at least.
+
+    >>> angle = torch.zeros(50, 50)
+    >>> angle[10, 10] = 20.0
+    >>> pitted_percent(angle, torch.ones(50, 50, dtype=torch.bool))
+    0.04
+    """
+    weight = known.double()
+    both = torch.stack([torch.where(known, angle_deg, 0).double() * weight, weight])
+    total, count = avg_pool2d(both, _ACROSS, stride=1, padding=_ACROSS // 2)
+    around = total / torch.where(known, count, 1)
+    pit = (around < _SOUND_DEG) & (angle_deg - around > _EXCESS_DEG)
+    return 100 * float(pit[known].double().mean())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlbedoFigures(Record):
+    """Errors after a scale was fitted: one for all channels, or one a channel.
+
+    Attributes:
+        one_scale_percent: ``100 ||s a - t|| / ||t||`` over samples and channels, with the
+            scale ``s`` of least squares.
+        channel_scales_percent: The same with one such scale a channel, which forgives the
+            colour of the lights.
+        one_scale_median_percent: Median of ``100 |s a - t| / t``, with ``s`` the median of
+            ``t / a``: blind to outliers.
+        channels: Compared; 1 if either side is grey, whose other side is then averaged.
+    """
+
+    one_scale_percent: float
+    channel_scales_percent: float
+    one_scale_median_percent: float
+    channels: int
+    samples: int
+
+
+def compare_albedo(
+    albedo: Float[Tensor, "sample ours"], albedo_true: Float[Tensor, "sample theirs"]
+) -> AlbedoFigures | None:
+    """Compare albedo sample by sample, up to scale.
+
+    Args:
+        albedo: Linear, up to scale.
+        albedo_true: Linear.
+
+    Returns:
+        ``None`` if no sample has both: finite, and above zero in the sum of its channels.
+    """
+    ours, truth = albedo.cpu().double(), albedo_true.cpu().double()
+    if ours.shape[1] != truth.shape[1]:
+        ours, truth = ours.mean(dim=1, keepdim=True), truth.mean(dim=1, keepdim=True)
+    known = ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
+    known &= (ours.sum(dim=1) > 0) & (truth.sum(dim=1) > 0)
+    if not bool(known.any()):
+        return None
+    ours, truth = ours[known], truth[known]
+    one = (ours * truth).sum() / ours.square().sum()
+    each = (ours * truth).sum(dim=0) / ours.square().sum(dim=0).clamp_min(1e-300)
+    positive = (ours > 0) & (truth > 0)
+    there, here = truth[positive], ours[positive]
+    robust = (there / here).median()
+    return AlbedoFigures(
+        one_scale_percent=float(100 * (one * ours - truth).norm() / truth.norm()),
+        channel_scales_percent=float(100 * (each * ours - truth).norm() / truth.norm()),
+        one_scale_median_percent=float(100 * ((robust * here - there).abs() / there).median()),
+        channels=ours.shape[1],
+        samples=len(ours),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +271,7 @@ class AngleFigures(Record):
     """Angles between normals over the rays that meet both, in degrees.
 
     Attributes:
-        pitted_percent: See :func:`pimper_torch.evidence.metrics.pits.pitted_percent`.
+        pitted_percent: See :func:`pimper_torch.evidence.metrics.in_view.pitted_percent`.
     """
 
     mean_deg: float
@@ -37,7 +284,7 @@ class ViewFigures(Record):
     """How a mesh compares with the truth along the rays of one true camera.
 
     Attributes:
-        relative_error: :func:`pimper_torch.evidence.metrics.relative.relative_error`, per cent.
+        relative_error: :func:`pimper_torch.evidence.metrics.in_view.relative_error`, per cent.
         coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
             the surroundings; the other figures are over these.
         transferred_normals: Of the normals that the mesh carries at its vertices; ``None`` if it

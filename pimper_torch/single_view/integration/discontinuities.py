@@ -26,10 +26,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.linalg.multigrid import Iterate
-from pimper_torch.paper.poisson import differences, differences_transposed
+from pimper_torch.paper.integrate import differences, differences_transposed
 from pimper_torch.progress import report
 from pimper_torch.records import Convergence, Record, StopCause
-from pimper_torch.single_view.integration.rasters import Method, RasterSystem
+from pimper_torch.single_view.integration.raster_system import Method, RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
 # Initial scale, in pixels, and the factor by which each iteration divides it: choices.

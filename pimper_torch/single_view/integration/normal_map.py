@@ -18,8 +18,8 @@ from pimper_torch.single_view.integration.discontinuities import (
     Continuity,
     find_discontinuities,
 )
-from pimper_torch.single_view.integration.rasters import Method as Solver
-from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.single_view.integration.raster_system import Method as Solver
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 Raster = Tensor | np.ndarray

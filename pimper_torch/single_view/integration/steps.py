@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.paper.filling import fill_smoothly
+from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
 # Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.

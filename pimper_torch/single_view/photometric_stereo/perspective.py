@@ -22,7 +22,7 @@ from torch.nn.functional import conv2d, pad
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
+from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
 # Minimum number of equations, for nine unknowns up to scale: a choice.
 _FEWEST = 50

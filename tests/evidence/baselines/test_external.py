@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pimper_torch.errors import MissingProgramError, ReconstructionError
-from pimper_torch.evidence.baselines.external import Deadline, Program, run_program
+from pimper_torch.evidence.baselines.openmvs import Deadline, Program, run_program
 
 TOOL = Program(name="tool", variable="PIMPER_TOOL", source="https://tool.example")
 

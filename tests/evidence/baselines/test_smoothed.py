@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, ReconstructionError
 from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 
 
 def few(**settings):

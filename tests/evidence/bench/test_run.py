@@ -11,19 +11,16 @@ from pimper_torch.errors import (
     PimperWarning,
     ReconstructionError,
 )
-from pimper_torch.evidence.bench import run as runner
-from pimper_torch.evidence.bench.config import BenchConfig
-from pimper_torch.evidence.bench.inputs import Inputs
-from pimper_torch.evidence.bench.methods import Outcome, method_named
-from pimper_torch.evidence.bench.panels import error_along_rays
-from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
+from pimper_torch.evidence.bench import run_bench as runner
+from pimper_torch.evidence.bench.bench_inputs import BenchConfig, Inputs, Outcome, method_named
+from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, error_along_rays, run_bench
 from pimper_torch.evidence.metrics import TrueSurface
 from pimper_torch.evidence.metrics.in_view import meet_truth
 from pimper_torch.evidence.scenes import SceneObject, render_objects, sparse_scene
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.outputs.marker import MARKER

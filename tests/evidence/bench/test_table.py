@@ -13,16 +13,20 @@ from rich.console import Console
 from pimper_torch.config import build
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import MissingProgramError, OutputError, ReconstructionError
-from pimper_torch.evidence.bench.machine import Machine, this_machine
-from pimper_torch.evidence.bench.rows import (
+from pimper_torch.evidence.bench.bench_table import (
+    MISSING,
     PUBLISHED,
     Row,
     Table,
+    cell,
+    columns,
+    markdown,
     row_of_failure,
+    terminal,
     with_published,
     write_json,
 )
-from pimper_torch.evidence.bench.table import MISSING, cell, columns, markdown, terminal
+from pimper_torch.evidence.bench.measure import Machine, this_machine
 
 MACHINE = Machine(
     cpu="Abacus 12",

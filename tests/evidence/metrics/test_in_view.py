@@ -6,7 +6,7 @@ from pimper_torch.evidence.metrics import (
     compare_albedo,
     compare_along_rays,
 )
-from pimper_torch.evidence.metrics.visible import joined
+from pimper_torch.evidence.metrics.surface_distances import joined
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Truth
 

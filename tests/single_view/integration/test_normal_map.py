@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
-from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import orthographic_steps
 
 ALL = ["discontinuities", "weighted"]

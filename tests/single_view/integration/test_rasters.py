@@ -10,8 +10,8 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.linalg import hierarchy
 from pimper_torch.linalg.singular import SingularSystemError
-from pimper_torch.paper.poisson import differences, differences_transposed
-from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.paper.integrate import differences, differences_transposed
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.single_view.photometric_stereo import Finding, photometric_stereo
-from pimper_torch.single_view.photometric_stereo.methods import METHODS
+from pimper_torch.single_view.photometric_stereo.stereo import METHODS
 
 COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
 
