@@ -97,23 +97,17 @@ def differences_transposed(
 
 def solve_poisson(
     source: Float[Tensor, "*batch height width"],
-    weight_right: float = 1.0,
-    weight_down: float = 1.0,
-    anchor: float = 0.0,
 ) -> Float[Tensor, "*batch height width"]:
-    r"""Solve :math:`(D^T W D + a) z = s`, D the steps of :func:`differences`.
+    r"""Solve :math:`D^T D z = s`, D the steps of :func:`differences`.
 
     Args:
-        source: ``s``. Without anchor no ``z`` can produce its mean, which is ignored; ``z``
-            then has mean zero.
-        anchor: ``a`` of all samples, not negative.
+        source: ``s``. No ``z`` can produce its mean, which is ignored; ``z`` has mean zero.
 
     Differentiable in ``source``.
     """
     height, width = source.shape[-2:]
     rows, cols = cosine_basis(height, source), cosine_basis(width, source)
-    across = weight_down * _stiffness(height, source)[:, None]
-    stiffness = across + weight_right * _stiffness(width, source) + anchor
+    stiffness = _stiffness(height, source)[:, None] + _stiffness(width, source)
     # No height answers to the mean; dividing it by infinity removes it.
     stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
     return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols

@@ -25,11 +25,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.linalg.multigrid import Iterate
 from pimper_torch.paper.integrate import differences, differences_transposed
 from pimper_torch.progress import report
 from pimper_torch.records import Convergence, Record, StopCause
-from pimper_torch.single_view.integration.raster_system import Method, RasterSystem
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
 # Initial scale, in pixels, and the factor by which each iteration divides it: choices.
@@ -80,7 +79,6 @@ def find_discontinuities(
     weight_down: Float[Tensor, "steps_down width"],
     anchor: Float[Tensor, "height width"] | None,
     heights: Float[Tensor, "height width"] | None,
-    method: Method = "auto",
 ) -> Continuity:
     """Find the continuous steps.
 
@@ -108,11 +106,13 @@ def find_discontinuities(
         scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
         for taken in range(1, _MAX_ITERATIONS + 1):
             weights = weight_right * fraction[0], weight_down * fraction[1]
-            system = RasterSystem(
-                *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
-            )
-            solution = _solved(system, steps, weights, anchor, heights, solution)
-            residuals = _residuals(steps, solution.values.reshape(steps.inside.shape))
+            system = RasterSystem(*weights, anchor, tolerance=_TOLERANCE, what="the integration")
+            target = steps.target
+            source = differences_transposed(weights[0] * target[0], weights[1] * target[1])
+            if anchor is not None and heights is not None:
+                source = source + anchor * heights
+            solution = system.solve_values(source, solution)
+            residuals = _residuals(steps, solution)
             smallest = _final_scale(residuals, tested)
             narrowed = scale <= smallest
             scale = max(scale, smallest)
@@ -135,21 +135,6 @@ def find_discontinuities(
                 cause=torch.tensor([int(cause)]),
             ),
         )
-
-
-def _solved(
-    system: RasterSystem,
-    steps: Steps,
-    weights: Pair,
-    anchor: Tensor | None,
-    heights: Tensor | None,
-    start: Iterate | None,
-) -> Iterate:
-    target = steps.target
-    source = differences_transposed(weights[0] * target[0], weights[1] * target[1])
-    if anchor is not None and heights is not None:
-        source = source + anchor * heights
-    return system.iterate(source, None if start is None else start.values.reshape(source.shape))
 
 
 def _residuals(steps: Steps, found: Float[Tensor, "height width"]) -> Pair:

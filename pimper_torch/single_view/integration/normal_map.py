@@ -18,7 +18,6 @@ from pimper_torch.single_view.integration.discontinuities import (
     Continuity,
     find_discontinuities,
 )
-from pimper_torch.single_view.integration.raster_system import Method as Solver
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
@@ -61,7 +60,6 @@ def integrate_normal_map(
     known_depth: Raster | None = None,
     known_weight: Raster | None = None,
     method: Integration = "discontinuities",
-    solver: Solver = "auto",
 ) -> IntegratedMap:
     """Integrate a normal map to depth.
 
@@ -78,7 +76,6 @@ def integrate_normal_map(
         known_weight: Of the known depths, in units of that of one normal; 1 if not given.
         method: ``"discontinuities"`` preserves depth discontinuities; see
             :mod:`.discontinuities`. ``"weighted"`` is least squares.
-        solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
 
     Raises:
         InputError: Shapes that differ, a mask without pixels, weights that are negative,
@@ -110,7 +107,6 @@ def integrate_normal_map(
         known_depth,
         known_weight,
         method,
-        solver,
     )
 
 
@@ -123,7 +119,6 @@ def _integrated(
     known_depth: Float[Tensor, "height width"] | None,
     known_weight: Float[Tensor, "height width"] | None,
     method: Integration,
-    solver: Solver,
 ) -> IntegratedMap:
     box = _box(mask)
     if mask[box].shape != mask.shape:
@@ -138,7 +133,6 @@ def _integrated(
             None if known_depth is None else known_depth[box],
             None if known_weight is None else known_weight[box],
             method,
-            solver,
         )
         return _placed(part, box, *mask.shape)
     unit = _usable(normals, mask, weight)
@@ -150,9 +144,9 @@ def _integrated(
     anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
-        continuity = find_discontinuities(steps, *weights, anchor, unknown, solver)
+        continuity = find_discontinuities(steps, *weights, anchor, unknown)
         weights = weights[0] * continuity.right, weights[1] * continuity.down
-    system = RasterSystem(*weights, anchor, method=solver, what="the integration")
+    system = RasterSystem(*weights, anchor, what="the integration")
     found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
