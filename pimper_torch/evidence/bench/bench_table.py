@@ -5,50 +5,35 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table as Grid
 from rich.text import Text
 
-from pimper_torch.config import to_mapping
-from pimper_torch.errors import MissingProgramError, OutputError
+from pimper_torch.errors import MissingProgramError
 from pimper_torch.evidence.bench.measure import Machine
+from pimper_torch.evidence.metrics.figure_rows import plain
 from pimper_torch.records import Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row(Record):
-    """One method on one scene; ``None`` is what was not, or cannot be, measured.
+    """One method on one scene; ``None`` is a figure that was not, or cannot be, measured.
 
-    Percentages are of 100. Lengths are percentages of the true bounding box's diagonal.
+    Percentages are of 100, and lengths are percentages of the true bounding box's diagonal;
+    :func:`legend` explains the figures.
 
     Attributes:
         mesh_points: Vertices of the coarse mesh.
-        samples: Samples of all templates times views, missing ones included.
         minutes: Wall clock of this method alone.
         sfm_minutes: Wall clock of the structure from motion that all methods share.
-        relative_error: The published 3D error, along the rays of the reference view, per cent.
-        coverage_percent: Of the true pixels, those whose ray meets the surface, and not where
-            it shows the table; the 3D error is over these.
-        mean_normal_deg: Error of the normals that the vertices carry.
-        mean_shape_normal_deg: Error of the normals of the surface's own shape.
-        common_percent: Of the true pixels, those that all methods of the table cover that gave
-            a surface.
-        common_relative_error: The 3D error over these.
-        common_mean_normal_deg: Of the normals that the vertices carry, over these.
-        common_mean_shape_normal_deg: Of the surface's own shape, over these.
-        pitted_percent: Rays where these are far further off than around: pimples and pits.
-        chamfer: Mean of accuracy and completeness of what three views or more see.
-        accuracy: Mean distance from the surface to the truth.
-        completeness: Mean distance from the truth to the surface.
-        completeness_seen: The same from the truth that three views or more see.
-        f_scores: Pairs of a threshold, a length, and the F-score there, per cent, over the
-            truth that three views or more see.
-        peak_memory_mb: Highest resident memory while the method ran.
+        f_scores: Pairs of a threshold, a length, and the F-score there, per cent.
         note: Why figures are missing, such as ``not installed``.
-        published: Printed in a paper, on photographs that are not these.
+        published: Printed in a paper, on other photographs.
     """
 
     scene: str
@@ -83,19 +68,13 @@ class Row(Record):
 
 
 def row_of_failure(scene: str, method: str, error: Exception, **known: int | float | None) -> Row:
-    """Make the row of a method that gave no surface.
+    """Return the row of a method that gave no surface; a missing program is no failure.
 
     Args:
-        error: What stopped it; a missing program is no failure.
         known: Fields that are known all the same, such as ``minutes``.
     """
-    message = str(error) or type(error).__name__
-    # The table shows the first line only.
-    note = (
-        f"not installed\n{message}"
-        if isinstance(error, MissingProgramError)
-        else f"failed: {message}"
-    )
+    kind = "not installed\n" if isinstance(error, MissingProgramError) else "failed: "
+    note = f"{kind}{str(error) or type(error).__name__}"
     return Row(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
 
 
@@ -164,28 +143,12 @@ def write_json(table: Table, path: Path) -> None:
         "version": 1,
         "date": table.date,
         "scale": table.scale,
-        "machine": to_mapping(table.machine),
-        "settings": dict(table.settings),
-        "rows": [to_mapping(row) for row in table.rows],
+        "machine": table.machine,
+        "settings": table.settings,
+        "rows": table.rows,
     }
-    text = json.dumps(_finite(report), indent=1, ensure_ascii=False, allow_nan=False)
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror}). Write elsewhere."
-        ) from error
-
-
-def _finite(value: object) -> object:
-    """Replace figures that are not finite by null."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
+    text = json.dumps(plain(report), indent=1, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 MISSING = "\N{EN DASH}"
@@ -193,13 +156,12 @@ _NOTE_LENGTH = 60
 _PUBLISHED_MARK = "†"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """How one figure is shown.
+class Column(NamedTuple):
+    """A figure of the table.
 
     Attributes:
-        value: Takes the figure out of a row.
-        decimals: The same for all rows, so that points stand under one another.
+        value: The figure of a row.
+        decimals: The same for all rows.
     """
 
     heading: str
@@ -207,46 +169,42 @@ class Column:
     decimals: int
 
 
+def _columns(*listed: tuple[str, str, int]) -> tuple[Column, ...]:
+    """Return columns from their headings, fields of rows and decimals."""
+    return tuple(Column(heading, attrgetter(field), digits) for heading, field, digits in listed)
+
+
 _COST = (
-    Column(heading="points", value=lambda row: row.mesh_points, decimals=0),
-    Column(heading="triangles", value=lambda row: row.triangles, decimals=0),
-    Column(heading="samples, M", value=lambda row: row.samples and row.samples / 1e6, decimals=2),
-    Column(heading="missing, %", value=lambda row: row.missing_percent, decimals=1),
-    Column(heading="minutes", value=lambda row: row.minutes, decimals=1),
-    Column(heading="SfM, min", value=lambda row: row.sfm_minutes, decimals=1),
-    Column(heading="memory, MB", value=lambda row: row.peak_memory_mb, decimals=0),
-)
-_RAYS = (
-    Column(heading="3D error, %", value=lambda row: row.relative_error, decimals=2),
-    Column(heading="covered, %", value=lambda row: row.coverage_percent, decimals=1),
-    Column(heading="normals, °", value=lambda row: row.mean_normal_deg, decimals=2),
-    Column(heading="median, °", value=lambda row: row.median_normal_deg, decimals=2),
-    Column(heading="shape, °", value=lambda row: row.mean_shape_normal_deg, decimals=2),
-    Column(
-        heading="shape median, °",
-        value=lambda row: row.median_shape_normal_deg,
-        decimals=2,
-    ),
-    Column(heading="pitted, %", value=lambda row: row.pitted_percent, decimals=2),
-)
-_COMMON = (
-    Column(heading="covered by all, %", value=lambda row: row.common_percent, decimals=1),
-    Column(heading="3D error there, %", value=lambda row: row.common_relative_error, decimals=2),
-    Column(heading="normals there, °", value=lambda row: row.common_mean_normal_deg, decimals=2),
-    Column(heading="median there, °", value=lambda row: row.common_median_normal_deg, decimals=2),
-    Column(
-        heading="shape there, °", value=lambda row: row.common_mean_shape_normal_deg, decimals=2
-    ),
-    Column(
-        heading="shape median there, °",
-        value=lambda row: row.common_median_shape_normal_deg,
-        decimals=2,
+    *_columns(("points", "mesh_points", 0), ("triangles", "triangles", 0)),
+    Column("samples, M", lambda row: row.samples and row.samples / 1e6, 2),
+    *_columns(
+        ("missing, %", "missing_percent", 1),
+        ("minutes", "minutes", 1),
+        ("SfM, min", "sfm_minutes", 1),
+        ("memory, MB", "peak_memory_mb", 0),
     ),
 )
-_SURFACE = (
-    Column(heading="Chamfer, %", value=lambda row: row.chamfer, decimals=3),
-    Column(heading="accuracy, %", value=lambda row: row.accuracy, decimals=3),
-    Column(heading="complete, %", value=lambda row: row.completeness_seen, decimals=3),
+_RAYS = _columns(
+    ("3D error, %", "relative_error", 2),
+    ("covered, %", "coverage_percent", 1),
+    ("normals, °", "mean_normal_deg", 2),
+    ("median, °", "median_normal_deg", 2),
+    ("shape, °", "mean_shape_normal_deg", 2),
+    ("shape median, °", "median_shape_normal_deg", 2),
+    ("pitted, %", "pitted_percent", 2),
+)
+_COMMON = _columns(
+    ("covered by all, %", "common_percent", 1),
+    ("3D error there, %", "common_relative_error", 2),
+    ("normals there, °", "common_mean_normal_deg", 2),
+    ("median there, °", "common_median_normal_deg", 2),
+    ("shape there, °", "common_mean_shape_normal_deg", 2),
+    ("shape median there, °", "common_median_shape_normal_deg", 2),
+)
+_SURFACE = _columns(
+    ("Chamfer, %", "chamfer", 3),
+    ("accuracy, %", "accuracy", 3),
+    ("complete, %", "completeness_seen", 3),
 )
 
 
@@ -261,9 +219,9 @@ def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
     thresholds = sorted({threshold for row in rows for threshold, _ in row.f_scores})
     scores = tuple(
         Column(
-            heading=f"F {threshold:g} %",
-            value=lambda row, threshold=threshold: dict(row.f_scores).get(threshold),  # type: ignore[misc]
-            decimals=1,
+            f"F {threshold:g} %",
+            lambda row, threshold=threshold: dict(row.f_scores).get(threshold),  # type: ignore[misc]
+            1,
         )
         for threshold in thresholds
     )
@@ -308,19 +266,16 @@ def markdown(table: Table) -> str:
     ]
     right = [False, False, *([True] * len(shown)), *([False] * noted)]
     widths = [max(3, *(len(line[index]) for line in (head, *lines))) for index in range(len(head))]
-    rule = ["-" * (width - to_right) + ":" * to_right for width, to_right in _pairs(widths, right)]
-    parts = ["\n".join(_line(line, widths, right) for line in (head, rule, *lines)), *legend(table)]
+    layout = list(zip(widths, right, strict=True))
+    rule = ["-" * (width - to_right) + ":" * to_right for width, to_right in layout]
+    parts = ["\n".join(_line(line, layout) for line in (head, rule, *lines)), *legend(table)]
     return "\n\n".join(parts) + "\n"
 
 
-def _pairs(widths: Sequence[int], right: Sequence[bool]) -> list[tuple[int, bool]]:
-    return list(zip(widths, right, strict=True))
-
-
-def _line(words: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+def _line(words: Sequence[str], layout: Sequence[tuple[int, bool]]) -> str:
     padded = [
         word.rjust(width) if to_right else word.ljust(width)
-        for word, (width, to_right) in zip(words, _pairs(widths, right), strict=True)
+        for word, (width, to_right) in zip(words, layout, strict=True)
     ]
     return f"| {' | '.join(padded)} |"
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,7 +35,7 @@ from pimper_torch.evidence.bench.bench_table import (
 )
 from pimper_torch.evidence.bench.measure import peak_memory, this_machine
 from pimper_torch.evidence.metrics.evaluation import Evaluation, evaluate
-from pimper_torch.evidence.metrics.in_view import Meeting, figures_of, meet_truth
+from pimper_torch.evidence.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
 from pimper_torch.evidence.metrics.similarity import transfer
 from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
 from pimper_torch.io.meshes import read_mesh, write_ply
@@ -81,24 +82,30 @@ def with_common(
 
 
 def _with_common(row: Row, path: Path, common: Covered, maps: Capture) -> Row:
-    identity = torch.eye(4, dtype=torch.float64)
     mesh = read_mesh(path)
-    met = meet_truth(mesh, identity, maps, 0)
+    met = meet_truth(mesh, maps, 0)
     assert met is not None  # as when it was measured
     met = met.only(common)
     fraction = 100 * met.coverage
     if not met.both.any():
         return row.replace(common_percent=fraction)
-    figures = figures_of(met, mesh, identity, maps, 0)
-    normals, shape = figures.transferred_normals, figures.shape_normals
-    return row.replace(
-        common_percent=fraction,
-        common_relative_error=figures.relative_error,
-        common_mean_normal_deg=normals.mean_deg if normals else None,
-        common_median_normal_deg=normals.median_deg if normals else None,
-        common_mean_shape_normal_deg=shape.mean_deg if shape else None,
-        common_median_shape_normal_deg=shape.median_deg if shape else None,
-    )
+    figures = figures_of(met, mesh, maps, 0)
+    others = {f"common_{name}": value for name, value in _along_rays(figures).items()}
+    return row.replace(common_percent=fraction, **others)
+
+
+def _along_rays(view: ViewFigures | None) -> dict[str, Any]:
+    """Return the figures that a row has over its own pixels and over common ones."""
+    if view is None:
+        return {}
+    normals, shape = view.transferred_normals, view.shape_normals
+    return {
+        "relative_error": view.relative_error,
+        "mean_normal_deg": normals.mean_deg if normals else None,
+        "median_normal_deg": normals.median_deg if normals else None,
+        "mean_shape_normal_deg": shape.mean_deg if shape else None,
+        "median_shape_normal_deg": shape.median_deg if shape else None,
+    }
 
 
 # Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
@@ -309,7 +316,7 @@ def _cell(
     write_ply(mesh, _mesh_file(staging, scene, method))
     heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
     # Evaluated in a view, it has been met.
-    met = meet_truth(mesh, torch.eye(4).double(), inputs.maps, 0) if evaluation.views else None
+    met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
     return Measured(
         row=row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes),
         panels=method_panels(mesh, met, inputs, scene, method, heatmap),
@@ -330,7 +337,7 @@ def row_of(
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
     seen, missing = surface.seen if surface else None, outcome.missing_fraction
-    normals, shape = (view.transferred_normals, view.shape_normals) if view else (None, None)
+    shape = view.shape_normals if view else None
     return Row(
         scene=scene,
         method=method,
@@ -340,12 +347,7 @@ def row_of(
         missing_percent=None if missing is None else 100 * missing,
         minutes=outcome.seconds / 60,
         sfm_minutes=sfm_minutes,
-        relative_error=view.relative_error if view else None,
         coverage_percent=100 * view.coverage if view else None,
-        mean_normal_deg=normals.mean_deg if normals else None,
-        median_normal_deg=normals.median_deg if normals else None,
-        mean_shape_normal_deg=shape.mean_deg if shape else None,
-        median_shape_normal_deg=shape.median_deg if shape else None,
         pitted_percent=shape.pitted_percent if shape else None,
         chamfer=seen.chamfer_mean_percent if seen else None,
         accuracy=surface.accuracy.mean_percent if surface and surface.accuracy else None,
@@ -355,6 +357,7 @@ def row_of(
         if seen
         else (),
         peak_memory_mb=memory,
+        **_along_rays(view),
     )
 
 

@@ -126,8 +126,7 @@ def evaluate(
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture
     compared = (
-        compare_along_rays(moved, torch.eye(4).double(), maps, view)
-        for view in chosen_views(estimate, maps, config)
+        compare_along_rays(moved, maps, view) for view in chosen_views(estimate, maps, config)
     )
     figures = None
     if dtu is not None and capture.truth.points_world is not None:

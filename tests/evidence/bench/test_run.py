@@ -216,18 +216,18 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, mo
 
 
 def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
-    shift, identity = torch.eye(4).double(), torch.eye(4).double()
+    shift = torch.eye(4).double()
     camera = ball.maps.cameras.cam_from_world[0]
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
     mesh = ball.capture.truth.mesh
     moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
-    error = error_along_rays(meet_truth(moved, identity, ball.maps, 0), ball.maps)
+    error = error_along_rays(meet_truth(moved, ball.maps, 0), ball.maps)
     foreground = ball.maps.truth.foreground[0]
     assert torch.equal(error.isnan(), ~foreground)
     centre = error[22, 30]
     assert_close(centre, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
-    missed = error_along_rays(meet_truth(half, identity, ball.maps, 0), ball.maps).isinf()
+    missed = error_along_rays(meet_truth(half, ball.maps, 0), ball.maps).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 
