@@ -55,9 +55,9 @@ class Anchors(Record):
     """The vertices of every facet, which its height field is to pass through.
 
     Attributes:
-        samples: ``(x, y, z)`` of the height field, before any transform, over the vertex; patch
+        samples: ``(x, y, z)`` of the height field over the vertex, before any transform, patch
             frame.
-        variance: Of the vertex's place along the facet's normal, scene units squared.
+        variance: Of the vertex along the facet's normal, scene units squared.
         known: Whether there is height field over the vertex.
     """
 
@@ -92,15 +92,11 @@ def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
 def anchor_certainty(
     variance: Float[Tensor, "*batch"], noise: Float[Tensor, ""]
 ) -> Float[Tensor, "*batch"]:
-    r"""Weigh anchors by one over their variance, next to one that is known exactly.
-
-    A height field misses an anchor by its own error, of which the disagreement at the seams is
-    the measure, and by the point's: :math:`s^2 / (s^2 + \sigma^2)`. A point known far
-    better than height fields agree counts fully, and not more the better it is known.
+    r"""Return the weight of anchors, :math:`s^2 / (s^2 + \sigma^2)`: 1 for an exact one.
 
     Args:
         variance: :math:`\sigma^2` of each point, along the height field's z.
-        noise: s, of the height fields, in the same units.
+        noise: s, the height fields' own error, from the disagreement at the seams.
     """
     return noise.square() / (noise.square() + variance)
 
@@ -124,17 +120,16 @@ _ROWS, _COLUMNS, _REACH = 3, 12, 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignConfig:
-    """How patches are brought together.
+    """Settings of the alignment.
 
     Attributes:
-        iterations: How often the overlaps are met anew, as transformed so far, and solved.
-        anchor: Weight of a facet's vertex, where the surface is known to pass, next to the
-            agreement of a seam. Vertices that are points of the cloud count the less the
-            less certain they are next to the disagreement at the seams.
+        iterations: Rounds: meeting the overlaps as transformed so far, and solving.
+        anchor: Weight of a facet's vertex next to the agreement of a seam; less for points whose
+            uncertainty exceeds the disagreement at the seams.
         prior: Weight that holds each transform at the identity. Where neighbours agree but
             for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
             4 %; where they agree in nothing, 1e-4 lets them be flattened.
-        scale_limit: No height field is flattened or stretched by more than this factor.
+        scale_limit: Maximum factor by which a height field is flattened or stretched.
     """
 
     iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
@@ -165,9 +160,8 @@ class Align(Stage):
     r"""Undo the bas-relief transform that photometry leaves each patch with.
 
     The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z)`
-    in its own frame, without contradicting its photographs. All h are found together, from
-    what neighbours say about the strip around the edge they share. Rays along the bisector
-    of the two normals meet both height fields, as transformed so far, and
+    in its own frame, without contradicting its photographs. All h are found together: rays along
+    the bisector of two facets' normals meet both height fields over the edge they share, and
 
     .. math::
         \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
@@ -176,32 +170,17 @@ class Align(Stage):
     with P the foot points on the facets' planes and N their normals. Each round meets the
     overlaps anew and solves one sparse linear system.
 
-    *The curvature term.* :math:`k = 1 / \sum (C_\mu + C_{\mu'})` is read so: C is the mean
-    square of the height field's curvature along the seam times the edge's length, under the
-    current transform, so it grows as :math:`h_z^2`. Then :math:`k |r|^2` is a disagreement
-    relative to the height fields that disagree, and flattening both does not make it smaller. A
-    linear solve holds k, and would not know; so the derivative of k enters the right-hand
-    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve. Where
-    height fields agree it vanishes.
+    :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, with C the mean square of the height field's
+    curvature along the seam times the edge's length, which grows as :math:`h_z^2`: flattening both
+    height fields does not make :math:`k |r|^2` smaller. The derivative of k enters the right-hand
+    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve.
 
-    *The gauge.* Seams alone leave some of h free. Over coplanar facets all is homogeneous:
-    any common affine change, :math:`h_z` and all, of their height fields leaves them in agreement,
-    and :math:`h = 0` is a solution without error: the flattening one. Between facets at an
-    angle the foot points differ, which no multiple of the height fields but the right one bridges:
-    folds tell scales, the better the sharper they are. Anchors fix what tilts the
-    surface: each height field is to pass through its facet's vertices, with weights by their
-    uncertainty, which say nothing of scales. The prior toward the identity decides what nothing
-    else does: without folds, the common scale of coplanar facets. Without anchors it also
-    holds the common tilt; without a prior, ``scale_limit`` alone would stop the
-    flattening where height fields have nothing in common.
+    Over coplanar facets a common affine change leaves height fields in agreement, and
+    :math:`h = 0` has no error. Folds determine scales; anchors, each height field passing through
+    its facet's vertices, determine tilts; the prior toward the identity determines the rest. A
+    patch that meets no neighbour stays on the mesh, where its own anchors put it.
 
-    *Who stays.* A patch that meets no neighbour stays on the mesh, where its own anchors
-    alone put it; statuses tell, an :class:`~pimper_torch.records.AlignStatus` each. One without
-    height field stays as it is.
-
-    Rigid motions and the scale of the world change nothing. Differentiable in the depths
-    through all rounds; which samples meet, and what the anchors weigh by distance,
-    is decided along the way like the rest, statuses without gradient.
+    Invariant to rigid motions and the scale of the world. Differentiable in the depths.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
     ours.
@@ -215,12 +194,8 @@ class Align(Stage):
         """Align all patches.
 
         Returns:
-            Changed depths with the transforms that changed them, a status each, and how far
-            neighbours were apart before and after each round. Where no patch meets a
-            neighbour, what came in.
-
-        Raises:
-            SingularSystemError: Depths that are not finite.
+            Changed depths with their transforms, an :class:`~pimper_torch.records.AlignStatus`
+            each, and the distance of neighbours before and after each round; the input where no patch meets a neighbour.
         """
         config, patches = self.config, depths.patches
         seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)

@@ -31,18 +31,10 @@ def behind_others(
 ) -> Bool[Tensor, " point"]:
     """Find points that a nearer surface occludes in the image, or probably does.
 
-    Another view may see past the contour of the nearer surface, and some tracks have a false
-    match in the very view that cannot see the point. Of the nearest points in the image those
-    count that are nearer to the camera by more than ``slope`` times their lateral distance; if
-    three or more leave no open half-plane, the point is occluded. Beside a contour, or where
-    the surface is steep, they are all on one side; then the point may lie just inside the
-    contour, and is not marked only if it is observed here.
-
-    Args:
-        points_cam: In its camera's frame.
-        observed: Whether the view has an observation of the point.
-        neighbours: How many nearest points in the image to look at.
-        slope: Depth over lateral distance.
+    Of the nearest points in the image those count that are nearer to the camera by more than
+    ``slope`` times their lateral distance. If three or more leave no open half-plane, the point is
+    occluded. If they are all on one side, as beside a contour or where the surface is steep, it is
+    occluded only if the view has no observation of it.
     """
     nearest = nearest_in_image(pixels, neighbours)
     steps = points_cam[nearest] - points_cam[:, None]
@@ -68,13 +60,10 @@ def neighbours_agree(
 ) -> Bool[Tensor, " point"]:
     """Find points that lie on the same surface as those around them in the image.
 
-    Two tests against the nearest points in the image. A point of another surface (the far
-    side, the background) is steep against most of them: ``|dz|`` over the lateral distance
-    exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more
-    than ``max_deviation`` of the neighbourhood's radius.
-
-    Points are dropped worst first in a few rounds, so that one outlier does not take its
-    neighbours along.
+    A point of another surface is steep against most of them: ``|dz|`` over the lateral distance
+    exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more than
+    ``max_deviation`` of the neighbourhood's radius. The worst are dropped first, in rounds, so that
+    one outlier does not take its neighbours along.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     for fraction in (0.9, 0.75, 0.6, 0.5):
@@ -111,9 +100,7 @@ def well_accompanied(
 ) -> Bool[Tensor, " point"]:
     """Find all points but isolated corners of the hull, one hull after another.
 
-    Neighbours all on one side say little about a corner's depth, and the mesh would reach out
-    to a wrong one. Isolation is the distance to the third nearest point over the median of
-    its neighbours'.
+    Isolation is the distance to the third nearest point over the median of its neighbours'.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     while keep.sum() > 8:
@@ -198,7 +185,7 @@ _SPLINE_NEIGHBOURS = 50
 def fill_pixels(
     pixels: Float[Tensor, "point 2"], faces: Int[Tensor, "face 3"], edge_px: float
 ) -> Float[Tensor, "filled 2"]:
-    """Propose pixels of a triangular grid, inside facets and away from their vertices."""
+    """Return pixels of a triangular grid, inside facets and away from their vertices."""
     known = pixels.detach().cpu().double().numpy()
     low, high = known.min(axis=0), known.max(axis=0)
     rows = np.arange(low[1], high[1], edge_px * math.sqrt(3) / 2)
@@ -221,10 +208,10 @@ def interpolate_inverse_depth(
     wanted: Float[Tensor, "filled 2"],
     smoothing: float,
 ) -> Float[Tensor, " filled"]:
-    """Evaluate a smoothing thin-plate spline of inverse depth.
+    """Evaluate a smoothing thin-plate spline of inverse depth, which is affine on a plane.
 
-    Inverse depth, because a plane's is an affine function of the pixel and so is reproduced
-    exactly. ``smoothing`` is relative to the spread of the values.
+    Args:
+        smoothing: Relative to the spread of the values.
     """
     if len(wanted) == 0:
         return wanted.new_zeros(0)
@@ -246,11 +233,7 @@ def interpolate_inverse_depth(
 
 
 def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
-    """Triangulate points of an image, so that faces show their front to its camera.
-
-    v points down and z into the scene, so that a triangle which runs clockwise on the
-    screen runs counter-clockwise round the normal that points at the camera.
-    """
+    """Triangulate points of an image, so that faces show their front to its camera."""
     simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
     faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
     a, b, c = pixels[faces].unbind(dim=1)
@@ -282,10 +265,9 @@ def with_cloud(
     reference: int,
     source: Int[Tensor, " vertex"],
 ) -> CoarseMesh:
-    """Make a coarse mesh of facets and the points of the cloud on them, with covariances.
+    """Return a coarse mesh of facets and the points of the cloud on them, with covariances.
 
     Args:
-        reference: The view they were triangulated in.
         source: The point of the cloud at each vertex, -1 for none.
     """
     is_point = source >= 0
@@ -312,11 +294,7 @@ def with_cloud(
 def facets_under(
     pixels: Float[Tensor, "point 2"], corners_px: Float[Tensor, "face 3 2"]
 ) -> Int[Tensor, " point"]:
-    """Find the facet that contains each point of an image, -1 outside all.
-
-    Args:
-        corners_px: Of facets that do not overlap in the image.
-    """
+    """Find the facet that contains each point of an image, -1 outside all."""
     found = []
     for some in torch.split(pixels, max(1, _TESTS_AT_ONCE // max(1, len(corners_px)))):
         within = (barycentric_2d(some[:, None], corners_px[None]) >= 0).all(dim=-1)

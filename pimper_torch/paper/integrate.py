@@ -25,14 +25,10 @@ def fill_smoothly(
     values: Float[Tensor, "patch channel height width"],
     weight: Float[Tensor, "patch height width"],
 ) -> Float[Tensor, "patch channel height width"]:
-    """Assign every sample without weight a smooth blend of those with weight around it.
-
-    Push and pull through a pyramid of halved rasters: holes are filled from the finest
-    level that knows anything there.
+    """Inpaint samples without weight from those around, through a pyramid of halved rasters.
 
     Args:
-        values: Kept exactly where ``weight`` is 1; what they are where it is 0, NaN
-            included, does not matter.
+        values: Kept exactly where ``weight`` is 1, ignored where it is 0, NaN included.
         weight: In [0, 1].
 
     Returns:
@@ -119,9 +115,6 @@ def integrate_steps(
 ) -> Float[Tensor, "*batch height width"]:
     """Find the heights, of mean zero, whose steps come nearest to those given.
 
-    Steps that belong to a height field give it back exactly, a tilted plane included: the
-    basis does not force the borders to meet, as that of the periodic raster would.
-
     Source: Frankot & Chellappa, PAMI 10(4), 1988, in the cosine basis; Simchony, Chellappa &
     Shao, PAMI 12(5), 1990, for the discrete operator.
     """
@@ -141,19 +134,16 @@ _MAX_TILT_DEG = 75.0
 class Integrate(Stage):
     """Integrate the normals of every patch on its template.
 
-    Frankot and Chellappa's projection in the cosine basis, bucket by bucket. Samples without
-    normals, and the raster outside the enlarged triangle, get slopes filled in smoothly from
-    the samples around them; a patch without any normals stays its facet's plane. The free
-    constant is chosen so that the height field passes, on average, through the facet's corners.
-
-    Differentiable in normals.
+    Samples without normals, and the raster outside the enlarged triangle, have inpainted slopes; a
+    patch without any normals stays its facet's plane. The height field passes, on average,
+    through the facet's corners. Differentiable in normals.
 
     Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
     algorithms, PAMI 10(4), 1988.
     """
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
-        """Give every patch its height field; ``valid`` inside enlarged triangles that have data."""
+        """Return the height fields, ``valid`` inside enlarged triangles that have data."""
         steepest = math.tan(math.radians(_MAX_TILT_DEG))
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
@@ -178,7 +168,7 @@ def integrate_normals(
     """Find the height field, of mean zero over its raster, whose slopes are the normals'.
 
     Args:
-        normals: Unit, ``n_z < 0``; anything where not valid.
+        normals: Unit, ``n_z < 0``; ignored where not valid.
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
     """

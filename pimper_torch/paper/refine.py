@@ -55,7 +55,6 @@ class System(Record):
     Attributes:
         rows: Of the entries of ``M + L``; entries named twice add up.
         values: The entries, float64; symmetric and positive definite.
-        mass: The diagonal of ``M``.
     """
 
     rows: Int[Tensor, " entry"]
@@ -69,15 +68,11 @@ def assemble(
     fidelity: Float[Tensor, " facet"],
     supported: Bool[Tensor, " vertex"],
 ) -> System:
-    """Assemble the normal equations of the energy.
+    """Assemble the normal equations of the energy; constant to autograd.
 
     Args:
-        subdivision: What the energy is integrated over.
         fidelity: Lambda of each facet, 1/length^2.
-        supported: Where the union is known. Elsewhere the mass is (nearly) zero, and the
-            smoothness term alone fills S in.
-
-    Constant to autograd: it holds the geometry of the flat facets only.
+        supported: Where the union is known. Elsewhere the mass is nearly zero.
     """
     weights = seam_weight(subdivision.barycentric.double())
     mesh = elements(subdivision.points.detach().double(), subdivision.faces)
@@ -96,16 +91,12 @@ def assemble(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineConfig:
-    """How much seams are smoothed.
+    """Settings of the refinement.
 
     Attributes:
         smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
-            ``1 / (r * spacing)^2``, the inverse square of a length. Where G is constant, a
-            wave of length ``w`` keeps ``1 / (1 + (2 pi R / w)^2)`` of its height, with
-            ``R = r sqrt(G / (1 - G))`` vertices: half of it at ``w = 2 pi R``. R is ``r`` on
-            the centre of an edge, 1.55 ``r`` at a vertex of the coarse mesh, nothing in the
-            centre of a facet. Twice the radius is a quarter of lambda. The notebook
-            ``08_refinement`` shows it.
+            ``1 / (r * spacing)^2``. Where G is constant, a wave of length ``w`` keeps
+            ``1 / (1 + (2 pi R / w)^2)`` of its height, with ``R = r sqrt(G / (1 - G))`` vertices.
     """
 
     smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 2.0
@@ -115,12 +106,10 @@ class RefineConfig:
 
 
 class Refine(Stage):
-    r"""Join the patches and smooth their seams, keeping the centre of every facet.
+    """Join the patches and smooth their seams, keeping the centre of every facet.
 
-    Minimises :math:`\int \lambda (1-G) |\cup S_\mu - S|^2 + G |\nabla S|^2` over the subdivided
-    mesh of the coarse mesh, with places S as unknowns: one sparse factorization, three right-hand
-    sides. See :mod:`~pimper_torch.paper.refine` for the discretisation, and
-    :mod:`~pimper_torch.fusion.blend` for the union. Vertices that no patch supports are filled by
+    One sparse factorization of the energy over the subdivided mesh, three right-hand sides.
+    :mod:`~pimper_torch.fusion.blend` is the union. Vertices that no patch supports are filled by
     the smoothness term and have information 0.
 
     Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
@@ -134,11 +123,9 @@ class Refine(Stage):
     def forward(self, depths: DepthPatches) -> Surface:
         """Refine the union of all patches.
 
-        The convergence's residual is the root mean square distance between the union and
-        the surface, in scene units, after one solve.
-
-        Where no patch has valid height field anywhere, as under one light for all views, the
-        surface is that of the facets, its seams smoothed, with information 0.
+        The convergence's residual is the root mean square distance between the union and the
+        surface, in scene units. Without any valid height field, as under one light for all views,
+        the surface is that of the facets, its seams smoothed, with information 0.
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
@@ -177,18 +164,12 @@ def smooth_seams(
     spacing: Float[Tensor, " facet"],
     radius: float,
 ) -> Float[Tensor, "vertex 3"]:
-    """Minimise the energy over the subdivided mesh.
+    """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.
 
     Args:
-        points: The union: where the patches have each vertex.
-        supported: Where they have it anywhere.
-        spacing: Of each facet's vertices, scene units.
+        points: The union of the patches at each vertex.
+        supported: Where the union is known.
         radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
-
-    Returns:
-        The places in float64.
-
-    Differentiable in ``points``; see :class:`Refine`.
     """
     fidelity = (radius * spacing.double()) ** -2
     system = assemble(subdivision, fidelity, supported)

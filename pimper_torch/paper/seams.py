@@ -25,14 +25,11 @@ class Seams(Record):
     """Rays through the strips along shared edges.
 
     Attributes:
-        facets: The two facets of every shared edge.
-        origins: A point of each ray, world; ``row`` counts lines parallel to the edge,
-            ``column`` places along it.
+        origins: A point of each ray, world; rows are lines parallel to the edge.
         directions: Of all rays of a seam: the bisector of the two inward normals; unit.
         normals: Inward unit normals of the two facets, world.
-        edge_lengths: Scene units.
         seam_of: The seams of every facet, -1 for an edge without a neighbour.
-        place_of: For a seam and side, where ``seam_of`` (flattened) names it.
+        place_of: Index of each seam and side in ``seam_of``, flattened.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -63,7 +60,6 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     """Lay rays over all edges that two facets share.
 
     Args:
-        patches: The facets and their frames.
         reach_samples: Distance of the outermost lines from the edge, in template samples.
     """
     frames, spacing = _by_facet(patches)
@@ -204,17 +200,16 @@ def _places(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pulls(Record):
-    """What asks the transforms to change.
+    """The terms of the alignment.
 
     Attributes:
-        normals: Their inward unit normals, world.
+        normals: Inward unit normals of the facets, world.
         samples: ``S`` of both height fields where a ray meets them.
         gap: Foot point of the first sample minus that of the second, world.
-        weight: Of each ray; 0 where it does not count. Sums to at most 1 over a seam.
+        weight: Of each ray, 0 where ignored; adds up to at most 1 over a seam.
         curvature: ``C`` of both height fields before any transform; see :func:`curvature_along`.
         corners: ``S`` of every height field at its facet's corners.
-        corner_weight: How strongly each corner is to stay where it is.
-        prior_weight: How strongly each component of h is held at the identity.
+        prior_weight: Of each component of h, towards the identity; infinite for fixed ones.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -243,8 +238,7 @@ def curvature_along(
     r"""Return the mean square of a height field's curvature along the edge, times its length.
 
     :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
-    quarter of the edge :math:`\ell`, for normals' noise lives at shorter distances. An arc
-    over the edge whose centre stands out by a tenth of its length has C = 0.64.
+    quarter of the edge :math:`\ell`, which noise of normals hardly reaches.
     """
     columns = heights.shape[-1]
     stride = max(1, columns // 4)
@@ -265,10 +259,9 @@ def seam_stiffness(
     scales: Float[Tensor, "seam 2"],
     floor: float,
 ) -> Float[Tensor, " seam"]:
-    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, guarded.
+    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`.
 
     Args:
-        curvature: ``C`` before any transform.
         scales: ``h_z`` of both patches; ``C`` grows with its square.
         floor: Added to the sum, so that flat neighbours have a finite k.
     """
@@ -281,16 +274,14 @@ def solve_transforms(
     stiffness: Float[Tensor, " seam"],
     uplift: Float[Tensor, "seam 2"],
 ) -> Float[Tensor, "face 4"]:
-    r"""Find the transforms that minimise the weighted squares of everything in ``pulls``.
+    r"""Find the transforms that minimise the weighted squares of all terms.
 
     .. math::
         \sum_{seams} k \sum_{rays} w |r|^2 + \sum_{corners} w (h^T S)^2
         + \sum_{patches} \sum_c w_c (h_c - e_c)^2
 
     Args:
-        pulls: The terms; components whose ``prior_weight`` is infinite are not free.
-        transforms: Those so far; components that are not free keep their values.
-        stiffness: ``k`` of every seam.
+        transforms: Those so far; fixed components keep their values.
         uplift: Added to the right-hand sides of both ``h_z`` of a seam; see
             :class:`~pimper_torch.paper.align.Align`.
     """
@@ -339,14 +330,7 @@ def scatter_blocks(
     block_cols: Int[Tensor, " block"],
     blocks: Float[Tensor, "block unknown unknown"],
 ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-    """Spread small dense blocks into the entries of a sparse matrix.
-
-    Args:
-        blocks: Square, all of one size.
-
-    Returns:
-        Rows, columns and values for :class:`SparseCholesky`; duplicates are left to it.
-    """
+    """Return rows, columns and values of a sparse matrix of small dense blocks, with duplicates."""
     side = blocks.shape[-1]
     within = torch.arange(side, device=blocks.device)
     rows = (side * block_rows[:, None, None] + within[:, None]).expand(blocks.shape)

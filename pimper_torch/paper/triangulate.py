@@ -245,13 +245,11 @@ def peel(
     unwanted: Bool[Tensor, " face"],
     sharp: Bool[Tensor, "face 3"] | None = None,
 ) -> Int[Tensor, "kept 3"]:
-    """Drop unwanted faces on the border, again and again; inner ones stay, so that no hole opens.
+    """Drop unwanted faces on the border repeatedly; inner ones stay, so that no hole opens.
 
     Args:
-        faces: Of a mesh with a border.
-        unwanted: Dropped as soon as they have an edge on it.
-        sharp: Marks corners; a face with a sharp corner between two edges on the border is a
-            spike, and dropped too.
+        unwanted: Dropped as soon as they have an edge on the border.
+        sharp: Corners; a face with a sharp corner between two border edges is dropped, too.
     """
     if sharp is None:
         sharp = torch.zeros_like(faces, dtype=torch.bool)

@@ -40,13 +40,12 @@ _DARK = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Observed(Record):
-    """What a photograph shows of a surface.
+    """The pixels of a photograph that show a surface.
 
     Attributes:
-        radiance: Linear; 1 is saturated.
-        weight: Of a squared error of radiance, so that errors count as sRGB shows them.
-        saturated: True where the photograph is, in a part of the pixel at least: it tells no more
-            than that the radiance is not below what it shows.
+        weight: Of a squared error of radiance, so that errors are those of sRGB.
+        saturated: True where the photograph is, in part of the pixel at least: radiance is then not
+            below the value shown.
     """
 
     pixels: SurfacePixels
@@ -94,10 +93,10 @@ def observe_all(
 def observe(
     surface: LitSurface, scene: SparseScene, view: int, silhouettes: Silhouettes | None
 ) -> Observed:
-    """Look at the surface through a photograph, where it shows nothing else.
+    """Return the pixels of a photograph that show the surface and nothing else.
 
     Args:
-        silhouettes: Of all views; without, the surface's own outline tells where the object is.
+        silhouettes: Of all views; by default the surface's own outline.
     """
     camera = shrunk(scene.cameras, view)
     width, height = (int(side) for side in scene.cameras.sizes_px[view])
@@ -220,8 +219,7 @@ class ViewLights(Record):
 
     Attributes:
         direction_world: Unit, from the surface's centre towards the light.
-        closeness: The surface's radius over the light's distance from its centre, see
-            :class:`~pimper_torch.relighting.lit_surface.LitSurface`; 0 for a light at infinity.
+        closeness: The surface's radius over the light's distance; 0 for a light at infinity.
         ambient: Radiance of a white matte surface in shadow.
         directed: Added where it faces the light, at the distance of the centre.
     """
@@ -242,8 +240,8 @@ def fit_lights(
 
     Args:
         mesh: In the scene's frame, with albedo.
-        silhouettes: Of the scene's views; without, the mesh's outline tells where the object is.
-        materials: Of the mesh; matte without.
+        silhouettes: Of the scene's views; by default the mesh's outline.
+        materials: By default matte.
     """
     surface = LitSurface(mesh)
     return lights_of(surface, observe_all(surface, scene, silhouettes), materials)
@@ -258,7 +256,7 @@ def lights_of(
     """Fit the light of every photograph; see :func:`fit_lights`.
 
     Args:
-        start: What is near it; without, the whole sphere is searched.
+        start: Lights nearby; by default the whole sphere is searched.
     """
     material = None if materials is None else materials.at_vertices()
 

@@ -51,7 +51,7 @@ def fit_materials(
 
     Args:
         mesh: In the scene's frame, with albedo.
-        silhouettes: Of the scene's views; without, the mesh's outline tells where the object is.
+        silhouettes: Of the scene's views; by default the mesh's outline.
     """
     surface = LitSurface(mesh)
     observed = observe_all(surface, scene, silhouettes)

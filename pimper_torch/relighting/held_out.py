@@ -27,14 +27,11 @@ def predict(
     light: ViewLights,
     materials: Materials | None = None,
 ) -> Float[Tensor, "height width channel"]:
-    """Return the linear radiance that a camera sees, with cast shadows.
+    """Return the linear radiance that a camera sees, with cast shadows; NaN beside the mesh.
 
     Args:
-        mesh: With albedo; prepared where several pictures are wanted of it.
-        materials: Of the mesh; matte without.
-
-    Returns:
-        NaN where the mesh is not seen.
+        mesh: With albedo; prepared where several pictures of it are wanted.
+        materials: By default matte.
     """
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
     pixels = surface.pixels(camera, 0)
@@ -61,8 +58,7 @@ def psnr(
     """Return the peak signal-to-noise ratio of sRGB values in [0, 1], in decibels.
 
     Args:
-        predicted: Linear, clipped to [0, 1] as a photograph is.
-        radiance: Linear.
+        predicted: Linear, clipped to [0, 1] as a photograph is; ``radiance`` likewise.
     """
     error = srgb_from_linear(predicted).double() - srgb_from_linear(radiance).double()
     return float(-10 * error.square().mean().clamp_min(1e-12).log10())

@@ -36,8 +36,6 @@ def facet_density(
 ) -> Float[Tensor, "*batch"]:
     """Return GGX's density of facets per solid angle.
 
-    Normalized so that the facets' area seen from above is that of the surface.
-
     Args:
         cosine: Between a facet's normal and the surface's.
         alpha: Width of the distribution; squared roughness.
@@ -54,8 +52,7 @@ def masking(
     """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
 
     Args:
-        to_light: Cosine between light and normal, more than 0.
-        to_eye: Cosine between eye and normal, more than 0.
+        to_light: Cosine between light and normal, more than 0; ``to_eye`` likewise.
     """
     light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
     eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()
@@ -64,10 +61,9 @@ def masking(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Materials(Record):
-    """Materials for base colours of :func:`~pimper_torch.viz.maps.base_color`.
+    """Materials of a surface in glTF's terms, one for every cluster of albedo.
 
     Attributes:
-        metallic: In [0, 1].
         roughness: In [0, 1]; its square is GGX's alpha.
         specular: Times what glTF's dielectric mirrors head on; ``KHR_materials_specular``'s
             ``specularFactor`` up to 1, ``specularColorFactor`` above.
@@ -108,10 +104,9 @@ class SurfacePixels(Record):
 
     Attributes:
         pixel: Index into the raster, row by row.
-        points_world: Where the ray through the pixel's centre meets the surface.
-        normals_world: Unit, as the mesh carries them.
+        points_world: Intersections of the rays through the pixels' centres.
+        normals_world: Unit, as the mesh has them.
         to_eye: Unit, towards the camera.
-        base_color: Linear, in [0, 1].
         vertex: The nearest vertex of the face that is met.
         inner: False beside pixels that show something else, with which they are blended.
     """
@@ -130,7 +125,6 @@ class Incidence(Record):
     """How lights reach the pixels of a view.
 
     Attributes:
-        to_light: Unit, world.
         cosine: Between the normal and the light; 0 where the surface faces away or is shadowed.
         irradiance: Of a light that has 1 at the surface's centre.
     """
@@ -192,13 +186,12 @@ class LitSurface:
         *,
         shadows: bool = True,
     ) -> "Incidence":
-        """Return from where lights reach pixels, and where they do.
+        """Return the directions to lights at pixels, and the light that arrives.
 
         Args:
             directions: Unit, world, from the surface's centre.
-            closeness: The surface's radius over the light's distance from its centre; 0 for a light
-                at infinity.
-            shadows: Whether the surface casts any; without, only what faces away is dark.
+            closeness: The surface's radius over the light's distance; 0 for a light at infinity.
+            shadows: Whether the surface casts any; without, only back faces are dark.
         """
         offset = (pixels.points_world - self.center_world) / self.radius
         toward = directions[:, None] - closeness[:, None, None] * offset

@@ -175,9 +175,6 @@ def _ending(status: int) -> str:
 def write_photographs(scene: SparseScene, folder: Path) -> tuple[str, ...]:
     """Write the undistorted photographs as 8-bit sRGB colour, saturated at 1.
 
-    Args:
-        scene: Any; padding is cut off.
-
     Returns:
         The files' names, ``00000000.png`` and so on, in the order of the views.
     """
@@ -190,9 +187,6 @@ def write_photographs(scene: SparseScene, folder: Path) -> tuple[str, ...]:
 
 def write_pinhole_model(scene: SparseScene, names: tuple[str, ...], folder: Path) -> None:
     """Write pinholes, cloud and tracks as a COLMAP model, binary, in the scene's own frame.
-
-    Args:
-        folder: Gets ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
 
     Raises:
         InputError: No view sees a point; stereo programs choose partners and depths by them.

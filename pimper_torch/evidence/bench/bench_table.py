@@ -28,7 +28,6 @@ class Row(Record):
     :func:`legend` explains the figures.
 
     Attributes:
-        mesh_points: Vertices of the coarse mesh.
         minutes: Wall clock of this method alone.
         sfm_minutes: Wall clock of the structure from motion that all methods share.
         f_scores: Pairs of a threshold, a length, and the F-score there, per cent.
@@ -84,8 +83,6 @@ class Table(Record):
 
     Attributes:
         rows: In the order they are shown.
-        date: ISO 8601.
-        scale: ``quick`` or ``full``.
         settings: Whatever else decides the figures, as JSON can hold it.
     """
 
@@ -157,12 +154,7 @@ _PUBLISHED_MARK = "†"
 
 
 class Column(NamedTuple):
-    """A figure of the table.
-
-    Attributes:
-        value: The figure of a row.
-        decimals: The same for all rows.
-    """
+    """A figure of the table."""
 
     heading: str
     value: Callable[[Row], int | float | None]

@@ -211,7 +211,6 @@ def run_bench(
     first scene, the scenes that are complete are written.
 
     Args:
-        folder: New or empty.
         cache: Folder where the models of structure from motion are kept from run to run.
     """
     observer = observer or Silent()

@@ -19,8 +19,6 @@ from pimper_torch.evidence.metrics.in_view import (
 )
 from pimper_torch.evidence.metrics.similarity import (
     Alignment,
-    IcpConfig,
-    IcpResult,
     align_estimate,
     pair_views,
     similarity_between_cameras,
@@ -43,8 +41,6 @@ __all__ = [
     "DtuFigures",
     "EvaluateConfig",
     "Evaluation",
-    "IcpConfig",
-    "IcpResult",
     "LightFigures",
     "Nearest",
     "NearestSurface",

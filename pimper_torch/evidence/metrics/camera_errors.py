@@ -128,12 +128,9 @@ def compare_cameras(
     """Compare cameras after a similarity carried ours to the frame of the truth.
 
     Args:
-        ours: World frame of the estimate.
         truth: The same views in the same order.
         truth_from_world: Similarity; on these cameras, for the usual figure.
         views: How many photographs there are in all.
-        centre: Of the object, frame of the truth.
-        diagonal: Of the object's bounding box.
     """
     truth_from_ours = truth_from_world.double().cpu()
     _, rotation = split_similarity(truth_from_ours)

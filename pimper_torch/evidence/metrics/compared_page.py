@@ -31,7 +31,6 @@ def write_compared_page(
 
     Args:
         truth: A mesh, or points without faces, which tell no normals.
-        truth_from_world: Similarity.
 
     Raises:
         InputError: The folder is no result, or its photographs are gone.

@@ -25,9 +25,7 @@ def thin(
     earlier points forbid, then settled among itself.
 
     Args:
-        points: On the CPU.
         distance: Two kept points are farther apart than this.
-        generator: On the CPU.
 
     Returns:
         Indices of the kept points, in the order they were visited.

@@ -19,7 +19,6 @@ from pimper_torch.evidence.metrics.dtu_protocol import DtuFigures, dtu_figures
 from pimper_torch.evidence.metrics.in_view import ViewFigures, compare_along_rays
 from pimper_torch.evidence.metrics.similarity import (
     Alignment,
-    IcpConfig,
     Method,
     align_estimate,
     pair_views,
@@ -120,8 +119,9 @@ def evaluate(
     """
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
-    icp = IcpConfig(trimmed_fraction=config.trimmed_fraction)
-    alignment = align_estimate(estimate, capture, config.alignment, icp, generator=generator)
+    alignment = align_estimate(
+        estimate, capture, config.alignment, config.trimmed_fraction, generator=generator
+    )
     moved = transfer(estimate.mesh, alignment.truth_from_world)
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture

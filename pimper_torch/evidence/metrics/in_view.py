@@ -127,7 +127,6 @@ class Meeting(Record):
         valid: True where a ray meets the truth.
         both: True where it meets the mesh too.
         points: Of the mesh, from the camera's centre.
-        faces: Of the mesh.
     """
 
     valid: Bool[Tensor, "height width"]
@@ -245,7 +244,6 @@ class ViewFigures(Record):
     """Errors of a mesh along the rays of one true camera.
 
     Attributes:
-        relative_error: :func:`relative_error`, per cent.
         coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
             the surroundings; the other figures are over these.
         transferred_normals: Of the normals at the mesh's vertices; ``None`` if it has none or

@@ -8,17 +8,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.surface_distances import joined, sample_surface, true_surface
 from pimper_torch.geometry.frames import rigid, transform
-from pimper_torch.geometry.nearest import Nearest, NearestSurface
+from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
 
@@ -86,10 +85,6 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
     rotation about it open, and an arc nearly does; so the rotation is fitted to the centres
     and to the cameras' axes together, each axis drawn as long as the centres' root mean
     square distance from their mean.
-
-    Args:
-        ours: World frame of the result.
-        truth: The same views in the same order; see :func:`pair_views`.
 
     Raises:
         InputError: Unequal numbers of cameras, or centres that coincide.
@@ -163,105 +158,144 @@ def _spread(points: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
 # direction: turning a ball, sliding a plane.
 _UNDETERMINED = 1e-6
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IcpConfig:
-    """How two surfaces are brought together.
-
-    Attributes:
-        trimmed_fraction: Fraction of the estimate's samples, those farthest from the truth, that
-            each step leaves out. It must cover outliers and whatever the truth lacks; what
-            the estimate lacks needs none, for only its own samples look for partners.
-        samples: Of the estimate.
-        iterations: At most.
-        tolerance: Stop when a step moves the samples by less than this fraction of their
-            spread.
-    """
-
-    trimmed_fraction: Annotated[float, Range(least=0, below=1)] = 0.2
-    samples: Annotated[int, Range(least=100, most=10_000_000)] = 8000  # 100 bytes each
-    iterations: Annotated[int, Range(least=1, most=100_000)] = 60
-    tolerance: Annotated[float, Range(above=0, most=1)] = 1e-7
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
+Method = Literal["auto", "none", "cameras", "icp"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IcpResult(Record):
-    """Where the estimate was put.
+class Alignment(Record):
+    """A similarity, and how it was found.
 
     Attributes:
-        truth_from_world: Similarity.
-        distance: Along true normals to the ``plane``, or to the nearest ``point`` of a truth
-            without faces.
-        residual: Root mean square distance of the samples that were kept, scene units.
-        converged: False where the limit of iterations stopped it.
+        description: In words.
+        truth_from_world: Upper left block is scale times rotation.
+        scale: Scene units of the truth in one of the estimate.
+        cameras: Pairs of cameras that were used.
+        trimmed_fraction: Fraction of the samples that ``icp`` left out; ``None`` otherwise.
+        residual: Root mean square distance of the samples ``icp`` kept, scene units.
+        converged: False where the limit of iterations stopped ``icp``; ``None`` otherwise.
     """
 
+    method: str
+    description: str
     truth_from_world: Float[Tensor, "4 4"]
-    distance: str
-    residual: float
-    iterations: int
-    converged: bool
+    scale: float
+    rotation_deg: float
+    cameras: int = 0
+    trimmed_fraction: float | None = None
+    residual: float | None = None
+    converged: bool | None = None
+
+
+def align_estimate(
+    estimate: Estimate,
+    capture: Capture,
+    method: Method,
+    trimmed_fraction: float = 0.2,
+    *,
+    generator: torch.Generator,
+) -> Alignment:
+    """Find the similarity that carries an estimate to the truth.
+
+    Args:
+        method: ``none`` takes the frames for one and the same. ``cameras`` fits the
+            estimate's cameras to the true ones of the same names. ``icp`` continues from
+            there, or from the identity, and fits the surfaces, see :func:`trimmed_icp`.
+            ``auto`` is ``cameras`` where there are two pairs of cameras at least, else ``none``.
+        generator: On the CPU; draws the samples of ``icp``.
+
+    Raises:
+        InputError: ``cameras`` without two pairs, or ``icp`` without a true surface.
+    """
+    pairs = paired_cameras(estimate, capture)
+    count = 0 if pairs is None else pairs[0].num_views
+    if method == "cameras" and count < 2:
+        raise InputError(
+            f"to align by cameras, {count} views have a camera in both the result and the truth; "
+            "needed: two at least. Align by the surfaces (`icp`), or not at all (`none`)."
+        )
+    found, used = torch.eye(4).double(), 0
+    if pairs is not None and count >= 2 and method != "none":
+        found, used = similarity_between_cameras(*pairs).cpu().double(), count
+    known: dict[str, float | None] = {}
+    description = f"similarity on {used} cameras" if used else "identity"
+    if method == "icp":
+        target = joined(true_surface(capture), capture.truth.surroundings)
+        kind = "plane" if len(target.faces) else "point"
+        description = (
+            f"similarity ICP, point to {kind}, {100 * trimmed_fraction:g} % of the estimate "
+            f"trimmed, from {description}"
+        )
+        found, known["residual"], known["converged"] = trimmed_icp(
+            estimate.mesh, target, found, trimmed_fraction, generator=generator
+        )
+        known["trimmed_fraction"] = trimmed_fraction
+    elif not used:
+        description = "none: the frames are taken for the same"
+    scale, rotation = split_similarity(found)
+    return Alignment(
+        method="icp" if method == "icp" else "cameras" if used else "none",
+        description=description,
+        truth_from_world=found,
+        scale=scale,
+        rotation_deg=float(rotation_angles_deg(rotation)),
+        cameras=used,
+        **known,  # type: ignore[arg-type]
+    )
 
 
 def trimmed_icp(
     mesh: Mesh,
     truth: Mesh,
     start: Float[Tensor, "4 4"],
-    config: IcpConfig | None = None,
+    trimmed_fraction: float = 0.2,
     *,
     generator: torch.Generator,
-) -> IcpResult:
+    count: int = 8000,
+    iterations: int = 60,
+    tolerance: float = 1e-7,
+) -> tuple[Float[Tensor, "4 4"], float, bool]:
     """Find the similarity that lays an estimate on the truth, beginning near it.
 
     Each step pairs every sample of the estimate with the nearest point of the true surface,
     drops the fraction of pairs that are farthest apart, and moves the estimate by the
-    similarity that is best for the rest. It finds the nearest minimum only, and the scale
-    is part of it: an estimate that starts far off may shrink into a corner of the truth, so
-    look at the scale that is reported.
+    similarity that is best for the rest. It finds the nearest minimum only: an estimate that
+    starts far off may shrink into a corner of the truth, so look at the scale that is reported.
 
     Args:
         truth: Surface or point cloud; with its surroundings, if the estimate may have them.
-        start: ``truth_from_world`` to begin with.
-        generator: On the CPU.
+        trimmed_fraction: Must cover outliers and what the truth lacks.
+        tolerance: Stop when a step moves the samples by less than this fraction of their spread.
+
+    Returns:
+        The similarity, the root mean square distance of the samples kept, and False where the
+        limit of iterations stopped it.
 
     Source: Chetverikov, Stepanov & Krsek, IVC 23(3), 2005, for trimming; Chen & Medioni,
     IVC 10(3), 1992, for the distance to the plane. Scale as a seventh unknown of the
     linearised step is ours.
     """
-    config = config or IcpConfig()
     target = NearestSurface(truth)
     normals = face_normals(truth.vertices_world.cpu().double(), truth.faces.cpu())
-    by_plane = len(truth.faces) > 0
-    samples = sample_surface(mesh, config.samples, generator).points
-    kept = max(3, round((1 - config.trimmed_fraction) * len(samples)))
+    samples = sample_surface(mesh, count, generator).points
+    kept = max(3, round((1 - trimmed_fraction) * len(samples)))
     found = start.cpu().double()
     spread = _deviation(transform(found, samples))
     converged, taken = False, 0
-    while taken < config.iterations and not converged:
+    while taken < iterations and not converged:
         moved = transform(found, samples)
         nearest = target.query(moved)
         chosen = nearest.distance.topk(kept, largest=False).indices
         source, aim = moved[chosen], nearest.points[chosen]
-        if by_plane:
+        if len(truth.faces):
             step = _step_to_planes(source, aim, normals[nearest.face[chosen]])
         else:
             step = similarity_between_points(source, aim)
         found = step @ found
         taken += 1
         length = (transform(step, moved) - moved).square().sum(dim=1).mean().sqrt()
-        converged = float(length) < config.tolerance * spread
-    rest: Nearest = target.query(transform(found, samples))
-    near = rest.distance.topk(kept, largest=False).values
-    return IcpResult(
-        truth_from_world=found,
-        distance="plane" if by_plane else "point",
-        residual=float(near.square().mean().sqrt()),
-        iterations=taken,
-        converged=converged,
-    )
+        converged = float(length) < tolerance * spread
+    near = target.query(transform(found, samples)).distance.topk(kept, largest=False).values
+    return found, float(near.square().mean().sqrt()), converged
 
 
 def _step_to_planes(
@@ -296,91 +330,6 @@ def _deviation(points: Float[Tensor, "point 3"]) -> float:
     return float((points - points.mean(dim=0)).square().sum(dim=1).mean().sqrt())
 
 
-Method = Literal["auto", "none", "cameras", "icp"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alignment(Record):
-    """A similarity, and how it was found.
-
-    Attributes:
-        method: ``none``, ``cameras`` or ``icp``.
-        description: In words, with whatever tells it from its kin.
-        truth_from_world: Upper left block is scale times rotation.
-        scale: Scene units of the truth in one of the estimate.
-        cameras: How many pairs of cameras were used; 0 if none.
-        trimmed_fraction: Fraction of the samples left out by ``icp``; ``None`` otherwise.
-        residual: Root mean square distance of the samples ``icp`` kept, scene units.
-        converged: Whether ``icp`` came to rest; ``None`` otherwise.
-    """
-
-    method: str
-    description: str
-    truth_from_world: Float[Tensor, "4 4"]
-    scale: float
-    rotation_deg: float
-    cameras: int = 0
-    trimmed_fraction: float | None = None
-    residual: float | None = None
-    converged: bool | None = None
-
-
-def align_estimate(
-    estimate: Estimate,
-    capture: Capture,
-    method: Method,
-    icp: IcpConfig | None = None,
-    *,
-    generator: torch.Generator,
-) -> Alignment:
-    """Find the similarity that carries an estimate to the truth.
-
-    Args:
-        estimate: In a frame of its own.
-        capture: The truth, with cameras if ``method`` needs some.
-        method: ``none`` takes the frames for one and the same. ``cameras`` fits the
-            estimate's cameras to the true ones of the same names. ``icp`` goes on from
-            there (from the identity, if there are not two pairs of cameras) and fits the
-            surfaces, see :func:`pimper_torch.evidence.metrics.similarity.trimmed_icp`. ``auto`` is
-            ``cameras`` where there are at least two pairs of cameras, else ``none``.
-        generator: On the CPU; draws the samples of ``icp``.
-
-    Raises:
-        InputError: ``cameras`` was asked for without two pairs, or ``icp`` without a true
-            surface.
-    """
-    pairs = paired_cameras(estimate, capture)
-    enough = pairs is not None and pairs[0].num_views >= 2
-    if method == "none" or (method == "auto" and not enough):
-        return _told("none", "none: the frames are taken for the same", torch.eye(4).double())
-    if method == "cameras" and not enough:
-        raise InputError(
-            f"to align by cameras, {0 if pairs is None else pairs[0].num_views} views have a "
-            "camera in both the result and the truth; needed: two at least. Align by the "
-            "surfaces (`icp`), or not at all (`none`)."
-        )
-    start, used = torch.eye(4).double(), 0
-    if pairs is not None and enough:
-        ours, truth = pairs
-        start, used = similarity_between_cameras(ours, truth).cpu().double(), ours.num_views
-    if method != "icp":
-        return _told("cameras", f"similarity on {used} cameras", start, cameras=used)
-    target = joined(true_surface(capture), capture.truth.surroundings)
-    found = trimmed_icp(estimate.mesh, target, start, icp, generator=generator)
-    trimmed = (icp or IcpConfig()).trimmed_fraction
-    origin = f"similarity on {used} cameras" if used else "identity"
-    return _told(
-        "icp",
-        f"similarity ICP, point to {found.distance}, {100 * trimmed:g} % of the estimate "
-        f"trimmed, from {origin}",
-        found.truth_from_world,
-        cameras=used,
-        trimmed_fraction=trimmed,
-        residual=found.residual,
-        converged=found.converged,
-    )
-
-
 def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Cameras] | None:
     """Return the cameras of the views that both have; ``None`` if there are none."""
     if estimate.cameras is None or capture.cameras is None:
@@ -401,21 +350,4 @@ def transfer(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
         vertices_world=transform(truth_from_world.cpu().double(), mesh.vertices_world.double()),
         normals_world=None if normals is None else normals.double() @ rotation.cpu().double().mT,
         expected_error=None if error is None else float(scale) * error.double(),
-    )
-
-
-def _told(
-    method: str,
-    description: str,
-    truth_from_world: Float[Tensor, "4 4"],
-    **known: int | float | None,
-) -> Alignment:
-    scale, rotation = split_similarity(truth_from_world)
-    return Alignment(
-        method=method,
-        description=description,
-        truth_from_world=truth_from_world,
-        scale=scale,
-        rotation_deg=float(rotation_angles_deg(rotation)),
-        **known,  # type: ignore[arg-type]
     )

@@ -23,7 +23,6 @@ class SurfaceSamples(Record):
     """Points on a surface, each standing for the same fraction of it.
 
     Attributes:
-        points: World, float64.
         normals: Of the faces they lie in, unit; ``None`` for a point cloud.
         corners: Vertices that each lies between; the one that it is of a point cloud.
         fractions: Of these; they add up to 1.
@@ -49,7 +48,6 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
 
     Args:
         mesh: A cloud gives its points, all of them if they are no more than ``count``.
-        generator: On the CPU.
 
     Raises:
         InputError: The surface has no extent: no vertices, or faces without any area.
@@ -275,8 +273,6 @@ class DistanceFigures(Record):
     """Distances of samples of one surface to the other.
 
     Attributes:
-        mean: Scene units.
-        median: Scene units.
         mean_percent: Of the diagonal of the true object's bounding box.
         samples: How many; each stands for the same area.
     """
@@ -293,8 +289,6 @@ class ThresholdFigures(Record):
     """How much of each surface lies near the other.
 
     Attributes:
-        threshold: Scene units.
-        threshold_percent: Of the diagonal.
         precision: Fraction of the estimate nearer to the truth than the threshold.
         recall: Fraction of the truth nearer to the estimate than the threshold.
         f_score: Their harmonic mean; 0 if both are 0.
@@ -315,8 +309,6 @@ class TwoSided(Record):
         completeness: From the truth to the estimate.
         chamfer_mean: Mean of mean accuracy and mean completeness, scene units.
         chamfer_sum: Their sum, which other papers call Chamfer distance.
-        chamfer_mean_percent: Of the diagonal.
-        chamfer_sum_percent: Of the diagonal.
     """
 
     completeness: DistanceFigures

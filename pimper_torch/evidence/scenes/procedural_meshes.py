@@ -44,7 +44,6 @@ def table(half_side: float = 4.0, cells: int = 1) -> Mesh:
     """Lay a square in the plane ``z = 0``, facing up.
 
     Args:
-        half_side: Scene units.
         cells: Along each side; light between objects is known at their corners.
     """
     side = torch.linspace(-half_side, half_side, cells + 1, dtype=torch.float64)
@@ -106,10 +105,7 @@ def push_clear(
     """Shift a solid to a position on the table, and on away from the centre until it is free.
 
     Args:
-        mesh: Closed.
-        others: Closed solids that it must not cut.
         position: Where it would best be; not the centre.
-        step: Scene units.
     """
     own, rest = _Solid(mesh), [_Solid(one) for one in others]
     x, y = position

@@ -29,13 +29,7 @@ _MIRRORS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spots(Record):
-    """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss.
-
-    Attributes:
-        points: World.
-        normals: Unit, interpolated over the face.
-        albedo: Linear.
-    """
+    """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss."""
 
     hits: Hits
     points: Float[Tensor, "ray 3"]
@@ -49,7 +43,6 @@ class Shaded(Record):
     """What spots send to the eye.
 
     Attributes:
-        matte: Radiance of the matte part.
         mirrored: Radiance of the highlight, and of what a conductor mirrors.
         lit: True where the point light reaches.
     """
@@ -233,11 +226,9 @@ class Frame(Record):
     """A photograph that no camera took, and what the rays through its pixels' centres meet.
 
     Attributes:
-        image: Linear radiance; 1 is saturation.
         depth: Along the camera's z; infinite where the ray meets nothing.
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
-        foreground: True on the object.
         lit: True where the point light reaches the surface.
         highlight: True where a highlight adds noticeably to the matte part: a hundredth of
             saturation or more, and a twentieth of the matte part. So does all that a conductor

@@ -170,7 +170,6 @@ def render_objects(
 
     Args:
         objects: Those that are no surroundings are the foreground.
-        cameras: Of one image size.
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = Stage(objects)
@@ -216,9 +215,7 @@ class OneView(Record):
     """Photographs from one viewpoint, and what they show.
 
     Attributes:
-        images: Linear radiance, never negative.
         normals: Unit, of the pixels inside the mask in raster order.
-        lights: Direction times strength.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -244,10 +241,6 @@ def photograph(
     """Render a Lambertian surface, attached shadows black.
 
     Args:
-        normals: Unit.
-        albedo: Linear, not negative.
-        lights: Direction times strength.
-        generator: On the CPU; for the noise.
         noise: Standard deviation of what is added to each value before negative ones are cut
             off, as a fraction of the brightest.
     """

@@ -67,7 +67,6 @@ def arc_cameras(
     The defaults face flat shapes such as :class:`.Plane` from above.
 
     Args:
-        distance: From the target, scene units.
         span_deg: From the first camera to the last, about ``up``.
         elevation_deg: Mean height of the arc over the plane across ``up``.
         sway_deg: How far the elevation goes up and down on the way.

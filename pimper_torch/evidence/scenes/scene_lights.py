@@ -24,8 +24,6 @@ class Environment:
         walls: Radiance in unit directions of its own frame.
         windows: In its own frame; rows of each: the unit direction of its centre, and two
             vectors across it, one over the tangents of half its width and height long.
-        own_from_world: Rotation.
-        scale: Multiplies all radiance.
     """
 
     walls: Texture
@@ -97,11 +95,7 @@ class PointLight(Record):
     def arriving(
         self, points: Float[Tensor, "*batch 3"], position: Float[Tensor, " 3"], irradiance: float
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-        """Return the direction to a light, and the irradiance across it, at points.
-
-        Args:
-            points: World.
-        """
+        """Return the direction to a light, and the irradiance across it, at points."""
         toward = position - points
         distance = toward.norm(dim=-1)
         falloff = ((position - self.target).norm() / distance) ** 2
@@ -187,8 +181,6 @@ def wandering_lights(
     Args:
         generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
-        spread_deg: Greatest angle from ``toward``.
-        min_tilt_deg: Smallest angle from ``toward``.
         irradiance: Mean over the views; drawn up to a quarter less or more.
         toward: Axis of the cone the point light moves in.
     """

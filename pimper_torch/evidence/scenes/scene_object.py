@@ -26,12 +26,7 @@ from pimper_torch.relighting.lit_surface import facet_density, masking
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conductor:
-    """The complex refractive index of a metal, once for red, green and blue.
-
-    Attributes:
-        index: Real part.
-        extinction: Imaginary part.
-    """
+    """The complex refractive index of a metal, once for red, green and blue."""
 
     index: tuple[float, float, float]
     extinction: tuple[float, float, float]
@@ -91,11 +86,7 @@ def reflect(
     ``specular`` 0 it is the cosine alone.
 
     Args:
-        normals: Unit.
-        to_light: Unit.
-        to_eye: Unit.
         specular: Share mirrored head on.
-        roughness: Its square is GGX's alpha.
 
     Returns:
         Radiance of a white matte part, and of the highlight. Both 0 where the light is below
@@ -156,12 +147,7 @@ class SceneObject:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MovedTexture:
-    """A texture that moves with its object.
-
-    Attributes:
-        texture: In the object's own frame.
-        own_from_world: Rigid.
-    """
+    """A texture that moves with its object."""
 
     texture: Texture
     own_from_world: Float[Tensor, "4 4"]

@@ -107,11 +107,7 @@ def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
 
 
 def mug_mesh(cell: float = 0.016) -> Mesh:
-    """Make a mug, its handle along +x; watertight.
-
-    Args:
-        cell: Of the triangulation, scene units.
-    """
+    """Make a mug, its handle along +x; watertight."""
     room = 0.06
     return mesh_level_set(
         _mug_level,

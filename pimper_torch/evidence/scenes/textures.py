@@ -12,13 +12,7 @@ from pimper_torch.evidence.scenes.scene_object import Texture
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waves:
-    """A sum of sines: smooth to every order, with its gradient in closed form.
-
-    Attributes:
-        wave_vectors: Radians a scene unit.
-        phases: Radians.
-        amplitudes: In the units of the function.
-    """
+    """A sum of sines: smooth to every order, with its gradient in closed form."""
 
     wave_vectors: Float[Tensor, "wave axis"]
     phases: Float[Tensor, " wave"]
@@ -78,7 +72,6 @@ class Speckle:
         contrast: Steepness of the push; the smaller, the less texture.
         offset: Added before the push: far from 0, most is light (or dark) and only rare
             spots are not.
-        tint: Multiplies each channel.
     """
 
     subdivisions: Float[Tensor, "octave channel side side side"]
@@ -152,8 +145,6 @@ class CylinderRegion:
     """What lies between two radii, two heights and two directions about the z axis.
 
     Attributes:
-        radii: Scene units.
-        heights: Scene units.
         azimuths_deg: Counter-clockwise from -y, where photographs are taken from.
     """
 
@@ -178,11 +169,7 @@ class CylinderRegion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Uniform:
-    """One albedo everywhere.
-
-    Attributes:
-        albedo: Linear; one number a channel.
-    """
+    """One albedo everywhere."""
 
     albedo: tuple[float, ...]
 
@@ -206,12 +193,7 @@ class Painted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Marked:
-    """One texture darkened by another, such as by blemishes.
-
-    Attributes:
-        base: Multiplied by the marks.
-        marks: 1 where there are none.
-    """
+    """One texture darkened by another, such as by blemishes."""
 
     base: Texture
     marks: Texture

@@ -33,9 +33,7 @@ def sparse_scene(
     their errors are along the rays as in real clouds.
 
     Args:
-        num_points: Wanted; fewer come out if too few are seen in ``min_views`` views.
         generator: Decides which points, and the noise.
-        noise_px: Standard deviation of every observation.
         outlier_fraction: Fraction of the points that are moved along their first ray by up to
             half their depth, keeping their short, wrong tracks.
         in_views: Pick points in the maps of these views; ``None`` is all of them, so that

@@ -144,7 +144,6 @@ class Scene:
     Attributes:
         name: Of the object, or the path of its mesh.
         objects: At rest in the world: the object's first, then its table, if that turns along.
-        cameras: One a photograph; float64.
         fixed: Objects that are at rest while the object turns or is turned over, in the frame of
             :mod:`pimper_torch.evidence.scenes.whole_scene`.
         world_from_room: Where that frame is in each photograph.

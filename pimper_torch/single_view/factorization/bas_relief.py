@@ -29,13 +29,10 @@ from pimper_torch.records import Record
 class BasRelief(Record):
     r"""A generalised bas-relief transformation, ready to act on a factorization.
 
-    Frame: x right, y down, z forward, normals facing the viewer (``n_z < 0``); the surface's
-    depth becomes :math:`\lambda z + \mu x + \nu y`, and :math:`b = \rho n` becomes ``G b``
-    with ``G = [[lambda, 0, -mu], [0, lambda, -nu], [0, 0, 1]]``.
+    Camera frame, ``n_z < 0``; depth becomes :math:`\lambda z + \mu x + \nu y`, and
+    :math:`b = \rho n` becomes ``G b`` with ``G = [[lambda, 0, -mu], [0, lambda, -nu], [0, 0, 1]]``.
 
     Attributes:
-        mu: Tilt along x.
-        nu: Tilt along y.
         lam: Flattening, not zero; below zero hills become valleys.
 
     >>> tilt = BasRelief(mu=torch.tensor(0.5), nu=torch.tensor(0.0), lam=torch.tensor(2.0))
@@ -87,11 +84,8 @@ def usable_pixels(shading: Float[Tensor, "3 pixel"]) -> Bool[Tensor, " pixel"]:
 def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
-    After it :math:`\sum x z = \sum y z = 0` and :math:`\sum x^2 + y^2 = \sum z^2`: the surface
-    faces the viewer on average, at a mean tilt of 45 degrees. Methods that start here do not
-    depend on the transformation they were given. Lambda is above zero.
-
-    NaN where all normals are parallel. Differentiable.
+    After it :math:`\sum x z = \sum y z = 0` and :math:`\sum x^2 + y^2 = \sum z^2`. Lambda is above
+    zero; NaN where all normals are parallel. Differentiable.
     """
     x, y, z = shading.double()
     depth = (z * z).sum()
@@ -126,13 +120,11 @@ def rounded_relief(
     r"""Return the transformation that makes a surface upright on average, and as deep as a ball.
 
     :math:`\sum w b_x b_z = \sum w b_y b_z = 0` and
-    :math:`\sum w (b_x^2 + b_y^2) = \sum w b_z^2`, as on the image of a sphere of even albedo; of
-    the two signs of ``lambda`` the convex one, whose normals point outwards on average. It is
-    a convention: the data do not determine it.
+    :math:`\sum w (b_x^2 + b_y^2) = \sum w b_z^2`; of the two signs of ``lambda`` the convex one. A
+    convention: the data do not determine it.
 
     Args:
-        shading: Of a surface, up to a bas-relief transformation, ``b_z < 0``, raster order.
-        weight: Not negative.
+        shading: Up to a bas-relief transformation, ``b_z < 0``, raster order.
 
     Differentiable; degenerate for a plane, where ``lambda`` is 1.
     """
@@ -157,7 +149,6 @@ def convex(
 
     Args:
         shading: It is applied to this, raster order.
-        weight: Not negative.
     """
     mu, nu, lam = (part.to(shading) for part in (relief.mu, relief.nu, relief.lam))
     found = BasRelief(mu=mu, nu=nu, lam=lam)
@@ -174,7 +165,6 @@ def bulge(
 
     Args:
         sideways: The parts of shading along x and y, uncorrelated with z.
-        weight: Not negative.
     """
     rows, columns = torch.nonzero(mask, as_tuple=True)
     position = torch.stack([columns, rows]).to(sideways)
@@ -199,11 +189,10 @@ def relief_from_albedo(
 ) -> BasRelief:
     """Find the bas-relief transformation after which most albedos are the same; convex.
 
+    Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
+
     Args:
         shading: Albedo times normal up to a bas-relief transformation, raster order.
-        weight: Not negative.
-
-    Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
     """
     x, y, z = shading.double()
 
@@ -232,10 +221,7 @@ def relief_from_strength(
 
     Args:
         lights: Of the same factorization as the shading; zero rows are ignored.
-        shading: Albedo times normal up to a bas-relief transformation, raster order; it
-            distinguishes convex from concave.
-
-    Levenberg-Marquardt from seven depths, with Cauchy's weights. Constant to autograd.
+        shading: As of :func:`relief_from_albedo`; it distinguishes convex from concave.
     """
     x, y, z = lights.double().unbind(dim=1)
 

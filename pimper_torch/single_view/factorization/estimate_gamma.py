@@ -91,7 +91,6 @@ class EncodedMatrix(Record):
     """Encoded values of the same samples in several views.
 
     Attributes:
-        seen: False where missing.
         scale: Of Cauchy's loss; 0 is least squares.
     """
 
@@ -124,14 +123,12 @@ def fit_encoded(
     start: EncodedFit | None,
     iterations: int = ITERATIONS,
 ) -> EncodedFit:
-    """Fit first-order light to encoded values through a response.
+    """Fit first-order light to encoded values through a response; constant to autograd.
 
     The encoded residual is linearized, first about the values or a former fit, then about the
     fit: it is then least squares in radiance, weighted by the square of the response's slope.
-    Constant to autograd.
 
     Args:
-        response: Through which they are seen; ``f``.
         start: Fit of a similar response; ``None`` starts from the values.
     """
     mask = problem.used.double()
@@ -242,14 +239,12 @@ _CHOICES = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class GammaEstimate(Record):
-    """The estimated exponent of a gamma curve, and its standard error.
+    """The estimated exponent of a gamma curve, ``radiance = encoded ** gamma``.
 
     Attributes:
-        gamma: ``radiance = encoded ** gamma``.
         standard_error: Of gamma, from its variation over samples, or views if that is larger.
         determined: False where the standard error is more than a tenth of gamma, the minimum is
-            at an end of the range, or residuals exceed a camera's noise, so that first-order
-            light does not fit under any gamma.
+            at an end of the range, or residuals exceed a camera's noise.
         residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
     """
 
@@ -288,14 +283,9 @@ def estimate_gamma(
     """Estimate gamma from the same surface samples under several lights.
 
     Dark and saturated values are left out: first by their observed values, then by those the fit
-    predicts, since selecting by noisy values favours those with noise of one sign, which biases
-    gamma. Outliers, such as highlights and cast shadows, lose weight. Where the estimate from the
-    brighter entries differs significantly, it is taken: ambient light in attached shadows is not
-    first-order.
-
-    A gain of each view, such as its exposure, is part of its light and has no effect. Light from
-    one direction, or a plane, does not determine gamma: the matrix is of rank 1 under every
-    exponent. The standard error is that of noise, not of a wrong model of the light.
+    predicts, as selecting by noisy values biases gamma. Outliers lose weight. Where the estimate
+    from the brighter entries differs significantly, it is taken: ambient light in attached shadows
+    is not first-order.
 
     Args:
         encoded: As the files hold them, 1 being full scale.
@@ -339,14 +329,12 @@ def gamma_of_photographs(
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
-        views: Read with :data:`~pimper_torch.radiometry.LINEAR`, so that they hold the files'
-            own values; of one size. Pixels that any of their masks leaves out are left out.
+        views: Read with :data:`~pimper_torch.radiometry.LINEAR`; pixels that any of their masks
+            leaves out are left out.
         mask: True on the object, for all photographs.
-        rank: 3 for distant point lights alone, 4 with ambient light.
 
     Raises:
-        InputError: As :func:`estimate_gamma`, for photographs or a mask of unlike sizes, and where
-            the camera moved.
+        InputError: As :func:`estimate_gamma`, for unlike sizes, and where the camera moved.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
         raise InputError(

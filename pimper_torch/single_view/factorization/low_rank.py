@@ -100,11 +100,8 @@ def low_rank_problem(
 ) -> Bilinear:
     r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
-    Rows are the problem's views, columns its samples: ``L`` becomes ``lights``, ``N``
-    ``shading``. They are unique at best up to one invertible matrix between them.
-
     Args:
-        matrix: ``X``; entries without weight are ignored.
+        matrix: ``X``, rows as views, columns as samples; entries without weight are ignored.
         weight: 0 where missing.
         start: Left factors of full rank.
 
@@ -211,10 +208,7 @@ def factorize_from_many(
     """Factorize a matrix with missing entries from random starts until the best repeats.
 
     Args:
-        matrix: Entries without weight are ignored.
-        weight: 0 where missing.
-        generator: On the CPU.
-        repeats: How many starts must end in the best minimum.
+        repeats: Number of starts that must end in the best minimum.
 
     Raises:
         InputError: ``max_starts`` below ``repeats``, or an invalid matrix, weight or rank.

@@ -60,7 +60,7 @@ Pair = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Continuity(Record):
-    """Which steps are continuous.
+    """The continuous steps.
 
     Attributes:
         right: Weight in [0, 1] of each step to the right: 1 continuous, 1e-4 rejected, 0
@@ -80,13 +80,11 @@ def find_discontinuities(
     anchor: Float[Tensor, "height width"] | None,
     heights: Float[Tensor, "height width"] | None,
 ) -> Continuity:
-    """Find the continuous steps.
+    """Find the continuous steps; constant to autograd.
 
     Args:
         weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
         anchor: Of pixels whose unknown is given.
-
-    Constant to autograd.
     """
     with torch.no_grad():
         inside = weight_right > 0, weight_down > 0

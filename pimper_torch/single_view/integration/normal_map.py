@@ -38,11 +38,10 @@ class IntegratedMap(Record):
     """A surface over a raster.
 
     Attributes:
-        depth: Along z; 0 outside. Each component of the mask without known depth is determined
-            up to a factor under a pinhole, its geometric mean being 1, and up to a constant
-            under parallel rays, its mean being 0.
+        depth: Along z; 0 outside. A component of the mask without known depth has the geometric
+            mean 1 under a pinhole, and the mean 0 under parallel rays.
         valid: True where a normal was used; the mask's other pixels are interpolated.
-        continuity: Which steps between pixels are continuous; ``None`` where all are.
+        continuity: The continuous steps between pixels; ``None`` where all are.
     """
 
     depth: Float[Tensor, "height width"]
@@ -74,18 +73,16 @@ def integrate_normal_map(
         weight: Of each normal; 1 if not given, 0 like not finite.
         known_depth: Depth at some pixels, NaN at the others.
         known_weight: Of the known depths, in units of that of one normal; 1 if not given.
-        method: ``"discontinuities"`` preserves depth discontinuities; see
-            :mod:`.discontinuities`. ``"weighted"`` is least squares.
+        method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
+            squares.
 
     Raises:
-        InputError: Shapes that differ, a mask without pixels, weights that are negative,
-            normals of another convention: coded as colours, or with z to the viewer.
+        InputError: Unusable rasters, or normals coded as colours or with z to the viewer.
 
     Warns:
         PimperWarning: Normals that are integrable only with y negated.
 
-    Differentiable in normals, weights and known depths, by one more solve; which steps are
-    continuous is constant.
+    Differentiable in normals, weights and known depths; which steps are continuous is constant.
 
     >>> up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 5, 3)
     >>> float(integrate_normal_map(up).depth.abs().max())

@@ -35,14 +35,9 @@ _CLUSTERED = 2000
 def chromaticities(
     images: Float[Tensor, "view channel height width"], mask: Bool[Tensor, "height width"]
 ) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
-    r"""Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
+    """Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
 
-    Weighted least squares for ``e`` and ``a`` in turn, weights the square of brightness: the
-    noise of a logarithm is that of the value over the value.
-
-    Args:
-        images: Linear radiance.
-        mask: Pixels to use, in raster order.
+    Weighted least squares for ``e`` and ``a`` in turn, weights the square of brightness.
 
     Returns:
         Colours whose sum over channels is zero, up to one colour that all pixels share; and
@@ -76,18 +71,16 @@ def chromaticity_groups(
     """Cluster pixels of similar chromaticity.
 
     The colour with the most neighbours becomes the first cluster, its neighbours are removed, and
-    so on; then every pixel is assigned to the nearest cluster within the radius. Colours that
-    change smoothly give arbitrary clusters.
+    so on; then every pixel is assigned to the nearest cluster within the radius.
 
     Args:
         images: Linear radiance, of two channels or more.
-        mask: Pixels to use, in raster order.
         radius: In logarithm of colour; a few times its noise, less than half the distance of
             different paints.
         smallest: Groups with less than this fraction of the pixels are dropped.
 
     Returns:
-        Labels from 0, the largest group's; -1 for pixels in no group.
+        Labels of the pixels in raster order, the largest group's 0; -1 for pixels in no group.
     """
     if images.shape[1] < 2:
         raise InputError(
@@ -139,33 +132,24 @@ def resolve_by_albedo_entropy(
     width: float = 0.015,
     max_pixels: int = 20_000,
 ) -> BasRelief:
-    r"""Find the bas-relief transformation of minimum albedo entropy.
+    r"""Find the bas-relief transformation of minimum albedo entropy; constant to autograd.
 
-    Minimizes the entropy of :math:`\log \lVert G b \rVert`, which is invariant to the scale of
-    albedo, smoothed by a kernel: first on a grid in the standard form of the surface
-    (:func:`.standard_relief`), then, from its best points, by a local search whose steps are
-    halved as the kernel narrows.
+    Minimizes the entropy of :math:`\log \lVert G b \rVert`, smoothed by a kernel: first on a grid
+    in the standard form of the surface (:func:`.standard_relief`), then, from its best points, by a
+    local search whose steps are halved as the kernel narrows.
 
     Args:
         shading: Albedo times normal, right up to a bas-relief transformation; vectors that are
             zero or not finite are left out.
-        groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`). The entropy of colour
-            albedo is that of chromaticity, which is invariant, plus that of brightness within
-            each group, which is minimized. Without it all are one group.
+        groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`), within which the
+            entropy of brightness is minimized; by default all are one group.
         width: Of the last kernel, as a fraction of albedo; about the noise of shading.
-        max_pixels: Evenly chosen from more.
 
-    Returns:
-        The transformation with lambda above zero: convex stays convex. Constant to autograd.
-
-    Fails where the surface has as many albedos as pixels, or so few different normals that the
-    entropy hardly depends on the transformation; precise to the kernel's width.
-
-    Raises:
-        InputError: Fewer than 50 vectors, or all parallel.
+    Fails where the surface has as many albedos as pixels, or few different normals. Convex stays
+    convex.
 
     Source: Alldrin, Mallick & Kriegman, CVPR 2007. The logarithm, which replaces their fixed
-    scale, the standard form and the reading of colour are ours.
+    scale, the standard form and the use of colour are ours.
     """
     with torch.no_grad():
         usable = usable_pixels(shading)
@@ -193,7 +177,6 @@ def albedo_entropy(
     """Return the entropy of log-albedo within groups after each transformation.
 
     Args:
-        shading: Albedo times normal.
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """

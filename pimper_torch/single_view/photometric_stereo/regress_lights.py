@@ -50,20 +50,14 @@ def regress(
     robust: bool = True,
     iterations: int = 15,
 ) -> Regressed:
-    r"""Fit each pixel's shading vector to its radiance.
+    r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
 
     Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
     weights, whose scale is 2.385 robust deviations of the residuals of all pixels; a view whose
     light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
     initial fit weights samples by their brightness, up to the pixel's median: shadows are dark.
 
-    Args:
-        radiance: Linear, gray. Samples without weight are ignored.
-        weight: Not negative; 0 where missing.
-
-    Returns:
-        In float64. An underdetermined pixel has one of its minima; see :func:`determined`.
-        Constant to autograd.
+    An underdetermined pixel has one of its minima; see :func:`determined`.
 
     Source: Holland & Welsch 1977 for the weights; robust weights in place of thresholds on
     shadows and highlights are common practice since Ikehata et al., CVPR 2012.
@@ -89,14 +83,11 @@ def reweigh(
     predicted: Float[Tensor, "view pixel"],
     widen: float,
 ) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
-    """Update the samples' weights by their residuals.
+    """Return the samples' weights by their residuals, and whether a light comes from the front.
 
     Args:
         predicted: By a fit; below zero for lights from behind.
         widen: Multiple of the scale.
-
-    Returns:
-        The weights, and whether a light comes from the front.
     """
     lit = predicted > 0
     residual = torch.where(lit, radiance - predicted, radiance)
@@ -125,12 +116,8 @@ def determined(
     """Find which pixels have as many samples as unknowns, and lights that span them.
 
     Args:
-        lights: The scale of each column does not matter.
         least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
             1 % in the images is as large as the solution.
-
-    Returns:
-        Enough samples with a tenth of the largest weight or more; lights that span.
     """
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     size = lights.double().norm(dim=0)
@@ -157,7 +144,6 @@ class Calibrated(Record):
 
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
-        albedo: Of each colour, not negative.
         weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
@@ -173,20 +159,15 @@ def calibrated_stereo(
     *,
     robust: bool = True,
 ) -> Calibrated:
-    r"""Recover normals and albedos of pixels under known distant point lights.
+    r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
 
-    Weights are those of the mean of the colours; see :func:`.regress`. Normal and albedos are then
+    Weights are those of the mean of the colours; see :func:`regress`. Normal and albedos are then
     the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top = C C^\top`
     and ``b_c`` the solution of one colour, :math:`C^\top n` is the leading eigenvector of
     :math:`\sum_c C^\top b_c b_c^\top C`.
 
     Args:
-        radiance: Linear. Samples without weight are ignored.
-        weight: Not negative; 0 where missing.
         lights: Direction to the point light times its irradiance.
-
-    Underdetermined, giving one of the minima, where a pixel has fewer lit samples than unknowns
-    or lights in one plane; see :func:`.determined`. Constant to autograd.
     """
     with torch.no_grad():
         seen = weight > 0
@@ -268,22 +249,13 @@ def factorize_photographs(
     *,
     robust: bool = True,
 ) -> Factored:
-    """Factorize photographs with missing samples, shadows and highlights.
+    """Factorize photographs with missing samples, shadows and highlights; constant to autograd.
 
     Complete and without robust weights, it is the singular value decomposition. Otherwise lights
     are estimated from an even subset of pixels by variable projection, with Cauchy's weights if
     ``robust``; the shading of all pixels is regressed on them.
 
-    Args:
-        radiance: Linear, gray. Samples without weight are ignored.
-        weight: Not negative; 0 where missing.
-        robust: Whether to reweight; see
-            :func:`~pimper_torch.single_view.photometric_stereo.regress_lights.regress`.
-
-    Constant to autograd.
-
-    Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition; variable projection as in
-    :mod:`pimper_torch.photometry.variable_projection`.
+    Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition.
     """
     with torch.no_grad():
         seen = weight > 0

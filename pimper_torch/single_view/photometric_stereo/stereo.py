@@ -33,12 +33,10 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Problem(Record):
-    """Input of a method: the pixels inside the mask, in raster order, in float64.
+    """Input of a method: pixels inside the mask, raster order, float64; weight 0 is missing.
 
     Attributes:
         images: As given, those views that have samples.
-        radiance: Linear; zero where missing.
-        weight: 0 where missing.
         intrinsics: Of a perspective camera; ``None`` for an orthographic one.
     """
 
@@ -61,9 +59,7 @@ class Solution(Record):
     """Output of a method.
 
     Attributes:
-        normals: Unit or zero.
         applied: The transformation that resolved the method's ambiguity, if any.
-        free: The remaining ambiguity, in words.
     """
 
     normals: Float[Tensor, "3 pixel"]
@@ -79,7 +75,6 @@ class Surfaced(Record):
     """An integrable factorization, right up to a bas-relief transformation.
 
     Attributes:
-        shading: Albedo times normal.
         reliability: Of each pixel; 0 leaves it out.
     """
 
@@ -245,12 +240,10 @@ class PhotometricStereo(Record):
     """Normals, albedo and lights of one viewpoint.
 
     Attributes:
-        normals: Unit, camera frame: x right, y down, z forward, ``n_z < 0`` where valid. Where
-            not valid, an estimate or zero.
-        albedo: Of each colour, not negative. With unknown lights up to one factor, such that
-            lights have the median length 1.
-        lights: One row a view: direction to the point light times its irradiance; zero for a
-            view without samples.
+        normals: Unit, camera frame; where not valid, an estimate or zero.
+        albedo: Not negative. With unknown lights up to one factor, such that lights have the median
+            length 1.
+        lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
         finding: A :class:`Finding` for each pixel.
@@ -291,25 +284,20 @@ def photometric_stereo(
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ==================  ==========================================  =================
 
-    ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a ball),
-    ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few albedos).
+    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_albedo``, ``equal_strength``, or
+    ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
-        mask: True on the object; of the size of the images.
-        resolve: For ``integrability``, by default ``albedo_entropy``; others have nothing to
-            resolve.
-        lights: For ``calibrated``, one a view: direction to the point light times its irradiance,
-            camera frame.
+        mask: True on the object.
+        lights: For ``calibrated``: direction to the point light times its irradiance, camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         robust: Whether shadows and highlights lose weight.
 
     Raises:
-        InputError: Unknown names, shapes that do not match, an empty mask, fewer views with
-            samples than unknowns, lights that are missing, not needed or in a plane; or input
-            that the method refuses.
+        InputError: Input that the method cannot use.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
