@@ -195,7 +195,8 @@ class Align(Stage):
 
         Returns:
             Changed depths with their transforms, an :class:`~pimper_torch.records.AlignStatus`
-            each, and the distance of neighbours before and after each round; the input where no patch meets a neighbour.
+            each, and the distance of neighbours before and after each round; the input where no
+            patch meets a neighbour.
         """
         config, patches = self.config, depths.patches
         seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)

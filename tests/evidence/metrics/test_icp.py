@@ -54,7 +54,7 @@ def test_a_known_similarity_is_found_among_a_third_of_outliers(generator, make):
     known = known_similarity(make, generator)
     dirty = with_outliers(truth, generator, fraction=0.3)
     estimate = make.moved(dirty, torch.linalg.inv(known))
-    settings = dict(trimmed_fraction=0.35, iterations=150, count=600)
+    settings = {"trimmed_fraction": 0.35, "iterations": 150, "count": 600}
     found = fitted(estimate, truth, torch.eye(4).double(), generator=generator, **settings)
     scale, angle, shift = error_of(found.truth_from_world, known)
     # What is trimmed is more than the outliers, so the rest lies exactly on the truth.
