@@ -111,8 +111,7 @@ def measure(scene: Scene, methods: list[str]) -> None:
         name = f"{name}, against known lights"
     runs = [("calibrated", None, {"robust": False}), ("calibrated", None, {})]
     for method in methods:
-        if not METHODS[method].calibrated and not METHODS[method].perspective:
-            runs += [(method, one, {}) for one in METHODS[method].resolvers or (None,)]
+        runs += [(method, resolver, {}) for resolver in METHODS[method]]
     for method, resolve, settings in runs:
         began = time.perf_counter()
         label = f"{method}, least squares" if settings else method

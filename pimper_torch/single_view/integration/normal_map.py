@@ -89,50 +89,24 @@ def integrate_normal_map(
     0.0
     """
     normals = torch.as_tensor(normals)
-    mask, weight = _tensor(mask), _tensor(weight)
-    known_depth, known_weight = _tensor(known_depth), _tensor(known_weight)
+    mask, weight, known_depth, known_weight = (
+        None if raster is None else torch.as_tensor(raster)
+        for raster in (mask, weight, known_depth, known_weight)
+    )
     _refuse(normals, mask, weight, known_depth, known_weight, spacing)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
     _refuse_convention(normals, mask)
-    return _integrated(
-        normals,
-        mask,
-        intrinsics,
-        spacing,
-        weight,
-        known_depth,
-        known_weight,
-        method,
+    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
+    if intrinsics is not None:
+        intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
+    mask = mask[box]  # the box of the mask, to save time and memory
+    weight, known_depth, known_weight = (
+        None if raster is None else raster[box] for raster in (weight, known_depth, known_weight)
     )
-
-
-def _integrated(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"] | None,
-    spacing: tuple[float, float],
-    weight: Float[Tensor, "height width"] | None,
-    known_depth: Float[Tensor, "height width"] | None,
-    known_weight: Float[Tensor, "height width"] | None,
-    method: Integration,
-) -> IntegratedMap:
-    box = _box(mask)
-    if mask[box].shape != mask.shape:
-        part = _integrated(
-            normals[box],
-            mask[box],
-            None
-            if intrinsics is None
-            else crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start)),
-            spacing,
-            None if weight is None else weight[box],
-            None if known_depth is None else known_depth[box],
-            None if known_weight is None else known_weight[box],
-            method,
-        )
-        return _placed(part, box, *mask.shape)
-    unit = _usable(normals, mask, weight)
+    unit = _usable(normals[box], mask, weight)
     if intrinsics is None:
         steps = orthographic_steps(unit, mask, spacing)
     else:
@@ -143,32 +117,16 @@ def _integrated(
     if method == "discontinuities":
         continuity = find_discontinuities(steps, *weights, anchor, unknown)
         weights = weights[0] * continuity.right, weights[1] * continuity.down
-    system = RasterSystem(*weights, anchor, what="the integration")
-    found = system.fit_steps(*steps.target, unknown)
-    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
-    return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
-
-
-Box = tuple[slice, slice]
-
-
-def _box(mask: Bool[Tensor, "height width"]) -> Box:
-    """Return the bounding rows and columns of the mask, to save time and memory."""
-    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:
-    """Pad the result of a box to the full raster."""
-    rows, columns = box
-    frame = (columns.start, width - columns.stop, rows.start, height - rows.stop)
-    continuity = part.continuity
-    if continuity is not None:
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
+    system = RasterSystem(*weights, anchor, what="the integration")
+    found = system.fit_steps(*steps.target, unknown)
+    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(
-        depth=pad(part.depth, frame), valid=pad(part.valid, frame), continuity=continuity
+        depth=pad(depth.to(normals), frame),
+        valid=pad(steps.valid & mask, frame),
+        continuity=continuity,
     )
 
 
@@ -222,10 +180,6 @@ def _known(
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
     return strength / (steps.unit_right * steps.unit_down), unknown
-
-
-def _tensor(values: Raster | None) -> Tensor | None:
-    return None if values is None else torch.as_tensor(values)
 
 
 def _refuse_convention(

@@ -1,6 +1,5 @@
 """Photometric stereo from one viewpoint, by any of the methods."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -24,203 +23,19 @@ from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
 from pimper_torch.single_view.photometric_stereo.integrability import integrable
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.regress_lights import (
+    Factored,
     calibrated_stereo,
     chromatic_albedo,
     determined,
     factorize_photographs,
 )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Problem(Record):
-    """Input of a method: pixels inside the mask, raster order, float64; weight 0 is missing.
-
-    Attributes:
-        images: As given, those views that have samples.
-        intrinsics: Of a perspective camera; ``None`` for an orthographic one.
-    """
-
-    images: Float[Tensor, "view channel height width"]
-    radiance: Float[Tensor, "view channel pixel"]
-    weight: Float[Tensor, "view pixel"]
-    mask: Bool[Tensor, "height width"]
-    lights: Float[Tensor, "view 3"] | None
-    intrinsics: Float[Tensor, "3 3"] | None
-    robust: bool
-
-    @property
-    def gray(self) -> Float[Tensor, "view pixel"]:
-        """The mean of the colours."""
-        return self.radiance.mean(dim=1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Solution(Record):
-    """Output of a method.
-
-    Attributes:
-        applied: The transformation that resolved the method's ambiguity, if any.
-    """
-
-    normals: Float[Tensor, "3 pixel"]
-    albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view 3"]
-    weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | None
-    free: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Surfaced(Record):
-    """An integrable factorization, right up to a bas-relief transformation.
-
-    Attributes:
-        reliability: Of each pixel; 0 leaves it out.
-    """
-
-    shading: Float[Tensor, "3 pixel"]
-    lights: Float[Tensor, "view 3"]
-    reliability: Float[Tensor, " pixel"]
-    weight: Float[Tensor, "view pixel"]
-
-
-def _by_entropy(given: Problem, found: Surfaced) -> BasRelief:
-    images, mask = _reliable(given, found)
-    groups = chromaticity_groups(images, mask) if images.shape[1] > 1 else None
-    relief = resolve_by_albedo_entropy(found.shading[:, found.reliability > 0], groups)
-    return convex(relief, found.shading, found.reliability, given.mask)
-
-
-def _reliable(
-    given: Problem, found: Surfaced
-) -> tuple[Float[Tensor, "view channel height width"], Bool[Tensor, "height width"]]:
-    """Return the photographs, and the reliable pixels."""
-    mask = torch.zeros_like(given.mask)
-    mask[given.mask] = found.reliability > 0
-    return _without_holes(given), mask
-
-
-def _without_holes(given: Problem) -> Float[Tensor, "view channel height width"]:
-    """Return the photographs with missing samples black."""
-    images = torch.zeros_like(given.images, dtype=torch.float64)
-    images[:, :, given.mask] = given.radiance
-    return images
-
-
-# Methods that resolve the bas-relief ambiguity; "rounded" is a convention. Entropy comes first, as
-# the default: nearest to known lights on the rendered objects
-# (benchmarks/photometric_stereo.py).
-RESOLVERS: dict[str, Callable[[Problem, Surfaced], BasRelief]] = {
-    "albedo_entropy": _by_entropy,
-    "rounded": lambda given, found: rounded_relief(found.shading, found.reliability, given.mask),
-    "equal_albedo": lambda given, found: relief_from_albedo(
-        found.shading, found.reliability, given.mask
-    ),
-    "equal_strength": lambda given, found: relief_from_strength(
-        found.lights, found.shading, found.reliability, given.mask
-    ),
-}
-_FACTOR = "a factor between albedo and light"
-
-
-def _calibrated(given: Problem, resolve: str) -> Solution:
-    assert given.lights is not None
-    found = calibrated_stereo(given.radiance, given.weight, given.lights, robust=given.robust)
-    return Solution(
-        normals=found.normals,
-        albedo=found.albedo,
-        lights=given.lights,
-        weight=found.weight,
-        applied=None,
-        free="nothing",
-    )
-
-
-def _integrability(given: Problem, resolve: str) -> Solution:
-    found = factorize_photographs(given.gray, given.weight, 3, robust=given.robust)
-    reliability = _reliability(found.weight, found.lights)
-    matrix = integrable(found.shading, reliability, given.mask).matrix
-    surfaced = Surfaced(
-        shading=matrix @ found.shading,
-        lights=found.lights @ torch.linalg.inv(matrix),
-        reliability=reliability,
-        weight=found.weight,
-    )
-    applied = RESOLVERS[resolve](given, surfaced)
-    free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
-    moved = surfaced.replace(
-        shading=applied.on_shading(surfaced.shading), lights=applied.on_lights(surfaced.lights)
-    )
-    return _lambertian(given, moved, applied, free)
-
-
-def _perspective(given: Problem, resolve: str) -> Solution:
-    assert given.intrinsics is not None
-    shading, lights = factorize_in_perspective(
-        _without_holes(given), given.mask, given.intrinsics, given.weight > 0
-    )
-    shading, lights = shading.double(), lights.double()
-    found = Surfaced(
-        shading=shading,
-        lights=lights,
-        reliability=(shading != 0).any(dim=0).double(),
-        weight=given.weight,
-    )
-    return _lambertian(given, found, None, _FACTOR)
-
-
-def _lambertian(given: Problem, found: Surfaced, applied: BasRelief | None, free: str) -> Solution:
-    """Return normals and the albedo of each colour from shading and point lights."""
-    size = found.shading.norm(dim=0)
-    normals = found.shading / torch.where(size > 0, size, 1)
-    shade = (found.lights @ normals).clamp_min(0)
-    return _scaled(
-        Solution(
-            normals=normals,
-            albedo=chromatic_albedo(given.radiance, found.weight, shade),
-            lights=found.lights,
-            weight=found.weight,
-            applied=applied,
-            free=free,
-        )
-    )
-
-
-def _scaled(found: Solution) -> Solution:
-    """Scale lights to the median length 1, and albedo inversely."""
-    length = found.lights.norm(dim=1)
-    shining = length[length > 0]
-    factor = shining.median() if len(shining) else length.new_ones(())
-    return found.replace(lights=found.lights / factor, albedo=found.albedo * factor)
-
-
-def _reliability(
-    weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
-) -> Float[Tensor, " pixel"]:
-    """Return each pixel's weight, from those of its samples; 0 where it is underdetermined."""
-    enough, spanned = determined(weight, lights)
-    total = weight.sum(dim=0)
-    return torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Method:
-    """A method by its name.
-
-    Attributes:
-        resolvers: Of its ambiguity; the first is the default.
-    """
-
-    solve: Callable[[Problem, str], Solution]
-    resolvers: tuple[str, ...] = ()
-    calibrated: bool = False
-    perspective: bool = False
-
-
-METHODS = {
-    "calibrated": Method(solve=_calibrated, calibrated=True),
-    "integrability": Method(solve=_integrability, resolvers=tuple(RESOLVERS)),
-    "perspective": Method(solve=_perspective, perspective=True),
+# Each method with the resolvers of its bas-relief ambiguity; "rounded" is a convention. Entropy is
+# the default: nearest to known lights on the rendered objects (benchmarks/photometric_stereo.py).
+METHODS: dict[str, tuple[str, ...]] = {
+    "calibrated": (),
+    "integrability": ("albedo_entropy", "rounded", "equal_albedo", "equal_strength"),
+    "perspective": (),
 }
 
 
@@ -310,36 +125,119 @@ def photometric_stereo(
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
     _refuse_shapes(images, mask, lights, weight)
-    chosen = METHODS[method]
-    _refuse_settings(method, chosen, resolve, lights, intrinsics)
+    _refuse_settings(method, resolve, lights, intrinsics)
     with torch.no_grad():
         given = images.new_ones(len(images), *mask.shape) if weight is None else weight
         samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
         used = (heavy > 0).any(dim=1)
-        _refuse_few(int(used.sum()), method)
-        problem = Problem(
-            images=images[used],
-            radiance=torch.where((heavy > 0)[:, None], samples, 0).double()[used],
-            weight=heavy[used],
-            mask=mask,
-            lights=None if lights is None else lights[used].double(),
-            intrinsics=None if intrinsics is None else intrinsics.double(),
-            robust=robust,
-        )
-        if problem.lights is not None:
-            _refuse_plane(problem.lights)
-        by = resolve or (chosen.resolvers[0] if chosen.resolvers else "")
-        found = chosen.solve(problem, by)
-        return _spread_out(found, problem, used, like=images)
+        if int(used.sum()) < 3:
+            raise InputError(
+                f"{method}: {int(used.sum())} photographs have samples inside the mask; needed: 3 "
+                "or more, one for each unknown of a pixel. Add photographs."
+            )
+        heavy = heavy[used]
+        radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
+        if lights is not None:
+            own = lights[used].double()
+            _refuse_plane(own)
+            known = calibrated_stereo(radiance, heavy, own, robust=robust)
+            found = _Solution(
+                normals=known.normals, albedo=known.albedo, lights=own, weight=known.weight
+            )
+        elif intrinsics is not None:
+            whole = torch.zeros_like(images[used], dtype=torch.float64)
+            whole[:, :, mask] = radiance
+            shading, own = factorize_in_perspective(whole, mask, intrinsics.double(), heavy > 0)
+            factors = Factored(lights=own.double(), shading=shading.double(), weight=heavy)
+            found = _lambertian(radiance, factors, None, _FACTOR)
+        else:
+            by = resolve or METHODS[method][0]
+            found = _integrable(radiance, heavy, mask, by, robust)
+        return _spread_out(found, heavy, mask, used, like=images)
+
+
+_FACTOR = "a factor between albedo and light"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Solution(Record):
+    """Output of a method, for the pixels inside the mask in raster order, in float64."""
+
+    normals: Float[Tensor, "3 pixel"]
+    albedo: Float[Tensor, "channel pixel"]
+    lights: Float[Tensor, "view 3"]
+    weight: Float[Tensor, "view pixel"]
+    applied: BasRelief | None = None
+    free: str = "nothing"
+
+
+def _integrable(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    resolve: str,
+    robust: bool,
+) -> _Solution:
+    """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
+    factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
+    enough, spanned = determined(factors.weight, factors.lights)
+    total = factors.weight.sum(dim=0)
+    reliability = torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
+    matrix = integrable(factors.shading, reliability, mask).matrix
+    shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
+    if resolve == "rounded":
+        relief = rounded_relief(shading, reliability, mask)
+    elif resolve == "equal_albedo":
+        relief = relief_from_albedo(shading, reliability, mask)
+    elif resolve == "equal_strength":
+        relief = relief_from_strength(lights, shading, reliability, mask)
+    else:
+        used, inside = reliability > 0, torch.zeros_like(mask)
+        inside[mask] = used
+        images = radiance.new_zeros(*radiance.shape[:2], *mask.shape)
+        images[:, :, mask] = radiance
+        groups = chromaticity_groups(images, inside) if images.shape[1] > 1 else None
+        relief = resolve_by_albedo_entropy(shading[:, used], groups)
+        relief = convex(relief, shading, reliability, mask)
+    moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
+    free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
+    return _lambertian(radiance, moved, relief, free)
+
+
+def _lambertian(
+    radiance: Float[Tensor, "view channel pixel"],
+    factors: Factored,
+    applied: BasRelief | None,
+    free: str,
+) -> _Solution:
+    """Return normals and the albedo of each colour, under lights of the median length 1."""
+    size = factors.shading.norm(dim=0)
+    normals = factors.shading / torch.where(size > 0, size, 1)
+    shade = (factors.lights @ normals).clamp_min(0)
+    albedo = chromatic_albedo(radiance, factors.weight, shade)
+    length = factors.lights.norm(dim=1)
+    shining = length[length > 0]
+    factor = shining.median() if len(shining) else length.new_ones(())
+    return _Solution(
+        normals=normals,
+        albedo=albedo * factor,
+        lights=factors.lights / factor,
+        weight=factors.weight,
+        applied=applied,
+        free=free,
+    )
 
 
 def _spread_out(
-    found: Solution, given: Problem, used: Bool[Tensor, " view"], like: Tensor
+    found: _Solution,
+    given: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    used: Bool[Tensor, " view"],
+    like: Tensor,
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
-    mask = given.mask
     enough, spanned = determined(found.weight, found.lights)
     finding = torch.full_like(spanned, int(Finding.FOUND), dtype=torch.long)
     checks = [
@@ -358,7 +256,7 @@ def _spread_out(
     albedo[mask] = found.albedo.mT.to(like)
     lit = torch.zeros(len(used), *mask.shape, dtype=torch.bool, device=mask.device)
     agreeing = lit[used]
-    agreeing[:, mask] = (given.weight > 0) & (found.weight >= 0.5 * given.weight)
+    agreeing[:, mask] = (given > 0) & (found.weight >= 0.5 * given)
     lit[used] = agreeing
     lights = like.new_zeros(len(used), found.lights.shape[1])
     lights[used] = found.lights.to(like)
@@ -403,31 +301,19 @@ def _refuse_shapes(
 
 
 def _refuse_settings(
-    name: str,
-    method: Method,
-    resolve: str | None,
-    lights: Tensor | None,
-    intrinsics: Tensor | None,
+    method: str, resolve: str | None, lights: Tensor | None, intrinsics: Tensor | None
 ) -> None:
-    if method.calibrated and lights is None:
-        raise InputError(f"{name}: there are no lights; needed: one direction a photograph.")
-    if not method.calibrated and lights is not None:
-        raise InputError(f"{name}: finds the lights itself. Leave them out, or use calibrated.")
-    if method.perspective and intrinsics is None:
-        raise InputError(f"{name}: there are no intrinsics; needed: those of the camera.")
-    if not method.perspective and intrinsics is not None:
-        raise InputError(f"{name}: is orthographic. Leave intrinsics out.")
-    if resolve is not None and resolve not in method.resolvers:
+    if method == "calibrated" and lights is None:
+        raise InputError(f"{method}: there are no lights; needed: one direction a photograph.")
+    if method != "calibrated" and lights is not None:
+        raise InputError(f"{method}: finds the lights itself. Leave them out, or use calibrated.")
+    if method == "perspective" and intrinsics is None:
+        raise InputError(f"{method}: there are no intrinsics; needed: those of the camera.")
+    if method != "perspective" and intrinsics is not None:
+        raise InputError(f"{method}: is orthographic. Leave intrinsics out.")
+    if resolve is not None and resolve not in METHODS[method]:
         raise InputError(
-            f"{name}: resolve is {resolve!r}; needed: {', '.join(method.resolvers) or 'none'}."
-        )
-
-
-def _refuse_few(views: int, method: str) -> None:
-    if views < 3:
-        raise InputError(
-            f"{method}: {views} photographs have samples inside the mask; needed: 3 or more, one "
-            "for each unknown of a pixel. Add photographs."
+            f"{method}: resolve is {resolve!r}; needed: {', '.join(METHODS[method]) or 'none'}."
         )
 
 
