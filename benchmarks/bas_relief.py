@@ -20,10 +20,12 @@ from reliefs import align_reliefs, ball, bumps, bumps_in_perspective, regions
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import OneView, photograph, point_lights
+from pimper_torch.evidence.scenes.render_in_memory import OneView, photograph, point_lights
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.albedo_entropy import resolve_by_albedo_entropy
-from pimper_torch.single_view.photometric_stereo.chromaticity import chromaticity_groups
+from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
+    chromaticity_groups,
+    resolve_by_albedo_entropy,
+)
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 
 NOISES = (0.0, 0.005, 0.01)

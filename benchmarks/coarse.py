@@ -39,9 +39,9 @@ from pimper_torch.coarse.surface import CoarseSurface, reliable_points
 from pimper_torch.coarse.trim import point_distances, view_counts
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
-from pimper_torch.evidence.metrics.distances import TrueSurface
+from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras, transfer
 from pimper_torch.evidence.metrics.in_view import compare_along_rays
+from pimper_torch.evidence.metrics.surface_distances import TrueSurface
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
@@ -171,7 +171,7 @@ class Judge:
     def __call__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> str:
         """Give a row's figures."""
         mesh = Mesh(vertices_world=vertices.double(), faces=faces)
-        seen = compare_along_rays(mesh, self._truth_from_world, self._maps, 0)
+        seen = compare_along_rays(transfer(mesh, self._truth_from_world), self._maps, 0)
         moved = transform(self._truth_from_world, mesh.vertices_world)
         found = self._surface.compare(mesh.replace(vertices_world=moved))
         assert seen is not None

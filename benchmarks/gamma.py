@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.evidence.datasets import read_uw_ps, read_yale_b
 from pimper_torch.radiometry import Gamma, Linear, Srgb
-from pimper_torch.single_view.factorization.gamma import (
+from pimper_torch.single_view.factorization.estimate_gamma import (
     GammaEstimate,
     estimate_gamma,
     gamma_of_photographs,

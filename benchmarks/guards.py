@@ -34,9 +34,9 @@ from torch.nn.functional import interpolate
 from pimper_torch.chains.presets import load_chain
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.datasets import read_rendered
-from pimper_torch.evidence.metrics.alignment import align_estimate, transfer
-from pimper_torch.evidence.metrics.distances import TrueSurface, true_surface
-from pimper_torch.evidence.metrics.evaluate import camera_figures
+from pimper_torch.evidence.metrics.evaluation import camera_figures
+from pimper_torch.evidence.metrics.similarity import align_estimate, transfer
+from pimper_torch.evidence.metrics.surface_distances import TrueSurface, true_surface
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.io.photographs import load_views

@@ -1,11 +1,11 @@
 """Sparse solvers on the systems of rasters and meshes: seconds, memory, iterations, residual.
 
-    OMP_NUM_THREADS=1 python benchmarks/linear_systems.py [--sides 500] [--cases mesh] [--products]
+    OMP_NUM_THREADS=1 python benchmarks/linear_systems.py [--sides 500] [--cases mesh]
 
 Every row is measured in a process of its own, so that peak memory is its own; it includes the
 0.3 GB that importing the package takes. CPU seconds, which on one thread do not depend on what
 else the machine does, are the best of three runs; of one for rivals and for more than a million
-unknowns. ``--products`` compares ways to multiply with the matrix instead, in elapsed time.
+unknowns.
 """
 
 import argparse
@@ -25,14 +25,11 @@ from torch import Tensor
 
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.linalg.hierarchy import sparse_product, torch_product
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.single_view.integration.rasters import RasterSystem
-from pimper_torch.single_view.integration.stencil import Stencil
 
 CASES = ("rectangle", "holes", "plateaus", "decades", "anisotropic", "strips", "mesh")
-SOLVERS = ("cosine", "cholesky", "multigrid", "spsolve", "cg", "cg, diagonal")
+SOLVERS = ("cholesky", "multigrid", "spsolve", "cg", "cg, diagonal")
 
 # Conjugate gradients without a hierarchy stop here, converged or not.
 PLAIN_STEPS = 3000
@@ -107,25 +104,28 @@ def mesh(side: int) -> tuple[tuple[Tensor, Tensor, Tensor], int]:
     ), parts.count
 
 
-def compressed(case: str, side: int) -> csr_array:
-    """Give the matrix that the rivals solve with."""
+def entries(case: str, side: int) -> tuple[tuple[Tensor, Tensor, Tensor], int]:
+    """Return rows, columns and values of a system; a pixel outside has a 1."""
     if case == "mesh":
-        (rows, cols, values), size = mesh(side)
-        return csr_array((values.numpy(), (rows.numpy(), cols.numpy())), shape=(size, size))
+        return mesh(side)
     weights = raster(case, side)
-    return stencil(weights).matrix()
+    index = torch.arange(side * side).view(side, side)
+    first = torch.cat([index[:, :-1].flatten(), index[:-1].flatten()])
+    second = torch.cat([index[:, 1:].flatten(), index[1:].flatten()])
+    weight = torch.cat([weights.right.flatten(), weights.down.flatten()])
+    diagonal = weights.anchor.flatten().index_add(0, first, weight).index_add(0, second, weight)
+    diagonal = torch.where(diagonal > 0, diagonal, 1.0)
+    return (
+        torch.cat([first, second, index.flatten()]),
+        torch.cat([second, first, index.flatten()]),
+        torch.cat([-weight, -weight, diagonal]),
+    ), side * side
 
 
-def stencil(weights: Raster) -> Stencil:
-    """Give the matrix of a raster as its solvers hold it; outside pixels have a 1."""
-    tied = weights.anchor.clone()
-    tied[:, 1:] += weights.right
-    tied[:, :-1] += weights.right
-    tied[1:] += weights.down
-    tied[:-1] += weights.down
-    return Stencil(
-        right=weights.right, down=weights.down, diagonal=torch.where(tied > 0, tied, 1.0)
-    )
+def compressed(case: str, side: int) -> csr_array:
+    """Return the matrix that the rivals solve with."""
+    (rows, cols, values), size = entries(case, side)
+    return csr_array((values.numpy(), (rows.numpy(), cols.numpy())), shape=(size, size))
 
 
 def solver(name: str, case: str, side: int) -> tuple[Callable[[], object], Callable[..., tuple]]:
@@ -150,27 +150,16 @@ def solver(name: str, case: str, side: int) -> tuple[Callable[[], object], Calla
             return torch.from_numpy(found), len(steps)
 
         return lambda: None, rival
-    if case == "mesh":
-        entries, size = mesh(side)
-        kind = {"multigrid": Multigrid, "cholesky": SparseCholesky}[name]
+    given, size = entries(case, side)
+    kind = {"multigrid": Multigrid, "cholesky": SparseCholesky}[name]
 
-        def solved(prepared: Multigrid | SparseCholesky, rhs: Tensor) -> tuple[Tensor, int]:
-            if isinstance(prepared, SparseCholesky):
-                return prepared.solve(rhs), 1
-            found = prepared.iterate(rhs)
-            return found.values, found.iterations
-
-        return lambda: kind(*entries, size), solved
-    weights = raster(case, side)
-
-    def fitted(prepared: RasterSystem, rhs: Tensor) -> tuple[Tensor, int]:
-        found = prepared.iterate(rhs.view(weights.anchor.shape))
+    def solved(prepared: Multigrid | SparseCholesky, rhs: Tensor) -> tuple[Tensor, int]:
+        if isinstance(prepared, SparseCholesky):
+            return prepared.solve(rhs), 1
+        found = prepared.iterate(rhs)
         return found.values, found.iterations
 
-    return (
-        lambda: RasterSystem(weights.right, weights.down, weights.anchor, method=name),
-        fitted,
-    )
+    return lambda: kind(*given, size), solved
 
 
 def measure(case: str, name: str, side: int) -> dict[str, float]:
@@ -184,7 +173,7 @@ def measure(case: str, name: str, side: int) -> dict[str, float]:
     scale = torch.from_numpy(matrix.diagonal()).rsqrt()
     del matrix
     prepare, solve = solver(name, case, side)
-    own = name in ("cosine", "cholesky", "multigrid")
+    own = name in ("cholesky", "multigrid")
     runs = 3 if own and size < MAX_FOR_FACTORS else 1
     scratch, reused = [], []
     for _ in range(runs):
@@ -210,42 +199,17 @@ def measure(case: str, name: str, side: int) -> dict[str, float]:
     }
 
 
-def products(side: int) -> None:
-    """Compare the ways to multiply with the matrix of a raster."""
-    weights = stencil(raster("rectangle", side))
-    matrix, vector = weights.matrix(), torch.randn(side * side).double()
-    cpu = torch.device("cpu")
-    ways = {
-        "shifted slices": weights.product,
-        "scipy": sparse_product(matrix, cpu),
-        "torch": torch_product(matrix, cpu),
-    }
-    for name, way in ways.items():
-        seconds = []
-        for _ in range(20):
-            began = time.perf_counter()
-            way(vector)
-            seconds.append(time.perf_counter() - began)
-        print(f"| {side * side:,} | {name} | {1e3 * min(seconds):.2f} |", flush=True)  # noqa: T201
-
-
 def main() -> None:
     """Print one row a system and solver."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sides", type=int, nargs="+", default=[500, 2000])
     parser.add_argument("--cases", nargs="+", default=CASES, choices=CASES)
     parser.add_argument("--solvers", nargs="+", default=SOLVERS, choices=SOLVERS)
-    parser.add_argument("--products", action="store_true")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
         case, name, side = given.one
         print(json.dumps(measure(case, name, int(side))))  # noqa: T201
-        return
-    if given.products:
-        print("| unknowns | product by | ms |\n|--:|---|--:|")  # noqa: T201
-        for side in given.sides:
-            products(side)
         return
     print(  # noqa: T201
         "| system | unknowns | solver | CPU s from scratch | reused | peak GB | iterations "
@@ -254,9 +218,7 @@ def main() -> None:
     for side in given.sides:
         for case in given.cases:
             for name in given.solvers:
-                if (name == "cosine") != (case == "rectangle") and name == "cosine":
-                    continue
-                if name not in ("cosine", "multigrid") and side * side > MAX_FOR_FACTORS:
+                if name != "multigrid" and side * side > MAX_FOR_FACTORS:
                     continue
                 print(row(case, name, side), flush=True)  # noqa: T201
 

@@ -24,14 +24,14 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import PimperError
 from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
-from pimper_torch.evidence.scenes.lights import Lights
+from pimper_torch.evidence.scenes.scene_lights import Lights
 from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo
-from pimper_torch.single_view.photometric_stereo.methods import METHODS
+from pimper_torch.single_view.photometric_stereo.stereo import METHODS
 
 HEIGHT = 240  # pixels of the rendered photographs
 POINT_LIGHTS, SPREAD_DEG = 20, 60.0
@@ -111,8 +111,7 @@ def measure(scene: Scene, methods: list[str]) -> None:
         name = f"{name}, against known lights"
     runs = [("calibrated", None, {"robust": False}), ("calibrated", None, {})]
     for method in methods:
-        if not METHODS[method].calibrated and not METHODS[method].perspective:
-            runs += [(method, one, {}) for one in METHODS[method].resolvers or (None,)]
+        runs += [(method, resolver, {}) for resolver in METHODS[method]]
     for method, resolve, settings in runs:
         began = time.perf_counter()
         label = f"{method}, least squares" if settings else method

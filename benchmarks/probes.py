@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import (

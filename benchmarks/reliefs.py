@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.noise import Waves
-from pimper_torch.evidence.scenes.shapes import Plane
+from pimper_torch.evidence.scenes.render_in_memory import Plane
+from pimper_torch.evidence.scenes.textures import Waves
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 

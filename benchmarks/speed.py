@@ -43,10 +43,9 @@ from PIL import Image
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.cores import usable_cores
-from pimper_torch.evidence.bench.machine import this_machine
-from pimper_torch.evidence.bench.memory import peak_memory
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.bench.measure import peak_memory, this_machine
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
 from pimper_torch.outputs.folders import held_output

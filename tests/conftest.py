@@ -82,7 +82,7 @@ def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize
 
-    from pimper_torch.evidence.scenes.cameras import arc_cameras
+    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.geometry.frames import rigid
     from pimper_torch.geometry.projection import project
     from pimper_torch.geometry.surfaces import vertex_normals
@@ -210,10 +210,10 @@ def lift():
     from types import SimpleNamespace
 
     from pimper_torch.evidence.scenes import render_shape
-    from pimper_torch.evidence.scenes.cameras import arc_cameras
-    from pimper_torch.evidence.scenes.lights import wandering_lights
-    from pimper_torch.evidence.scenes.noise import random_speckle
-    from pimper_torch.evidence.scenes.shapes import Plane
+    from pimper_torch.evidence.scenes.render_in_memory import Plane
+    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+    from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+    from pimper_torch.evidence.scenes.textures import random_speckle
     from pimper_torch.geometry.frames import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
@@ -297,8 +297,8 @@ def dtu(tmp_path_factory):
     import scipy.io
     from PIL import Image
 
-    from pimper_torch.evidence.scenes.cameras import arc_cameras
-    from pimper_torch.evidence.scenes.meshes import icosphere
+    from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.records import Mesh
 
     cameras = arc_cameras(3, width=1600, height=1200, focal_px=2000.0, distance=600.0)

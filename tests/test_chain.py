@@ -16,18 +16,18 @@ from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
-from pimper_torch.evidence.metrics.relative import angles_deg
+from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.evidence.scenes import (
     RenderedScene,
     potato_on_table,
     render_shape,
 )
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.shapes import Plane, Shape, Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.render_in_memory import Plane, Shape, Sphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from tests.test_chain import photographed, small_chain
 from tests.threads import on_threads
 

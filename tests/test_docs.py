@@ -23,11 +23,11 @@ from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.scenes import RenderedScene, render_shape, sparse_scene
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.photometry.harmonics import harmonics
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct

@@ -38,7 +38,7 @@ def calls():
 def test_nothing_is_unpickled():
     # The renderer hands a scene to processes that it starts itself.
     assert [found for found in imports() if found[1] in UNPICKLE] == [
-        ("evidence/scenes/write.py", "pickle")
+        ("evidence/scenes/rendered_folder.py", "pickle")
     ]
     loads = [(path, node) for path, name, node in calls() if name in ("np.load", "numpy.load")]
     for path, node in loads:
@@ -64,6 +64,6 @@ def test_only_baselines_and_python_itself_are_run():
     assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
         "asset/atlas.py",  # Python, which calls xatlas
         "batches/task.py",  # Python, which is `pimper reconstruct`
-        "evidence/baselines/external.py",
+        "evidence/baselines/openmvs.py",
         "kernels/compile.py",  # Python, which compiles its kernels
     }

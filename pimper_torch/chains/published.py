@@ -14,9 +14,9 @@ from pimper_torch.failures import OnFailure
 from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.paper.alignment.align import Align, AlignConfig
+from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate
-from pimper_torch.paper.refinement.refine import Refine, RefineConfig
+from pimper_torch.paper.refine import Refine, RefineConfig
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig

@@ -1,20 +1,130 @@
-"""Integration: normals of every patch become its height field."""
+r"""Integration: normals of every patch become its height field.
+
+A least-squares problem :math:`\min_z \sum |\nabla z - g|^2` with forward differences and nothing
+fixed at the border. The cosine basis turns it into a division, frequency by frequency. Products
+with the basis are 3 to 10 times as fast as FFTs on rasters of 30 to 120 samples a side.
+"""
 
 import math
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
 from pimper_torch.geometry.surfaces import slopes_from_normals
-from pimper_torch.paper.filling import fill_smoothly
-from pimper_torch.paper.poisson import integrate_steps
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
 from pimper_torch.records.patches import Photometry, Templates
 from pimper_torch.stage import Stage
+
+
+def fill_smoothly(
+    values: Float[Tensor, "patch channel height width"],
+    weight: Float[Tensor, "patch height width"],
+) -> Float[Tensor, "patch channel height width"]:
+    """Inpaint samples without weight from those around, through a pyramid of halved rasters.
+
+    Args:
+        values: Kept exactly where ``weight`` is 1, ignored where it is 0, NaN included.
+        weight: In [0, 1].
+
+    Returns:
+        Finite everywhere; zero in a patch without any weight. Differentiable.
+
+    Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
+    """
+    fraction = weight[:, None]
+    return _regularization(torch.where(fraction > 0, values, 0) * fraction, fraction)
+
+
+def _regularization(
+    weighted: Float[Tensor, "patch channel height width"],
+    weight: Float[Tensor, "patch 1 height width"],
+) -> Float[Tensor, "patch channel height width"]:
+    size = weight.shape[-2:]
+    known = torch.where(weight > 0, weighted / torch.where(weight > 0, weight, 1), 0)
+    if max(size) == 1:
+        return known
+    coarse_weight = _halved(weight)
+    coarse_weighted = _halved(weighted)
+    # A parent of one known child knows as much as that child: without saturation, thin
+    # evidence would fade on its way up, and the mean of the whole patch would win.
+    full = (4 * coarse_weight).clamp_max(1)
+    gain = full / torch.where(coarse_weight > 0, coarse_weight, 1)
+    coarse = _regularization(coarse_weighted * gain, full)
+    around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+    return weight * known + (1 - weight) * around
+
+
+def _halved(
+    raster: Float[Tensor, "patch channel height width"],
+) -> Float[Tensor, "patch channel half_height half_width"]:
+    window = [min(2, side) for side in raster.shape[-2:]]
+    return avg_pool2d(raster, kernel_size=window, stride=window, ceil_mode=True)
+
+
+def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
+    """Return the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
+    frequency = torch.arange(size, device=like.device, dtype=like.dtype)
+    basis = (math.pi / size * frequency[:, None] * (frequency + 0.5)).cos()
+    basis = basis * math.sqrt(2 / size)
+    return torch.cat([basis[:1] * math.sqrt(0.5), basis[1:]])
+
+
+def differences(
+    heights: Float[Tensor, "*batch height width"],
+) -> tuple[Float[Tensor, "*batch height steps_right"], Float[Tensor, "*batch steps_down width"]]:
+    """Return the steps to the right and down."""
+    return heights.diff(dim=-1), heights.diff(dim=-2)
+
+
+def differences_transposed(
+    right: Float[Tensor, "*batch height steps_right"],
+    down: Float[Tensor, "*batch steps_down width"],
+) -> Float[Tensor, "*batch height width"]:
+    """Apply the transpose of :func:`differences`: minus the divergence."""
+    pad = torch.nn.functional.pad
+    across = pad(right, (1, 0)) - pad(right, (0, 1))
+    return across + pad(down, (0, 0, 1, 0)) - pad(down, (0, 0, 0, 1))
+
+
+def solve_poisson(
+    source: Float[Tensor, "*batch height width"],
+) -> Float[Tensor, "*batch height width"]:
+    r"""Solve :math:`D^T D z = s`, D the steps of :func:`differences`.
+
+    Args:
+        source: ``s``. No ``z`` can produce its mean, which is ignored; ``z`` has mean zero.
+
+    Differentiable in ``source``.
+    """
+    height, width = source.shape[-2:]
+    rows, cols = cosine_basis(height, source), cosine_basis(width, source)
+    stiffness = _stiffness(height, source)[:, None] + _stiffness(width, source)
+    # No height answers to the mean; dividing it by infinity removes it.
+    stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
+    return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols
+
+
+def integrate_steps(
+    right: Float[Tensor, "*batch height steps_right"],
+    down: Float[Tensor, "*batch steps_down width"],
+) -> Float[Tensor, "*batch height width"]:
+    """Find the heights, of mean zero, whose steps come nearest to those given.
+
+    Source: Frankot & Chellappa, PAMI 10(4), 1988, in the cosine basis; Simchony, Chellappa &
+    Shao, PAMI 12(5), 1990, for the discrete operator.
+    """
+    return solve_poisson(differences_transposed(right, down))
+
+
+def _stiffness(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"]:
+    frequency = torch.arange(size, device=like.device, dtype=like.dtype)
+    return 4 * (math.pi / (2 * size) * frequency).sin() ** 2
+
 
 # Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
 # sample lies on the contour or is wrong, and one alone can bend its whole patch.
@@ -24,19 +134,16 @@ _MAX_TILT_DEG = 75.0
 class Integrate(Stage):
     """Integrate the normals of every patch on its template.
 
-    Frankot and Chellappa's projection in the cosine basis, bucket by bucket. Samples without
-    normals, and the raster outside the enlarged triangle, get slopes filled in smoothly from
-    the samples around them; a patch without any normals stays its facet's plane. The free
-    constant is chosen so that the height field passes, on average, through the facet's corners.
-
-    Differentiable in normals.
+    Samples without normals, and the raster outside the enlarged triangle, have inpainted slopes; a
+    patch without any normals stays its facet's plane. The height field passes, on average,
+    through the facet's corners. Differentiable in normals.
 
     Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
     algorithms, PAMI 10(4), 1988.
     """
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
-        """Give every patch its height field; ``valid`` inside enlarged triangles that have data."""
+        """Return the height fields, ``valid`` inside enlarged triangles that have data."""
         steepest = math.tan(math.radians(_MAX_TILT_DEG))
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
@@ -61,7 +168,7 @@ def integrate_normals(
     """Find the height field, of mean zero over its raster, whose slopes are the normals'.
 
     Args:
-        normals: Unit, ``n_z < 0``; anything where not valid.
+        normals: Unit, ``n_z < 0``; ignored where not valid.
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
     """

@@ -18,16 +18,18 @@ from pimper_torch.geometry.projection import project, rays_through, triangulatio
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.ledger import leave_out
-from pimper_torch.paper.cloud import with_cloud
-from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
-from pimper_torch.paper.filters import (
+from pimper_torch.paper.cloud_filters import (
     behind_others,
+    delaunay,
+    fill_pixels,
+    interpolate_inverse_depth,
     neighbours_agree,
     on_hull,
     spread,
     spread_to_count,
     views_near,
     well_accompanied,
+    with_cloud,
 )
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
 from pimper_torch.stage import Stage
@@ -243,13 +245,11 @@ def peel(
     unwanted: Bool[Tensor, " face"],
     sharp: Bool[Tensor, "face 3"] | None = None,
 ) -> Int[Tensor, "kept 3"]:
-    """Drop unwanted faces on the border, again and again; inner ones stay, so that no hole opens.
+    """Drop unwanted faces on the border repeatedly; inner ones stay, so that no hole opens.
 
     Args:
-        faces: Of a mesh with a border.
-        unwanted: Dropped as soon as they have an edge on it.
-        sharp: Marks corners; a face with a sharp corner between two edges on the border is a
-            spike, and dropped too.
+        unwanted: Dropped as soon as they have an edge on the border.
+        sharp: Corners; a face with a sharp corner between two border edges is dropped, too.
     """
     if sharp is None:
         sharp = torch.zeros_like(faces, dtype=torch.bool)

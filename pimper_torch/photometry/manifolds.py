@@ -3,7 +3,7 @@ r"""Photometric manifolds: the sets of possible shading vectors. First-order lig
 Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
 albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, whose ambiguity is
 a scaled Lorentz transformation. Other orders of light, and low-rank matrices, are in
-:mod:`pimper_torch.single_view.factorization.manifolds`.
+:mod:`pimper_torch.single_view.factorization.low_rank`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """

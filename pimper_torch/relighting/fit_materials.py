@@ -17,12 +17,15 @@ from torch import Tensor
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Mesh, Silhouettes, SparseScene
-from pimper_torch.relighting.lights import ViewLights, lights_of
-from pimper_torch.relighting.materials import Materials
-from pimper_torch.relighting.observed import Observed, observe_all
-from pimper_torch.relighting.reflectance import diffuse_color, response
-from pimper_torch.relighting.strengths import fit_strengths, loss_scale
-from pimper_torch.relighting.surface_pixels import LitSurface
+from pimper_torch.relighting.fit_lights import (
+    Observed,
+    ViewLights,
+    fit_strengths,
+    lights_of,
+    loss_scale,
+    observe_all,
+)
+from pimper_torch.relighting.lit_surface import LitSurface, Materials, diffuse_color, response
 
 _MATTE = (0.0, 1.0, 0.0)
 # Tried first. Highlights of less roughness have few pixels; diamond has a specular of 4.
@@ -48,7 +51,7 @@ def fit_materials(
 
     Args:
         mesh: In the scene's frame, with albedo.
-        silhouettes: Of the scene's views; without, the mesh's outline tells where the object is.
+        silhouettes: Of the scene's views; by default the mesh's outline.
     """
     surface = LitSurface(mesh)
     observed = observe_all(surface, scene, silhouettes)

@@ -1,4 +1,4 @@
-"""A surface judged by photographs: predicted under their own light, at best held out ones."""
+"""Prediction of photographs from a surface, its materials and a light, and the errors."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,61 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.asset.bake import Textured
-from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.relighting.fit_lights import Observed, ViewLights, lights_of, observe_all
 from pimper_torch.relighting.fit_materials import materials_under
-from pimper_torch.relighting.lights import ViewLights, lights_of
-from pimper_torch.relighting.materials import Materials
-from pimper_torch.relighting.observed import Observed, observe_all
-from pimper_torch.relighting.predict import psnr, shaded
-from pimper_torch.relighting.surface_pixels import LitSurface
-from pimper_torch.relighting.textured_surface import TexturedSurface
+from pimper_torch.relighting.lit_surface import (
+    LitSurface,
+    Materials,
+    SurfacePixels,
+    TexturedSurface,
+    diffuse_color,
+    response,
+)
+
+
+def predict(
+    mesh: Mesh | LitSurface,
+    camera: Cameras,
+    light: ViewLights,
+    materials: Materials | None = None,
+) -> Float[Tensor, "height width channel"]:
+    """Return the linear radiance that a camera sees, with cast shadows; NaN beside the mesh.
+
+    Args:
+        mesh: With albedo; prepared where several pictures of it are wanted.
+        materials: By default matte.
+    """
+    surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
+    pixels = surface.pixels(camera, 0)
+    width, height = (int(side) for side in camera.sizes_px[0])
+    radiance = shaded(surface, pixels, light, materials)
+    picture = torch.full((height * width, radiance.shape[1]), torch.nan)
+    picture[pixels.pixel] = radiance
+    return picture.reshape(height, width, -1)
+
+
+def shaded(
+    surface: LitSurface, pixels: SurfacePixels, light: ViewLights, materials: Materials | None
+) -> Float[Tensor, "pixel channel"]:
+    """Return the linear radiance of pixels."""
+    material = None if materials is None else materials.at_vertices()[pixels.vertex]
+    incidence = surface.incidence(pixels, light.direction_world, light.closeness)
+    lit = response(pixels, incidence, material)[0]
+    return light.ambient * diffuse_color(pixels, material) + light.directed * lit
+
+
+def psnr(
+    predicted: Float[Tensor, "pixel channel"], radiance: Float[Tensor, "pixel channel"]
+) -> float:
+    """Return the peak signal-to-noise ratio of sRGB values in [0, 1], in decibels.
+
+    Args:
+        predicted: Linear, clipped to [0, 1] as a photograph is; ``radiance`` likewise.
+    """
+    error = srgb_from_linear(predicted).double() - srgb_from_linear(radiance).double()
+    return float(-10 * error.square().mean().clamp_min(1e-12).log10())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

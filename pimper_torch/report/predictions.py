@@ -9,10 +9,9 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Mesh, Record, SparseScene
-from pimper_torch.relighting.held_out import Relighting
-from pimper_torch.relighting.lights import ViewLights
-from pimper_torch.relighting.predict import predict
-from pimper_torch.relighting.surface_pixels import LitSurface
+from pimper_torch.relighting.fit_lights import ViewLights
+from pimper_torch.relighting.held_out import Relighting, predict
+from pimper_torch.relighting.lit_surface import LitSurface
 from pimper_torch.report.pictures import longest_px
 
 # Predictions have half as many pixels a side as photographs: rays are what they cost.

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.records import Silhouettes, SparseScene
-from pimper_torch.relighting.lights import ViewLights
+from pimper_torch.relighting.fit_lights import ViewLights
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
 from pimper_torch.report.predictions import Prediction
 

@@ -4,7 +4,7 @@ import torch
 
 from pimper_torch.chains.chain import Step
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
-from pimper_torch.relighting.lights import fit_lights
+from pimper_torch.relighting.fit_lights import fit_lights
 from pimper_torch.viewer.viewer import Viewer
 
 COARSE, RESULT = "coarse surface", "result"

@@ -19,7 +19,7 @@ from pimper_torch.asset.make import few_enough, textured
 from pimper_torch.asset.tangents import tangents
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import write_glb
 from pimper_torch.parallel import on_one_thread

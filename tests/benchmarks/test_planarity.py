@@ -6,7 +6,7 @@ from planarity import dihedrals, planar_faces
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh
 

@@ -18,7 +18,7 @@ from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.store import Store

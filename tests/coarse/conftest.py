@@ -1,10 +1,9 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.records import SparseScene
 from tests.coarse.ball import all_round, photographed
 

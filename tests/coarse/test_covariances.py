@@ -2,10 +2,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.covariances import point_covariances
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 
 
 def noisy_cloud(noise_px, seed, span_deg=50.0):

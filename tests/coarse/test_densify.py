@@ -19,11 +19,10 @@ from pimper_torch.coarse.trim import (
     supported_components,
     without_small_holes,
 )
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.meshes import icosphere, table
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
+from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.records import Mesh, Support

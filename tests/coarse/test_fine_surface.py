@@ -9,8 +9,8 @@ from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.coarse.trim import ViewCounts
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_components, face_pairs

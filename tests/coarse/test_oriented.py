@@ -4,7 +4,7 @@ from torch.testing import assert_close
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.matching import Level
 from pimper_torch.coarse.oriented import denied, fitted_planes
-from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 
 

@@ -5,11 +5,11 @@ from torch.testing import assert_close
 
 from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
-from pimper_torch.paper.fill import delaunay
+from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
 from pimper_torch.silhouettes.hull import Hull
 

@@ -10,8 +10,8 @@ from pimper_torch.coarse.surface import (
     two_faces_an_edge,
 )
 from pimper_torch.errors import InputError, ReconstructionError
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_components, face_pairs

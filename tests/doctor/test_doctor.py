@@ -16,7 +16,7 @@ from pimper_torch.doctor.machine import available_gb, machine, total_gb
 from pimper_torch.doctor.overlap import match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, summarize
 from pimper_torch.doctor.sharpness import edge_blur_px
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import Encoding

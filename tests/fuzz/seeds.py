@@ -38,10 +38,10 @@ from pimper_torch.evidence.datasets import (
     write_transforms,
 )
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import project

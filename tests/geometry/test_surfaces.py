@@ -3,7 +3,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     face_normals,

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.metrics.relative import angles_deg, meet_in_view, relative_error
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.evidence.metrics.in_view import angles_deg, meet_in_view, relative_error
+from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 
 
@@ -14,7 +14,9 @@ def compare_in_view(
     mesh, truth_from_world, cameras, view, depth_true, *, normals_true=None, where=None
 ):
     """Return 3D error in per cent, coverage, and angles between vertex and true normals."""
-    met = meet_in_view(mesh, truth_from_world, cameras, view, depth_true, where)
+    vertices = mesh.vertices_world
+    moved = mesh.replace(vertices_world=transform(truth_from_world.to(vertices), vertices))
+    met = meet_in_view(moved, cameras, view, depth_true, where)
     angles = torch.full((1,), torch.nan)
     if normals_true is not None:
         own = mesh.normals_world

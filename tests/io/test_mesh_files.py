@@ -7,7 +7,7 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.results import write_result

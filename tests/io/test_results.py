@@ -13,7 +13,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.errors import OutputError
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.paper.cloud import facets_under
+from pimper_torch.paper.cloud_filters import facets_under
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 
 

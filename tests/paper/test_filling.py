@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.filling import fill_smoothly
+from pimper_torch.paper.integrate import fill_smoothly
 
 
 @pytest.fixture

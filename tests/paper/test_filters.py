@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.filters import (
+from pimper_torch.paper.cloud_filters import (
     behind_others,
     neighbours_agree,
     on_hull,

@@ -3,7 +3,7 @@ import scipy.fft
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.poisson import (
+from pimper_torch.paper.integrate import (
     cosine_basis,
     differences,
     differences_transposed,

@@ -6,7 +6,7 @@ from pimper_torch.errors import ConfigError, InputError, ReconstructionError
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_pairs, half_edges
-from pimper_torch.paper.fill import delaunay, fill_pixels, interpolate_inverse_depth
+from pimper_torch.paper.cloud_filters import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.triangulate import (
     Triangulate,
     TriangulateConfig,

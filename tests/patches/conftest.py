@@ -1,10 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.rendered import RenderedScene
-from pimper_torch.evidence.scenes.shapes import Plane
+from pimper_torch.evidence.scenes.render_in_memory import Plane, RenderedScene, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import CoarseMesh, Mesh
 
 TILTED = Plane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))

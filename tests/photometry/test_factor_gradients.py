@@ -11,7 +11,7 @@ from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.single_view.factorization.manifolds import Free
+from pimper_torch.single_view.factorization.low_rank import Free
 
 
 @pytest.fixture

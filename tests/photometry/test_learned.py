@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 import pimper_torch as pt
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics.evaluate import EvaluateConfig, evaluate
+from pimper_torch.evidence.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig

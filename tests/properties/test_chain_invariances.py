@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.shapes import Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.records import Mesh, SparseScene
 from tests.test_chain import photographed, small_chain
 

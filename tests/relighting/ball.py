@@ -3,14 +3,14 @@
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh
-from pimper_torch.relighting.lights import ViewLights
+from pimper_torch.relighting.fit_lights import ViewLights
 
 SIDE = 80
 

@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.sfm.binding import loaded
 from pimper_torch.sfm.colmap import (

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.room import upside_down
+from pimper_torch.evidence.scenes.whole_scene import upside_down
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Lens

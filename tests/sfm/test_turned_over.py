@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.scene import build_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.settings import ReconstructConfig
 from tests.sfm.test_turntable import center_errors, photographs

@@ -3,11 +3,10 @@ import torch
 
 from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.evidence.metrics.similarity import similarity_between_cameras
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.meshes import potato
-from pimper_torch.evidence.scenes.scene import build_scene
-from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.procedural_meshes import potato
+from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Views

@@ -1,7 +1,7 @@
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.metrics.relative import angles_deg
+from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.silhouettes.hull import visual_hull
 from pimper_torch.silhouettes.rays import contour_rays
 from pimper_torch.silhouettes.tangency import ambiguous, contour_points

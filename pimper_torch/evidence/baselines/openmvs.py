@@ -1,40 +1,36 @@
 """OpenMVS, if the user has it: depth maps, Delaunay and graph cut, refinement."""
 
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
 import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from pimper_torch.cores import usable_cores
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.evidence.baselines.exchange import (
-    estimate_of,
-    read_surface,
-    write_photographs,
-    write_pinhole_model,
-)
-from pimper_torch.evidence.baselines.external import Deadline, Program, run_program
+from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
+from pimper_torch.exchange.colmap_workspace import write_pinholes
+from pimper_torch.exchange.pictures import write_picture
+from pimper_torch.geometry.local_frame import NO_OFFSET
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.progress import report
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
 
+# Environment variable that may name a program, or the folder it lies in, and folders of installers.
+_VARIABLE, _FOLDERS = "PIMPER_OPENMVS", ("/usr/local/bin/OpenMVS", "/usr/bin/OpenMVS")
+_ADVICE = (
+    f"Get it from https://github.com/cdcseacave/openMVS, or point {_VARIABLE} to it, or leave this "
+    "method out."
+)
+PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")
 
-def _program(name: str) -> Program:
-    return Program(
-        name=name,
-        variable="PIMPER_OPENMVS",
-        source="https://github.com/cdcseacave/openMVS",
-        folders=(Path("/usr/local/bin/OpenMVS"), Path("/usr/bin/OpenMVS")),
-    )
-
-
-INTERFACE = _program("InterfaceCOLMAP")
-DENSIFY = _program("DensifyPointCloud")
-RECONSTRUCT = _program("ReconstructMesh")
-REFINE = _program("RefineMesh")
-
-# Names that the programs give their results when they are left the choice; the same in all
-# versions, which those after ``-o`` are not.
+# Names of the programs' results by default: the same in all versions, unlike those after ``-o``.
 _SCENE, _DENSE, _MESH = "scene.mvs", "scene_dense.mvs", "scene_dense_mesh.ply"
 _REFINED = ("scene_dense_refine.ply", "scene_dense_mesh_refine.ply")
 # For all the programs together; then they are stopped.
@@ -44,73 +40,164 @@ _MAX_MINUTES = 120.0
 class OpenMvs(Stage):
     """Depth maps by patch match, a mesh that explains their visibility, refined.
 
-    All under the programs' own defaults.
+    All under the programs' own defaults. Masks are not handed over: not every version takes them.
     """
 
     @torch.no_grad()
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
-        """Run OpenMVS on the scene's photographs, cameras and cloud.
+        """Run OpenMVS on the scene's photographs, cameras and cloud, which chooses pairs of views.
 
-        Masks are not handed over: not every version takes them.
-
-        Args:
-            scene: Its cloud chooses pairs of views.
-
-        Returns:
-            A mesh in the scene's frame.
+        Raises:
+            InputError: No view sees a point.
+            MissingProgramError: A program is not installed.
+            ReconstructionError: A program failed.
         """
-        found = {program: program.find() for program in (INTERFACE, DENSIFY, RECONSTRUCT, REFINE)}
+        found = {name: find_program(name) for name in PROGRAMS}
         with tempfile.TemporaryDirectory(prefix="pimper-openmvs-") as temporary:
             folder = Path(temporary).resolve()
-            names = write_photographs(scene, folder / "images")
-            write_pinhole_model(scene, names, folder / "sparse")
-            mesh = _Run(found, folder).surface()
-        return estimate_of(mesh, scene, coarse)
+            _write_scene(scene, folder)
+            mesh = _run_all(found, folder)
+        like = scene.points_world
+        return Estimate(
+            mesh=mesh.replace(
+                vertices_world=mesh.vertices_world.to(like),
+                faces=mesh.faces.to(like.device),
+                normals_world=None if mesh.normals_world is None else mesh.normals_world.to(like),
+            ),
+            names=scene.views.names,
+            cameras=scene.cameras,
+            reference=scene.views.names[coarse.reference],
+        )
 
 
-class _Run:
-    """The chain of programs in one folder."""
+def find_program(name: str) -> Path:
+    """Find an executable: by the variable, on the PATH, in the usual folders."""
+    if _VARIABLE in os.environ:
+        named = Path(os.environ[_VARIABLE])
+        path = named / name if named.is_dir() else named
+        if not (path.is_file() and os.access(path, os.X_OK)):
+            raise MissingProgramError(
+                f"{name} is not installed at {named}, where {_VARIABLE} says; needed: the "
+                f"executable, or the folder it lies in. {_ADVICE}"
+            )
+        return path.absolute()  # it will run in another folder
+    found = shutil.which(name) or shutil.which(name, path=os.pathsep.join(_FOLDERS))
+    if found is None:
+        raise MissingProgramError(
+            f"{name} is not installed: it is neither on the PATH nor named by {_VARIABLE}. "
+            f"{_ADVICE}"
+        )
+    return Path(found).absolute()
 
-    def __init__(self, found: dict[Program, Path], folder: Path) -> None:
-        self._found, self._folder = found, folder
-        self._deadline = Deadline(_MAX_MINUTES)
-        self._threads = usable_cores()
-        self._done = 0
 
-    def surface(self) -> Mesh:
-        """Run them all and read the last one's mesh."""
-        self._call(INTERFACE, "-i", str(self._folder), leaves=(_SCENE,))
-        self._call(DENSIFY, "-i", _SCENE, leaves=(_DENSE,))
-        # Since version 2.3 the dense points are not in the scene's file, and must be named;
-        # before, the option did not exist.
-        points = ("-p", "scene_dense.ply") if self._names_points() else ()
-        path, printed = self._call(RECONSTRUCT, "-i", _DENSE, *points, leaves=(_MESH,))
-        last = RECONSTRUCT
-        if path.is_file():
-            path, printed = self._call(REFINE, "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
-            last = REFINE
-        return read_surface(path, last.name, printed)
+def _write_scene(scene: SparseScene, folder: Path) -> None:
+    """Write undistorted photographs and a COLMAP model of pinholes, in the scene's own frame.
 
-    def _call(self, program: Program, *arguments: str, leaves: tuple[str, ...]) -> tuple[Path, str]:
-        """Run one program; give the file that it writes and what it printed."""
-        command: list[Path | str] = [self._found[program], *arguments]
-        command += ["-w", str(self._folder), "--max-threads", str(self._threads)]
-        printed = run_program(command, self._folder, self._deadline, threads=self._threads)
-        self._done += 1
-        report(self._done, len(self._found))
-        there = [self._folder / name for name in leaves if (self._folder / name).is_file()]
-        # read_surface says, with the log, that a mesh is not there.
-        path = there[0] if there else self._folder / leaves[0]
-        if not there and path.suffix == ".mvs":
-            read_surface(path, program.name, printed)
+    Photographs are named by their number: programs fail on spaces and folders in names.
+    """
+    if not len(scene.observation_point):
+        raise InputError(
+            "the scene has no sparse points that a view sees; needed: some, for a stereo program "
+            "chooses its pairs of views and its range of depth by them."
+        )
+    names = tuple(f"{index:08d}.png" for index in range(scene.views.num_views))
+    colour = scene.views.replace(images=scene.views.images.expand(-1, 3, -1, -1))
+    for index, name in enumerate(names):
+        write_picture(colour, index, folder / "images" / name)
+    here = scene.replace(offset_world=NO_OFFSET).detach().to("cpu")
+    write_pinholes(here, here.cameras, names, folder / "sparse")
+
+
+def _run_all(found: dict[str, Path], folder: Path) -> Mesh:
+    """Run the programs in turn, and read the last one's mesh."""
+    deadline, threads = time.monotonic() + 60 * _MAX_MINUTES, usable_cores()
+
+    def call(name: str, *arguments: str, leaves: tuple[str, ...]) -> tuple[Path, str]:
+        """Run a program; return the file that it writes, and its output."""
+        options = ["-w", str(folder), "--max-threads", str(threads)]
+        printed = run_program([found[name], *arguments, *options], folder, deadline, threads)
+        report(PROGRAMS.index(name) + 1, len(PROGRAMS))
+        there = [folder / leaf for leaf in leaves if (folder / leaf).is_file()]
+        path = there[0] if there else folder / leaves[0]
+        if not there:
+            raise ReconstructionError(
+                f"{name} ended without complaint, but left no {path.name}.{_last_lines(printed)}"
+            )
         return path, printed
 
-    def _names_points(self) -> bool:
-        """Return whether the dense points are passed to the program beside the scene."""
+    call("InterfaceCOLMAP", "-i", str(folder), leaves=(_SCENE,))
+    call("DensifyPointCloud", "-i", _SCENE, leaves=(_DENSE,))
+    try:
+        help_text = run_program([found["ReconstructMesh"], "--help"], folder, deadline, 1)
+    except ReconstructionError as error:  # some versions fail after showing their help
+        help_text = str(error)
+    # Since version 2.3 the dense points are not in the scene's file, and must be named.
+    points = ("-p", "scene_dense.ply") if "--pointcloud-file" in help_text else ()
+    call("ReconstructMesh", "-i", _DENSE, *points, leaves=(_MESH,))
+    path, printed = call("RefineMesh", "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
+    try:
+        # Its colours are radiance under this light, no albedo.
+        return read_mesh(path).replace(albedo=None, confidence=None)
+    except InputError as error:
+        raise ReconstructionError(
+            f"RefineMesh found no surface: {error}{_last_lines(printed)}"
+        ) from error
+
+
+def run_program(command: Sequence[Path | str], folder: Path, deadline: float, threads: int) -> str:
+    """Run a program in a folder, without a shell, and return its output, which is kept there too.
+
+    The program and its children are stopped at the deadline or when we are interrupted.
+
+    Args:
+        deadline: Of ``time.monotonic()``.
+    """
+    name = Path(command[0]).name
+    with tempfile.NamedTemporaryFile(
+        prefix=f"{name}-", suffix=".log", dir=folder, delete=False
+    ) as log:
         try:
-            help_text = run_program(
-                [self._found[RECONSTRUCT], "--help"], self._folder, self._deadline, threads=1
+            process = subprocess.Popen(
+                [str(part) for part in command],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=os.environ | {"OMP_NUM_THREADS": str(threads)},
+                start_new_session=True,
             )
-        except ReconstructionError as error:  # some versions fail after showing their help
-            help_text = str(error)
-        return "--pointcloud-file" in help_text
+        except OSError as error:
+            raise MissingProgramError(
+                f"{command[0]} cannot be started ({error.strerror}); needed: an executable for "
+                "this machine."
+            ) from error
+        try:
+            status = process.wait(timeout=max(0.0, deadline - time.monotonic()))
+        except BaseException as error:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            raise ReconstructionError(
+                f"{name} was stopped: the programs' {_MAX_MINUTES:g} minutes are over. Work on "
+                f"smaller photographs.{_last_lines(_text(log.name))}"
+            ) from error
+    printed = _text(log.name)
+    if status != 0:
+        ending = f"exit status {status}" if status > 0 else f"ended by signal {-status}"
+        often = "; often because memory ran out" if status == -signal.SIGKILL else ""
+        raise ReconstructionError(f"{name} failed ({ending}{often}).{_last_lines(printed)}")
+    return printed
+
+
+def _last_lines(printed: str) -> str:
+    """Quote the end of a program's output, ready to follow a message."""
+    lines = [line.rstrip() for line in printed.splitlines() if line.strip()][-15:]
+    if not lines:
+        return " It printed nothing."
+    return "".join(["\nIts last lines:", *(f"\n  {line}" for line in lines)])
+
+
+def _text(path: str) -> str:
+    return Path(path).read_text(encoding="utf-8", errors="replace")

@@ -14,15 +14,11 @@ Source: Botsch & Sorkine, On linear variational surface deformation methods, TVC
 for the discrete plate; the rim's term is ours.
 """
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
@@ -35,29 +31,16 @@ from pimper_torch.stage import Stage
 # A needle's area is taken as at least this fraction of its longest edge squared.
 _MIN_SHAPE = 1e-3
 
+# Vertices of the smooth mesh if its facets are of one size, about twice as many with those of a
+# sparse cloud: more would show nothing more.
+_NUM_VERTICES = 20_000
+
+# ``w``: on a sphere, a wavy plane and rendered potatoes 1000 came nearer to the truth than 100, and
+# 10000 hardly nearer than 1000.
+_FIDELITY = 1000.0
+
 # Rows, columns and values of a sparse matrix.
 Entries = tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SmoothedConfig:
-    """Settings of :class:`Smoothed`.
-
-    Attributes:
-        num_vertices: How many the smooth mesh has if its facets are of one size; about twice
-            as many with those of a sparse cloud. It is smooth: more would show nothing more.
-        fidelity: ``w`` of vertices that are points of the cloud: the larger, the closer the
-            surface passes. On a sphere, a wavy plane and rendered potatoes 1000 came nearer
-            to the truth than 100, and 10000 hardly nearer than 1000.
-        filled_fidelity: ``w`` of vertices that were filled in between.
-    """
-
-    num_vertices: Annotated[int, Range(least=4, most=10_000_000)] = 20_000  # half a kilobyte each
-    fidelity: Annotated[float, Range(above=0, most=1e12)] = 1000.0
-    filled_fidelity: Annotated[float, Range(least=0, most=1e12)] = 1000.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Smoothed(Stage):
@@ -67,28 +50,20 @@ class Smoothed(Stage):
     albedo and lights stay unknown. Not differentiable.
     """
 
-    def __init__(self, config: SmoothedConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or SmoothedConfig()
-
     @torch.no_grad()
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
         """Smooth the mesh; its vertices carry its own normals."""
         mesh = coarse.mesh
-        used = torch.unique(mesh.faces)
-        fixed = coarse.is_point[used].any() or self.config.filled_fidelity > 0
-        if len(mesh.faces) == 0 or not fixed:
+        if len(mesh.faces) == 0:
             raise ReconstructionError(
-                f"the coarse mesh has {len(mesh.faces)} facets and "
-                f"{int(coarse.is_point[used].sum())} sparse points; at least one of each is "
-                "needed. Relax the filters of `triangulate`, or bring a mesh of your own."
+                "the coarse mesh has no facets; at least one is needed. Relax the filters of "
+                "`triangulate`, or bring a mesh of your own."
             )
         area = face_normals(mesh.vertices_world, mesh.faces).norm(dim=-1).sum() / 2
         # A triangular subdivided mesh with edges s has a vertex on every sqrt(3)/2 s^2.
-        spacing = (area / self.config.num_vertices * 2 / 3**0.5).sqrt()
+        spacing = (area / _NUM_VERTICES * 2 / 3**0.5).sqrt()
         subdivision = subdivide(mesh.vertices_world, mesh.faces, spacing.expand(len(mesh.faces)))
-        weights = torch.where(coarse.is_point, self.config.fidelity, self.config.filled_fidelity)
-        vertices = thin_plate(subdivision, mesh, weights.to(mesh.vertices_world))
+        vertices = thin_plate(subdivision, mesh)
         return Estimate(
             mesh=Mesh(
                 vertices_world=vertices,
@@ -101,14 +76,8 @@ class Smoothed(Stage):
         )
 
 
-def thin_plate(
-    subdivision: Subdivision, mesh: Mesh, weights: Float[Tensor, " corner"]
-) -> Float[Tensor, "vertex 3"]:
-    """Return the positions of the subdivided mesh's vertices on the surface of least bending.
-
-    Args:
-        weights: ``w`` of its vertices; one at least, in every piece, above 0.
-    """
+def thin_plate(subdivision: Subdivision, mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+    """Return the positions of the subdivided mesh's vertices on the surface of least bending."""
     points = subdivision.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]
     edge = side_lengths(corners).median()
@@ -123,8 +92,10 @@ def thin_plate(
         _gram((rows, cols, values * keep[rows]), count, count),
         _gram(_rim_differences(subdivision, edge), count, count),
     ]
-    fixed, target = _fixed_vertices(subdivision, mesh)
-    regularization = weights.double()[target] / edge**2
+    (fixed,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
+    slot = subdivision.barycentric[fixed].argmax(dim=1)
+    target = mesh.faces[subdivision.facet[fixed], slot]
+    regularization = torch.full_like(mass, _FIDELITY)[target] / edge**2
     diagonal = torch.zeros_like(mass).index_add(0, fixed, regularization)
     rhs = torch.zeros_like(points).index_add(
         0, fixed, regularization[:, None] * mesh.vertices_world.double()[target]
@@ -158,7 +129,8 @@ def _gram(
 
 def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entries:
     """Return the second differences along the border, in the plate's units."""
-    ends = _rim_edges(subdivision.faces)
+    _, index = face_edges(subdivision.faces)
+    ends = half_edges(subdivision.faces)[face_counts(index)[index.flatten()] == 1]
     count = len(subdivision.points)
     # Every vertex of the rim with one edge in and one out has a second difference.
     following = torch.full((count,), -1, device=ends.device).index_put((ends[:, 0],), ends[:, 1])
@@ -173,18 +145,3 @@ def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entri
     values = torch.stack([root / back, -root * (1 / back + 1 / ahead), root / ahead])
     columns = torch.stack([before, centre, after])
     return centre.expand(3, -1).flatten(), columns.flatten(), values.flatten()
-
-
-def _rim_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
-    """List the border edges, in the direction of their face."""
-    _, index = face_edges(faces)
-    return half_edges(faces)[face_counts(index)[index.flatten()] == 1]
-
-
-def _fixed_vertices(
-    subdivision: Subdivision, mesh: Mesh
-) -> tuple[Int[Tensor, " fixed"], Int[Tensor, " fixed"]]:
-    """Find the subdivided mesh's vertices of the coarse mesh, and their indices."""
-    (fixed,) = (subdivision.barycentric == 1).any(dim=1).nonzero(as_tuple=True)
-    slot = subdivision.barycentric[fixed].argmax(dim=1)
-    return fixed, mesh.faces[subdivision.facet[fixed], slot]

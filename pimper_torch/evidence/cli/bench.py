@@ -10,9 +10,9 @@ from rich.console import Console
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.evidence.bench.config import BenchConfig
-from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
-from pimper_torch.evidence.bench.table import terminal
+from pimper_torch.evidence.bench.bench_inputs import BenchConfig
+from pimper_torch.evidence.bench.bench_table import terminal
+from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, run_bench
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.store.folders import user_cache
 

@@ -19,14 +19,14 @@ from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.diligent import read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_sets import read_dtu_mvs, read_dtu_protocol
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics.evaluate import (
+from pimper_torch.evidence.metrics.compared_page import write_compared_page
+from pimper_torch.evidence.metrics.evaluation import (
     EvaluateConfig,
     Evaluation,
     chosen_views,
     evaluate,
 )
-from pimper_torch.evidence.metrics.page import write_compared_page
-from pimper_torch.evidence.metrics.report import report, rows
+from pimper_torch.evidence.metrics.figure_rows import report, rows
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version

@@ -9,8 +9,8 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.reporting import stage
 
 _DEFAULT = SceneConfig()

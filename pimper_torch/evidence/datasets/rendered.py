@@ -1,4 +1,4 @@
-"""Rendered scenes, as :func:`pimper_torch.evidence.scenes.render_scene` writes them."""
+"""Rendered scenes, as :func:`pimper_torch.evidence.scenes.rendered_folder` writes them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +10,13 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.maps import MAP_NAMES, unpack_maps
-from pimper_torch.evidence.scenes.write import FORMAT, FORMAT_VERSION
+from pimper_torch.evidence.scenes.rendered_folder import (
+    FORMAT,
+    FORMAT_VERSION,
+    MAP_NAMES,
+    unpack_maps,
+)
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.numpy_files import read_npz

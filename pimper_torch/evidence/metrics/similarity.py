@@ -1,4 +1,4 @@
-"""Similarities (scale, rotation, translation) that put a result in the frame of the truth.
+"""Similarities that put a result in the frame of the truth.
 
 They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
 :func:`pimper_torch.geometry.frames.transform` applies them.
@@ -6,15 +6,20 @@ They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import rigid
-from pimper_torch.records import Cameras
+from pimper_torch.evidence.metrics.surface_distances import joined, sample_surface, true_surface
+from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
 
 
 def pair_views(
@@ -80,10 +85,6 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
     rotation about it open, and an arc nearly does; so the rotation is fitted to the centres
     and to the cameras' axes together, each axis drawn as long as the centres' root mean
     square distance from their mean.
-
-    Args:
-        ours: World frame of the result.
-        truth: The same views in the same order; see :func:`pair_views`.
 
     Raises:
         InputError: Unequal numbers of cameras, or centres that coincide.
@@ -151,3 +152,202 @@ def _outer(
 
 def _spread(points: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
     return (points - points.mean(dim=0)).square().sum(dim=1).mean()
+
+
+# A direction of the seven that moves the surface less than this fraction of the strongest is no
+# direction: turning a ball, sliding a plane.
+_UNDETERMINED = 1e-6
+
+Method = Literal["auto", "none", "cameras", "icp"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alignment(Record):
+    """A similarity, and how it was found.
+
+    Attributes:
+        description: In words.
+        truth_from_world: Upper left block is scale times rotation.
+        scale: Scene units of the truth in one of the estimate.
+        cameras: Pairs of cameras that were used.
+        trimmed_fraction: Fraction of the samples that ``icp`` left out; ``None`` otherwise.
+        residual: Root mean square distance of the samples ``icp`` kept, scene units.
+        converged: False where the limit of iterations stopped ``icp``; ``None`` otherwise.
+    """
+
+    method: str
+    description: str
+    truth_from_world: Float[Tensor, "4 4"]
+    scale: float
+    rotation_deg: float
+    cameras: int = 0
+    trimmed_fraction: float | None = None
+    residual: float | None = None
+    converged: bool | None = None
+
+
+def align_estimate(
+    estimate: Estimate,
+    capture: Capture,
+    method: Method,
+    trimmed_fraction: float = 0.2,
+    *,
+    generator: torch.Generator,
+) -> Alignment:
+    """Find the similarity that carries an estimate to the truth.
+
+    Args:
+        method: ``none`` takes the frames for one and the same. ``cameras`` fits the
+            estimate's cameras to the true ones of the same names. ``icp`` continues from
+            there, or from the identity, and fits the surfaces, see :func:`trimmed_icp`.
+            ``auto`` is ``cameras`` where there are two pairs of cameras at least, else ``none``.
+        generator: On the CPU; draws the samples of ``icp``.
+
+    Raises:
+        InputError: ``cameras`` without two pairs, or ``icp`` without a true surface.
+    """
+    pairs = paired_cameras(estimate, capture)
+    count = 0 if pairs is None else pairs[0].num_views
+    if method == "cameras" and count < 2:
+        raise InputError(
+            f"to align by cameras, {count} views have a camera in both the result and the truth; "
+            "needed: two at least. Align by the surfaces (`icp`), or not at all (`none`)."
+        )
+    found, used = torch.eye(4).double(), 0
+    if pairs is not None and count >= 2 and method != "none":
+        found, used = similarity_between_cameras(*pairs).cpu().double(), count
+    known: dict[str, float | None] = {}
+    description = f"similarity on {used} cameras" if used else "identity"
+    if method == "icp":
+        target = joined(true_surface(capture), capture.truth.surroundings)
+        kind = "plane" if len(target.faces) else "point"
+        description = (
+            f"similarity ICP, point to {kind}, {100 * trimmed_fraction:g} % of the estimate "
+            f"trimmed, from {description}"
+        )
+        found, known["residual"], known["converged"] = trimmed_icp(
+            estimate.mesh, target, found, trimmed_fraction, generator=generator
+        )
+        known["trimmed_fraction"] = trimmed_fraction
+    elif not used:
+        description = "none: the frames are taken for the same"
+    scale, rotation = split_similarity(found)
+    return Alignment(
+        method="icp" if method == "icp" else "cameras" if used else "none",
+        description=description,
+        truth_from_world=found,
+        scale=scale,
+        rotation_deg=float(rotation_angles_deg(rotation)),
+        cameras=used,
+        **known,  # type: ignore[arg-type]
+    )
+
+
+def trimmed_icp(
+    mesh: Mesh,
+    truth: Mesh,
+    start: Float[Tensor, "4 4"],
+    trimmed_fraction: float = 0.2,
+    *,
+    generator: torch.Generator,
+    count: int = 8000,
+    iterations: int = 60,
+    tolerance: float = 1e-7,
+) -> tuple[Float[Tensor, "4 4"], float, bool]:
+    """Find the similarity that lays an estimate on the truth, beginning near it.
+
+    Each step pairs every sample of the estimate with the nearest point of the true surface,
+    drops the fraction of pairs that are farthest apart, and moves the estimate by the
+    similarity that is best for the rest. It finds the nearest minimum only: an estimate that
+    starts far off may shrink into a corner of the truth, so look at the scale that is reported.
+
+    Args:
+        truth: Surface or point cloud; with its surroundings, if the estimate may have them.
+        trimmed_fraction: Must cover outliers and what the truth lacks.
+        tolerance: Stop when a step moves the samples by less than this fraction of their spread.
+
+    Returns:
+        The similarity, the root mean square distance of the samples kept, and False where the
+        limit of iterations stopped it.
+
+    Source: Chetverikov, Stepanov & Krsek, IVC 23(3), 2005, for trimming; Chen & Medioni,
+    IVC 10(3), 1992, for the distance to the plane. Scale as a seventh unknown of the
+    linearised step is ours.
+    """
+    target = NearestSurface(truth)
+    normals = face_normals(truth.vertices_world.cpu().double(), truth.faces.cpu())
+    samples = sample_surface(mesh, count, generator).points
+    kept = max(3, round((1 - trimmed_fraction) * len(samples)))
+    found = start.cpu().double()
+    spread = _deviation(transform(found, samples))
+    converged, taken = False, 0
+    while taken < iterations and not converged:
+        moved = transform(found, samples)
+        nearest = target.query(moved)
+        chosen = nearest.distance.topk(kept, largest=False).indices
+        source, aim = moved[chosen], nearest.points[chosen]
+        if len(truth.faces):
+            step = _step_to_planes(source, aim, normals[nearest.face[chosen]])
+        else:
+            step = similarity_between_points(source, aim)
+        found = step @ found
+        taken += 1
+        length = (transform(step, moved) - moved).square().sum(dim=1).mean().sqrt()
+        converged = float(length) < tolerance * spread
+    near = target.query(transform(found, samples)).distance.topk(kept, largest=False).values
+    return found, float(near.square().mean().sqrt()), converged
+
+
+def _step_to_planes(
+    source: Float[Tensor, "pair 3"],
+    target: Float[Tensor, "pair 3"],
+    normals: Float[Tensor, "pair 3"],
+) -> Float[Tensor, "4 4"]:
+    """Solve for the small rotation, translation and change of scale about the mean.
+
+    The residual ``n . (p - q)`` changes by ``n . (w x p + t + s p)``, linear in w, t and s.
+    Those of the seven unknowns that the planes leave open stay zero.
+    """
+    centre = source.mean(dim=0)
+    size = _deviation(source)
+    local = (source - centre) / size
+    unit = normals / normals.norm(dim=1, keepdim=True).clamp_min(torch.finfo(normals.dtype).tiny)
+    gap = ((target - source) * unit).sum(dim=1) / size
+    rotation = torch.linalg.cross(local, unit)
+    grow = (local * unit).sum(dim=1, keepdim=True)
+    rows = torch.cat([rotation, unit, grow], dim=1)
+    solution = torch.linalg.pinv(rows.mT @ rows, rtol=_UNDETERMINED, hermitian=True) @ (
+        rows.mT @ gap
+    )
+    w, t, s = solution[:3], solution[3:6], solution[6]
+    zero = torch.zeros_like(s)
+    skew = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
+    linear = s.exp() * torch.linalg.matrix_exp(skew)
+    return rigid(linear, centre + size * t - linear @ centre)
+
+
+def _deviation(points: Float[Tensor, "point 3"]) -> float:
+    return float((points - points.mean(dim=0)).square().sum(dim=1).mean().sqrt())
+
+
+def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Cameras] | None:
+    """Return the cameras of the views that both have; ``None`` if there are none."""
+    if estimate.cameras is None or capture.cameras is None:
+        return None
+    try:
+        ours, truth = pair_views(estimate.names, capture.views.names)
+    except InputError:
+        return None
+    return estimate.cameras.take(ours.tolist()), capture.cameras.take(truth.tolist())
+
+
+def transfer(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
+    """Put a mesh in the frame of the truth by a similarity, in float64 on the CPU."""
+    mesh = mesh.to("cpu")
+    scale, rotation = split_similarity(truth_from_world)
+    normals, error = mesh.normals_world, mesh.expected_error
+    return mesh.replace(
+        vertices_world=transform(truth_from_world.cpu().double(), mesh.vertices_world.double()),
+        normals_world=None if normals is None else normals.double() @ rotation.cpu().double().mT,
+        expected_error=None if error is None else float(scale) * error.double(),
+    )

@@ -5,18 +5,19 @@
 scene in memory.
 """
 
-from pimper_torch.evidence.scenes.compositions import potato_on_table
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.frame import Frame, render_frame
-from pimper_torch.evidence.scenes.objects import RECIPES
-from pimper_torch.evidence.scenes.render import render_objects, render_shape
-from pimper_torch.evidence.scenes.rendered import RenderedScene
-from pimper_torch.evidence.scenes.scene import Scene, build_scene
+from pimper_torch.evidence.scenes.ray_tracing import Frame, Stage, render_frame
+from pimper_torch.evidence.scenes.render_in_memory import (
+    RenderedScene,
+    potato_on_table,
+    render_objects,
+    render_shape,
+)
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.sensor import SensorConfig
-from pimper_torch.evidence.scenes.sparse import sparse_scene
-from pimper_torch.evidence.scenes.stage import Stage
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.scenes.scene_objects import RECIPES
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig, SensorConfig
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
+from pimper_torch.evidence.scenes.whole_scene import Scene, build_scene
 
 SCENES = tuple(RECIPES)
 

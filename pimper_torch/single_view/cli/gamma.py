@@ -14,7 +14,10 @@ from pimper_torch.io.file_cautions import CONTRADICTED
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.reporting import stage
-from pimper_torch.single_view.factorization.gamma import GammaEstimate, gamma_of_photographs
+from pimper_torch.single_view.factorization.estimate_gamma import (
+    GammaEstimate,
+    gamma_of_photographs,
+)
 
 # A standard response whose residual is below this multiple of the best is recommended: a choice.
 _AS_GOOD = 1.05

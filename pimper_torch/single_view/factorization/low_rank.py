@@ -1,12 +1,96 @@
-"""Low-rank factorization of matrices with missing entries, as a problem for the solvers."""
+r"""Low-rank factorization of matrices with missing entries, as a problem for the solvers.
+
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
+albedo and normal alone. The set of these vectors determines the ambiguity of a factorization:
+
+=====================  ====  =============================  =====================
+light                  rank  :math:`s`                      ambiguity
+=====================  ====  =============================  =====================
+any low-rank matrix    any   any vector                     an invertible matrix
+a distant point light  3     :math:`\rho n`: any vector     an invertible 3 x 3
+first order            4     :math:`\rho (1, n)`            scaled Lorentz
+=====================  ====  =============================  =====================
+
+First order is :class:`pimper_torch.photometry.manifolds.Cone`.
+
+Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.single_view.factorization.manifolds import Free
+from pimper_torch.photometry.bilinear import Bilinear, Factors
+from pimper_torch.photometry.cone import tangents
+from pimper_torch.photometry.quadratics import outer
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import Record
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """Any vectors: low-rank factorization, and with rank three albedo times normal."""
+
+    rank: int = 3
+    flat: ClassVar[bool] = True
+
+    def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Return the nearest vector of the manifold: the vector itself."""
+        return shading
+
+    def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Return the end of the step: the manifold is linear."""
+        return shading
+
+    def curvature(
+        self,
+        shading: Float[Tensor, "*batch rank sample"],
+        slope: Float[Tensor, "*batch rank sample"],
+    ) -> Float[Tensor, "*batch sample rank rank"]:
+        """Return the manifold's part of second derivatives: flat, it has none."""
+        return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
+
+    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
+        """Span the space; with rank three by albedo, then by two rotations of the normal."""
+        if self.rank == 3:
+            _, normal = self.split(shading.mT)
+            return [column.mT for column in (normal, *tangents(normal))]
+        eye = torch.eye(self.rank, dtype=shading.dtype, device=shading.device)
+        return [axis[:, None].expand_as(shading) for axis in eye]
+
+    def split(
+        self, shading: Float[Tensor, "*batch rank"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Return albedo and unit normal of vectors of rank three."""
+        self._only_three()
+        length = shading.norm(dim=-1)
+        return length, shading / torch.where(length > 0, length, 1)[..., None]
+
+    def join(
+        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return the vectors of albedo and normal."""
+        self._only_three()
+        return albedo[..., None] * normals
+
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 6 sample"]:
+        r"""Return the penalty :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
+        self._only_three()
+        one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
+        unit = torch.stack([one, zero, zero, one, zero, one], dim=-2)
+        return unit - outer(normals)
+
+    def _only_three(self) -> None:
+        if self.rank != 3:
+            raise InputError(
+                f"vectors of rank {self.rank} have no albedo and normal; needed: rank 3."
+            )
 
 
 def low_rank_problem(
@@ -16,11 +100,8 @@ def low_rank_problem(
 ) -> Bilinear:
     r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
-    Rows are the problem's views, columns its samples: ``L`` becomes ``lights``, ``N``
-    ``shading``. They are unique at best up to one invertible matrix between them.
-
     Args:
-        matrix: ``X``; entries without weight are ignored.
+        matrix: ``X``, rows as views, columns as samples; entries without weight are ignored.
         weight: 0 where missing.
         start: Left factors of full rank.
 
@@ -91,3 +172,71 @@ def random_left(
 
 def _leading(filled: Float[Tensor, "batch row column"], rank: int) -> Float[Tensor, "..."]:
     return torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]
+
+
+# Residuals below this fraction of the data are zero but for rounding.
+_ROUNDING = 1e-6
+# Choices: the steps of a start, its tolerance, and the fraction by which residuals of the same
+# minimum differ.
+_STEPS, _TOLERANCE, _CLOSENESS = 300, 1e-9, 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Restarted(Record):
+    """The best of several factorizations of one matrix.
+
+    Attributes:
+        best: A batch of one, rows as views and columns as samples.
+        repeated: Whether ``repeats`` starts reached the best minimum; if not, there may well be a
+            better one.
+    """
+
+    best: Factors
+    residuals: Float[Tensor, " start"]
+    repeated: bool
+
+
+def factorize_from_many(
+    matrix: Float[Tensor, "row column"],
+    weight: Float[Tensor, "row column"],
+    rank: int,
+    generator: torch.Generator,
+    *,
+    repeats: int = 2,
+    max_starts: int = 50,
+) -> Restarted:
+    """Factorize a matrix with missing entries from random starts until the best repeats.
+
+    Args:
+        repeats: Number of starts that must end in the best minimum.
+
+    Raises:
+        InputError: ``max_starts`` below ``repeats``, or an invalid matrix, weight or rank.
+    """
+    if not 1 <= repeats <= max_starts:
+        raise InputError(
+            f"repeats is {repeats} and max_starts {max_starts}; needed: 1 <= repeats <= max_starts."
+        )
+    best: Factors | None = None
+    residuals: list[float] = []
+    repeated = False
+    seen = weight > 0
+    level = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
+    while len(residuals) < max_starts:
+        start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
+        problem = low_rank_problem(matrix[None], weight[None], start)
+        found = solve_variable_projection(problem, _STEPS, _TOLERANCE)
+        residuals.append(float(found.convergence.residual))
+        if best is None or residuals[-1] < float(best.convergence.residual):
+            best = found
+        # On exact data the residuals are rounding, and all differ.
+        same = max(min(residuals) * (1 + _CLOSENESS), _ROUNDING * level)
+        repeated = sum(one <= same for one in residuals) >= repeats
+        if repeated:
+            break
+    assert best is not None
+    return Restarted(
+        best=best,
+        residuals=torch.tensor(residuals, dtype=torch.float64),
+        repeated=repeated,
+    )

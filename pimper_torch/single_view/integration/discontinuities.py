@@ -22,14 +22,13 @@ components follow from the weights and are never fixed. Kinks and twists are our
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.linalg.multigrid import Iterate
-from pimper_torch.paper.poisson import differences, differences_transposed
+from pimper_torch.paper.integrate import differences, differences_transposed
 from pimper_torch.progress import report
 from pimper_torch.records import Convergence, Record, StopCause
-from pimper_torch.single_view.integration.rasters import Method, RasterSystem
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
 # Initial scale, in pixels, and the factor by which each iteration divides it: choices.
@@ -53,15 +52,10 @@ _TIE = 1e-4
 # Mean change of the weights at convergence, and linear systems at most.
 _CHANGE, _MAX_ITERATIONS = 5e-4, 40
 
-# Standard deviation of Gaussian noise over its median absolute value.
-_PER_MEDIAN = 1.4826
-
-Pair = tuple[Tensor, Tensor]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Continuity(Record):
-    """Which steps are continuous.
+    """The continuous steps.
 
     Attributes:
         right: Weight in [0, 1] of each step to the right: 1 continuous, 1e-4 rejected, 0
@@ -80,108 +74,65 @@ def find_discontinuities(
     weight_down: Float[Tensor, "steps_down width"],
     anchor: Float[Tensor, "height width"] | None,
     heights: Float[Tensor, "height width"] | None,
-    method: Method = "auto",
 ) -> Continuity:
-    """Find the continuous steps.
+    """Find the continuous steps; constant to autograd.
 
     Args:
         weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
         anchor: Of pixels whose unknown is given.
-
-    Constant to autograd.
     """
     with torch.no_grad():
-        inside = weight_right > 0, weight_down > 0
-        smooth = (
-            (steps.kink_right < _KINK) & (steps.twist_right < _TWIST),
-            (steps.kink_down < _KINK) & (steps.twist_down < _TWIST),
-        )
-        tested = (
-            steps.reliable_right & smooth[0] & inside[0],
-            steps.reliable_down & smooth[1] & inside[1],
-        )
-        fraction = (
-            torch.where(tested[0], 1.0, _TIE) * inside[0],
-            torch.where(tested[1], 1.0, _TIE) * inside[1],
-        )
+        height, width = steps.inside.shape
+        many = height * (width - 1)
+
+        def joined(right: Tensor, down: Tensor) -> Tensor:
+            return torch.cat([right.flatten(), down.flatten()])
+
+        def parts(values: Float[Tensor, " step"]) -> tuple[Tensor, Tensor]:
+            return values[:many].view(height, width - 1), values[many:].view(height - 1, width)
+
+        weight, target = joined(weight_right, weight_down), joined(*steps.target)
+        inside = weight > 0
+        tested = inside & joined(steps.reliable_right, steps.reliable_down)
+        tested &= joined(steps.kink_right, steps.kink_down) < _KINK
+        tested &= joined(steps.twist_right, steps.twist_down) < _TWIST
+        fraction = torch.where(tested, 1.0, _TIE) * inside
         solution = None
-        scale, narrowed, cause = _FIRST_SCALE, False, StopCause.LIMIT
+        scale, cause = _FIRST_SCALE, StopCause.LIMIT
         for taken in range(1, _MAX_ITERATIONS + 1):
-            weights = weight_right * fraction[0], weight_down * fraction[1]
+            weights = weight * fraction
             system = RasterSystem(
-                *weights, anchor, method=method, tolerance=_TOLERANCE, what="the integration"
+                *parts(weights), anchor, tolerance=_TOLERANCE, what="the integration"
             )
-            solution = _solved(system, steps, weights, anchor, heights, solution)
-            residuals = _residuals(steps, solution.values.reshape(steps.inside.shape))
-            smallest = _final_scale(residuals, tested)
+            source = differences_transposed(*parts(weights * target))
+            if anchor is not None and heights is not None:
+                source = source + anchor * heights
+            solution = system.solve_values(source, solution)
+            right, down = differences(solution)
+            residual = joined(
+                right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
+            )
+            deviation = 1.4826 * float(residual[tested].abs().median()) if tested.any() else 0.0
+            smallest = max(_SCALE_PX, _NOISE_SCALES * deviation)
             narrowed = scale <= smallest
             scale = max(scale, smallest)
+            geman_mcclure = (1 + (residual / scale).square()) ** -2
             before = fraction
-            fraction = (
-                _robust_weight(residuals[0], tested[0], inside[0], scale),
-                _robust_weight(residuals[1], tested[1], inside[1], scale),
-            )
+            fraction = torch.where(tested, geman_mcclure, 0).clamp_min(_TIE) * inside
             report(taken, _MAX_ITERATIONS)
-            if narrowed and _mean_change(before, fraction, inside) < _CHANGE:
+            change = float((fraction - before).abs().sum()) / max(1, int(inside.sum()))
+            if narrowed and change < _CHANGE:
                 cause = StopCause.CONVERGED
                 break
             scale = max(scale / _NARROWER, smallest)
+        square = (fraction * residual.square()).sum() / fraction.sum().clamp_min(1)
+        right, down = parts(fraction)
         return Continuity(
-            right=fraction[0],
-            down=fraction[1],
+            right=right,
+            down=down,
             convergence=Convergence(
                 iterations=torch.tensor([taken]),
-                residual=_deviation(residuals, fraction)[None],
+                residual=square.sqrt()[None],
                 cause=torch.tensor([int(cause)]),
             ),
         )
-
-
-def _solved(
-    system: RasterSystem,
-    steps: Steps,
-    weights: Pair,
-    anchor: Tensor | None,
-    heights: Tensor | None,
-    start: Iterate | None,
-) -> Iterate:
-    target = steps.target
-    source = differences_transposed(weights[0] * target[0], weights[1] * target[1])
-    if anchor is not None and heights is not None:
-        source = source + anchor * heights
-    return system.iterate(source, None if start is None else start.values.reshape(source.shape))
-
-
-def _residuals(steps: Steps, found: Float[Tensor, "height width"]) -> Pair:
-    """Return the residuals of the steps, in widths of a pixel."""
-    right, down = differences(found)
-    return right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
-
-
-def _robust_weight(
-    residual: Float[Tensor, "row column"],
-    tested: Bool[Tensor, "row column"],
-    inside: Bool[Tensor, "row column"],
-    scale: float,
-) -> Float[Tensor, "row column"]:
-    """Return each step's robust weight."""
-    geman_mcclure = (1 + (residual / scale).square()) ** -2
-    return torch.where(tested, geman_mcclure, 0).clamp_min(_TIE) * inside
-
-
-def _final_scale(residuals: Pair, tested: tuple[Tensor, Tensor]) -> float:
-    some = torch.cat([residuals[0][tested[0]], residuals[1][tested[1]]])
-    deviation = _PER_MEDIAN * float(some.abs().median()) if len(some) else 0.0
-    return max(_SCALE_PX, _NOISE_SCALES * deviation)
-
-
-def _mean_change(before: Pair, after: Pair, inside: tuple[Tensor, Tensor]) -> float:
-    moved = (after[0] - before[0]).abs().sum() + (after[1] - before[1]).abs().sum()
-    return float(moved) / max(1, int(inside[0].sum()) + int(inside[1].sum()))
-
-
-def _deviation(residuals: Pair, fraction: Pair) -> Float[Tensor, ""]:
-    square = (fraction[0] * residuals[0].square()).sum() + (
-        fraction[1] * residuals[1].square()
-    ).sum()
-    return (square / (fraction[0].sum() + fraction[1].sum()).clamp_min(1)).sqrt()

@@ -18,8 +18,7 @@ from pimper_torch.single_view.integration.discontinuities import (
     Continuity,
     find_discontinuities,
 )
-from pimper_torch.single_view.integration.rasters import Method as Solver
-from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
 Raster = Tensor | np.ndarray
@@ -39,11 +38,10 @@ class IntegratedMap(Record):
     """A surface over a raster.
 
     Attributes:
-        depth: Along z; 0 outside. Each component of the mask without known depth is determined
-            up to a factor under a pinhole, its geometric mean being 1, and up to a constant
-            under parallel rays, its mean being 0.
+        depth: Along z; 0 outside. A component of the mask without known depth has the geometric
+            mean 1 under a pinhole, and the mean 0 under parallel rays.
         valid: True where a normal was used; the mask's other pixels are interpolated.
-        continuity: Which steps between pixels are continuous; ``None`` where all are.
+        continuity: The continuous steps between pixels; ``None`` where all are.
     """
 
     depth: Float[Tensor, "height width"]
@@ -61,7 +59,6 @@ def integrate_normal_map(
     known_depth: Raster | None = None,
     known_weight: Raster | None = None,
     method: Integration = "discontinuities",
-    solver: Solver = "auto",
 ) -> IntegratedMap:
     """Integrate a normal map to depth.
 
@@ -76,72 +73,40 @@ def integrate_normal_map(
         weight: Of each normal; 1 if not given, 0 like not finite.
         known_depth: Depth at some pixels, NaN at the others.
         known_weight: Of the known depths, in units of that of one normal; 1 if not given.
-        method: ``"discontinuities"`` preserves depth discontinuities; see
-            :mod:`.discontinuities`. ``"weighted"`` is least squares.
-        solver: Of the linear systems: ``"cholesky"``, ``"multigrid"`` or ``"auto"``.
+        method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
+            squares.
 
     Raises:
-        InputError: Shapes that differ, a mask without pixels, weights that are negative,
-            normals of another convention: coded as colours, or with z to the viewer.
+        InputError: Unusable rasters, or normals coded as colours or with z to the viewer.
 
     Warns:
         PimperWarning: Normals that are integrable only with y negated.
 
-    Differentiable in normals, weights and known depths, by one more solve; which steps are
-    continuous is constant.
+    Differentiable in normals, weights and known depths; which steps are continuous is constant.
 
     >>> up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 5, 3)
     >>> float(integrate_normal_map(up).depth.abs().max())
     0.0
     """
     normals = torch.as_tensor(normals)
-    mask, weight = _tensor(mask), _tensor(weight)
-    known_depth, known_weight = _tensor(known_depth), _tensor(known_weight)
+    mask, weight, known_depth, known_weight = (
+        None if raster is None else torch.as_tensor(raster)
+        for raster in (mask, weight, known_depth, known_weight)
+    )
     _refuse(normals, mask, weight, known_depth, known_weight, spacing)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
     _refuse_convention(normals, mask)
-    return _integrated(
-        normals,
-        mask,
-        intrinsics,
-        spacing,
-        weight,
-        known_depth,
-        known_weight,
-        method,
-        solver,
+    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
+    if intrinsics is not None:
+        intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
+    mask = mask[box]  # the box of the mask, to save time and memory
+    weight, known_depth, known_weight = (
+        None if raster is None else raster[box] for raster in (weight, known_depth, known_weight)
     )
-
-
-def _integrated(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"] | None,
-    spacing: tuple[float, float],
-    weight: Float[Tensor, "height width"] | None,
-    known_depth: Float[Tensor, "height width"] | None,
-    known_weight: Float[Tensor, "height width"] | None,
-    method: Integration,
-    solver: Solver,
-) -> IntegratedMap:
-    box = _box(mask)
-    if mask[box].shape != mask.shape:
-        part = _integrated(
-            normals[box],
-            mask[box],
-            None
-            if intrinsics is None
-            else crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start)),
-            spacing,
-            None if weight is None else weight[box],
-            None if known_depth is None else known_depth[box],
-            None if known_weight is None else known_weight[box],
-            method,
-            solver,
-        )
-        return _placed(part, box, *mask.shape)
-    unit = _usable(normals, mask, weight)
+    unit = _usable(normals[box], mask, weight)
     if intrinsics is None:
         steps = orthographic_steps(unit, mask, spacing)
     else:
@@ -150,34 +115,18 @@ def _integrated(
     anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
-        continuity = find_discontinuities(steps, *weights, anchor, unknown, solver)
+        continuity = find_discontinuities(steps, *weights, anchor, unknown)
         weights = weights[0] * continuity.right, weights[1] * continuity.down
-    system = RasterSystem(*weights, anchor, method=solver, what="the integration")
-    found = system.fit_steps(*steps.target, unknown)
-    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
-    return IntegratedMap(depth=depth.to(normals), valid=steps.valid & mask, continuity=continuity)
-
-
-Box = tuple[slice, slice]
-
-
-def _box(mask: Bool[Tensor, "height width"]) -> Box:
-    """Return the bounding rows and columns of the mask, to save time and memory."""
-    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _placed(part: IntegratedMap, box: Box, height: int, width: int) -> IntegratedMap:
-    """Pad the result of a box to the full raster."""
-    rows, columns = box
-    frame = (columns.start, width - columns.stop, rows.start, height - rows.stop)
-    continuity = part.continuity
-    if continuity is not None:
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
+    system = RasterSystem(*weights, anchor, what="the integration")
+    found = system.fit_steps(*steps.target, unknown)
+    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(
-        depth=pad(part.depth, frame), valid=pad(part.valid, frame), continuity=continuity
+        depth=pad(depth.to(normals), frame),
+        valid=pad(steps.valid & mask, frame),
+        continuity=continuity,
     )
 
 
@@ -231,10 +180,6 @@ def _known(
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
     return strength / (steps.unit_right * steps.unit_down), unknown
-
-
-def _tensor(values: Raster | None) -> Tensor | None:
-    return None if values is None else torch.as_tensor(values)
 
 
 def _refuse_convention(

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.paper.filling import fill_smoothly
+from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
 # Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.
@@ -37,16 +37,14 @@ class Steps(Record):
     """Target differences between neighbouring pixels, in units of ``unit_right, unit_down``.
 
     Attributes:
-        slopes: At every pixel of the raster, right and down; inpainted where not valid.
-        right: From each pixel to the next in its row; 0 outside.
-        down: From each pixel to that below.
+        slopes: At every pixel, right and down; inpainted where not valid.
         reliable_right: True where both pixels are inside and their normals are usable.
         kink_right: Change of the slope along the step, less that of the steps before and after:
-            0 on a smooth surface, the size of the kink at a crease or a depth discontinuity.
-        twist_right: Likewise of the slope across the step, which changes at a depth
-            discontinuity: sides of different slope meet in one point at most.
+            0 on a smooth surface.
+        twist_right: Likewise of the slope across the step, at depth discontinuities: sides of
+            different slope meet in one point at most.
         unit_right: Change of the unknown on a step of slope 1.
-        valid: Those of them with a usable normal.
+        valid: Pixels with a usable normal.
     """
 
     slopes: Float[Tensor, "height width 2"]
@@ -76,14 +74,12 @@ def orthographic_steps(
     mask: Bool[Tensor, "height width"],
     spacing: tuple[float, float] = (1.0, 1.0),
 ) -> Steps:
-    """Return the steps of depth under parallel rays.
+    """Return the steps of depth under parallel rays, differentiable in the normals.
 
     Args:
-        normals: Unit, ``n_z < 0``; where they are not finite or face away, inside the mask,
-            slopes are inpainted and the steps not reliable.
+        normals: Unit, ``n_z < 0``; where they are not finite or face away, slopes are inpainted
+            and the steps not reliable.
         spacing: Distance of neighbouring pixels in a row and in a column.
-
-    Differentiable in the normals. Fourth order in the spacing where the surface is smooth.
     """
     known = normals.isfinite().all(dim=-1)
     valid = mask & known & (normals[..., 2] < -_GRAZING)
@@ -107,7 +103,6 @@ def perspective_steps(
 
     Args:
         normals: As for :func:`orthographic_steps`, in the camera's frame.
-        intrinsics: Without skew.
 
     Source: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung, Discontinuity-aware normal
     integration for generic central camera models, 2025, for the planes that meet.

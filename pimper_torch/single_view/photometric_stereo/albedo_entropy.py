@@ -1,7 +1,9 @@
-r"""Bas-relief resolved by minimum entropy of albedo.
+r"""Bas-relief resolved by minimum entropy of albedo, within groups of one chromaticity.
 
 A wrong transformation makes the albedo of a region of one paint vary with its normals. The right
-one minimizes the entropy of the histogram of albedo.
+one minimizes the entropy of the histogram of albedo. A Lambertian pixel's channels differ by albedo
+and by the point light's colour alone: in logarithm :math:`\log J_{vci} = s_{vi} + e_{vc} + a_{ci}`,
+with ``e`` the colour of the light of view v and ``a`` that of pixel i.
 
 Source: Alldrin, Mallick & Kriegman, Resolving the generalized bas-relief ambiguity by entropy
 minimization, CVPR 2007.
@@ -10,16 +12,102 @@ minimization, CVPR 2007.
 import itertools
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.factors import (
+from pimper_torch.single_view.factorization.bas_relief import (
+    BasRelief,
     cast,
     require_standard,
     usable_pixels,
 )
+
+# Channels darker than this fraction of a photograph's brightest value are ignored: a choice.
+_DARK = 0.02
+# Alternations between lights and pixels: a choice; each at least halves the residual where point
+# lights overlap.
+_ALTERNATIONS = 20
+# Pixels that are clustered; all are then assigned: a choice.
+_CLUSTERED = 2000
+
+
+def chromaticities(
+    images: Float[Tensor, "view channel height width"], mask: Bool[Tensor, "height width"]
+) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
+    """Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
+
+    Weighted least squares for ``e`` and ``a`` in turn, weights the square of brightness.
+
+    Returns:
+        Colours whose sum over channels is zero, up to one colour that all pixels share; and
+        whether a pixel has one: bright enough in all channels of some view.
+    """
+    values = images[:, :, mask].double()
+    brightest = values.flatten(1).amax(dim=1)[:, None]
+    bright = values.amin(dim=1) > _DARK * brightest
+    log = torch.where(bright[:, None], values, 1).log()
+    log = log - log.mean(dim=1, keepdim=True)
+    # Harmonic: the darkest channel has the noisiest logarithm.
+    inverse = torch.where(bright[:, None], values, 1).pow(-2).sum(dim=1)
+    weight = (bright / inverse)[:, None]
+    total_view = weight.sum(dim=2).clamp_min(1e-30)
+    total_pixel = weight.sum(dim=0).clamp_min(1e-30)
+    point_light = torch.zeros_like(log[:, :, 0])
+    pixel = torch.zeros_like(log[0])
+    for _ in range(_ALTERNATIONS):
+        pixel = (weight * (log - point_light[..., None])).sum(dim=0) / total_pixel
+        point_light = (weight * (log - pixel)).sum(dim=2) / total_view
+    return pixel.to(images), bright.any(dim=0)
+
+
+def chromaticity_groups(
+    images: Float[Tensor, "view channel height width"],
+    mask: Bool[Tensor, "height width"],
+    *,
+    radius: float = 0.05,
+    smallest: float = 0.01,
+) -> Int[Tensor, " pixel"]:
+    """Cluster pixels of similar chromaticity.
+
+    The colour with the most neighbours becomes the first cluster, its neighbours are removed, and
+    so on; then every pixel is assigned to the nearest cluster within the radius.
+
+    Args:
+        images: Linear radiance, of two channels or more.
+        radius: In logarithm of colour; a few times its noise, less than half the distance of
+            different paints.
+        smallest: Groups with less than this fraction of the pixels are dropped.
+
+    Returns:
+        Labels of the pixels in raster order, the largest group's 0; -1 for pixels in no group.
+    """
+    if images.shape[1] < 2:
+        raise InputError(
+            f"images have {images.shape[1]} channel; needed: two at least, pixels of one paint "
+            "are grouped by colour. Use another method for grey images."
+        )
+    colour, known = chromaticities(images, mask)
+    labels = torch.full_like(known, -1, dtype=torch.int64)
+    if not bool(known.any()):
+        raise InputError("no pixel inside the mask is bright in all channels; needed: some.")
+    colour = colour[:, known].mT.double().contiguous()
+    sample = colour[:: -(-len(colour) // _CLUSTERED)]
+    neighbours = torch.cdist(sample, sample) < radius
+    remaining = torch.ones(len(sample), dtype=torch.bool, device=sample.device)
+    leaders = []
+    while bool(remaining.any()):
+        votes = (neighbours & remaining).sum(dim=1) * remaining
+        best = int(votes.argmax())
+        if int(votes[best]) < max(2, smallest * len(sample)):
+            break
+        leaders.append(sample[neighbours[best] & remaining].mean(dim=0))
+        remaining = remaining & ((sample - leaders[-1]).norm(dim=1) > 2 * radius)
+    if leaders:
+        distance, nearest = torch.cdist(colour, torch.stack(leaders)).min(dim=1)
+        labels[known] = torch.where(distance < radius, nearest, -1)
+    return labels
+
 
 # Range and size of the grid of lambda and of tilts. In the standard form a ball cut at 75 degrees
 # has lambda 0.9 and a surface with slopes of 0.15 has 0.15; mean slopes are rarely above one.
@@ -44,33 +132,24 @@ def resolve_by_albedo_entropy(
     width: float = 0.015,
     max_pixels: int = 20_000,
 ) -> BasRelief:
-    r"""Find the bas-relief transformation of minimum albedo entropy.
+    r"""Find the bas-relief transformation of minimum albedo entropy; constant to autograd.
 
-    Minimizes the entropy of :math:`\log \lVert G b \rVert`, which is invariant to the scale of
-    albedo, smoothed by a kernel: first on a grid in the standard form of the surface
-    (:func:`.standard_relief`), then, from its best points, by a local search whose steps are
-    halved as the kernel narrows.
+    Minimizes the entropy of :math:`\log \lVert G b \rVert`, smoothed by a kernel: first on a grid
+    in the standard form of the surface (:func:`.standard_relief`), then, from its best points, by a
+    local search whose steps are halved as the kernel narrows.
 
     Args:
         shading: Albedo times normal, right up to a bas-relief transformation; vectors that are
             zero or not finite are left out.
-        groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`). The entropy of colour
-            albedo is that of chromaticity, which is invariant, plus that of brightness within
-            each group, which is minimized. Without it all are one group.
+        groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`), within which the
+            entropy of brightness is minimized; by default all are one group.
         width: Of the last kernel, as a fraction of albedo; about the noise of shading.
-        max_pixels: Evenly chosen from more.
 
-    Returns:
-        The transformation with lambda above zero: convex stays convex. Constant to autograd.
-
-    Fails where the surface has as many albedos as pixels, or so few different normals that the
-    entropy hardly depends on the transformation; precise to the kernel's width.
-
-    Raises:
-        InputError: Fewer than 50 vectors, or all parallel.
+    Fails where the surface has as many albedos as pixels, or few different normals. Convex stays
+    convex.
 
     Source: Alldrin, Mallick & Kriegman, CVPR 2007. The logarithm, which replaces their fixed
-    scale, the standard form and the reading of colour are ours.
+    scale, the standard form and the use of colour are ours.
     """
     with torch.no_grad():
         usable = usable_pixels(shading)
@@ -98,7 +177,6 @@ def albedo_entropy(
     """Return the entropy of log-albedo within groups after each transformation.
 
     Args:
-        shading: Albedo times normal.
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """

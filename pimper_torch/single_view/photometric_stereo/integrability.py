@@ -42,7 +42,6 @@ class Curls(Record):
 
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
-        down: ``s ^ ds/dy``.
         noise: Covariance of ``across``, and of ``down``, from the noise of the pseudo-normals;
             up to a factor.
     """
@@ -92,9 +91,7 @@ def curls(
 
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
-        weight: Of the pixels; 0 leaves one out.
-        noise: Covariance of ``s``, up to a factor; by default noise is white, as after a singular
-            value decomposition.
+        noise: Covariance of ``s``, up to a factor; by default white.
     """
     s, w = pseudo.double(), weight.double()
     moment = (w * s) @ s.mT
@@ -145,24 +142,16 @@ def integrable(
     mask: Bool[Tensor, "height width"],
     noise: Float[Tensor, "3 3"] | None = None,
 ) -> Integrable:
-    r"""Find the matrix that makes pseudo-normals the normals of a surface.
+    """Find the matrix that makes pseudo-normals the normals of a surface.
 
     The six unknowns are the least generalised eigenvector of the equations' squares against
-    those of noise alone (total least squares), so that they do not depend on the basis of ``s``;
-    equations get Cauchy's weights, as they do not hold across depth edges. The remaining
-    bas-relief transformation is set by orthogonal rows, arbitrarily: see :mod:`.relief`. The
-    third component of most normals is negative.
-
-    Args:
-        pseudo: ``s`` of the pixels inside the mask, in raster order.
-        weight: Of the pixels; 0 leaves one out.
-        noise: Covariance of ``s``; see :func:`curls`.
+    those of noise alone (total least squares); equations get Cauchy's weights, as they do not hold
+    across depth edges. The remaining bas-relief transformation is set by orthogonal rows. The third
+    component of most normals is negative. Constant to autograd.
 
     Raises:
         InputError: Fewer than six equations, or a surface (a plane, a cylinder) that
             satisfies them with more than one matrix.
-
-    Constant to autograd.
 
     Source: Yuille & Snow, CVPR 1997; the noise model, the averaging and the weights are ours.
     """

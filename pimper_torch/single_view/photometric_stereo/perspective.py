@@ -22,7 +22,7 @@ from torch.nn.functional import conv2d, pad
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.single_view.photometric_stereo.factorization import factorize_photographs
+from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
 # Minimum number of equations, for nine unknowns up to scale: a choice.
 _FEWEST = 50
@@ -39,7 +39,7 @@ def factorize_in_perspective(
     *,
     radius: int = 3,
 ) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "view 3"]]:
-    r"""Estimate albedo times normal and the lights from photographs of one viewpoint.
+    """Estimate albedo times normal and the lights from photographs of one viewpoint.
 
     The images, channels added, are factorized to rank three; the integrability of the normalized
     vectors gives the matrix between the factors. Derivatives are those of cubics fitted to
@@ -47,28 +47,18 @@ def factorize_in_perspective(
     equations' moments against those of noise alone.
 
     Args:
-        images: Linear radiance.
         mask: True on the surface, without depth discontinuities.
         intrinsics: Pinhole K in pixels, centre of the top-left pixel at (0.5, 0.5).
-        seen: False for missing values, shadows and highlights, pixels in raster order; by default
-            all are seen.
+        seen: False for missing values, shadows and highlights, pixels in raster order.
         radius: Of the squares, which lie inside the mask.
 
     Returns:
-        Shading and lights in the camera frame, unique up to one factor between them, which is set
-        so that the lights' root mean square is 1. The sign is that of normals facing the viewer;
-        convex and concave are distinguished. Pixels seen in fewer than three views have the
-        vector zero. Constant to autograd.
+        Shading and lights in the camera frame, unique up to one factor between them: the lights'
+        root mean square is 1. Pixels seen in fewer than three views have the vector zero. Constant
+        to autograd.
 
-    Fails where the field of view is small: the error is proportional to its inverse. The result
-    is then right up to a bas-relief transformation, and the methods that resolve it apply. On a
-    ball, as on some other surfaces, the images do not determine the result; this is detected with
-    noise, but may not be without.
-
-    Raises:
-        InputError: Fewer than three views, ``seen`` or intrinsics that do not fit, three pixels
-            or fewer seen in four views, fewer than 50 squares inside the mask, or a second
-            surface that explains the images.
+    The error is proportional to the inverse of the field of view. On a ball, as on some other
+    surfaces, the images do not determine the result; this is detected with noise alone.
 
     Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, normalization and
     the noise model are ours.

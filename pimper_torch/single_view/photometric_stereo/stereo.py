@@ -9,10 +9,34 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.methods import METHODS, Method
-from pimper_torch.single_view.photometric_stereo.problem import Problem, Solution
-from pimper_torch.single_view.photometric_stereo.regression import determined
+from pimper_torch.single_view.factorization.bas_relief import (
+    BasRelief,
+    convex,
+    relief_from_albedo,
+    relief_from_strength,
+    rounded_relief,
+)
+from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
+    chromaticity_groups,
+    resolve_by_albedo_entropy,
+)
+from pimper_torch.single_view.photometric_stereo.integrability import integrable
+from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
+from pimper_torch.single_view.photometric_stereo.regress_lights import (
+    Factored,
+    calibrated_stereo,
+    chromatic_albedo,
+    determined,
+    factorize_photographs,
+)
+
+# Each method with the resolvers of its bas-relief ambiguity; "rounded" is a convention. Entropy is
+# the default: nearest to known lights on the rendered objects (benchmarks/photometric_stereo.py).
+METHODS: dict[str, tuple[str, ...]] = {
+    "calibrated": (),
+    "integrability": ("albedo_entropy", "rounded", "equal_albedo", "equal_strength"),
+    "perspective": (),
+}
 
 
 class Finding(IntEnum):
@@ -31,12 +55,10 @@ class PhotometricStereo(Record):
     """Normals, albedo and lights of one viewpoint.
 
     Attributes:
-        normals: Unit, camera frame: x right, y down, z forward, ``n_z < 0`` where valid. Where
-            not valid, an estimate or zero.
-        albedo: Of each colour, not negative. With unknown lights up to one factor, such that
-            lights have the median length 1.
-        lights: One row a view: direction to the point light times its irradiance; zero for a
-            view without samples.
+        normals: Unit, camera frame; where not valid, an estimate or zero.
+        albedo: Not negative. With unknown lights up to one factor, such that lights have the median
+            length 1.
+        lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
         finding: A :class:`Finding` for each pixel.
@@ -77,25 +99,20 @@ def photometric_stereo(
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ==================  ==========================================  =================
 
-    ``resolve`` is ``rounded`` (a convention: upright on average, as deep as a ball),
-    ``equal_albedo``, ``equal_strength``, or ``albedo_entropy`` (few albedos).
+    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_albedo``, ``equal_strength``, or
+    ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
-        mask: True on the object; of the size of the images.
-        resolve: For ``integrability``, by default ``albedo_entropy``; others have nothing to
-            resolve.
-        lights: For ``calibrated``, one a view: direction to the point light times its irradiance,
-            camera frame.
+        mask: True on the object.
+        lights: For ``calibrated``: direction to the point light times its irradiance, camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         robust: Whether shadows and highlights lose weight.
 
     Raises:
-        InputError: Unknown names, shapes that do not match, an empty mask, fewer views with
-            samples than unknowns, lights that are missing, not needed or in a plane; or input
-            that the method refuses.
+        InputError: Input that the method cannot use.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
@@ -108,36 +125,119 @@ def photometric_stereo(
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
     _refuse_shapes(images, mask, lights, weight)
-    chosen = METHODS[method]
-    _refuse_settings(method, chosen, resolve, lights, intrinsics)
+    _refuse_settings(method, resolve, lights, intrinsics)
     with torch.no_grad():
         given = images.new_ones(len(images), *mask.shape) if weight is None else weight
         samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
         used = (heavy > 0).any(dim=1)
-        _refuse_few(int(used.sum()), method)
-        problem = Problem(
-            images=images[used],
-            radiance=torch.where((heavy > 0)[:, None], samples, 0).double()[used],
-            weight=heavy[used],
-            mask=mask,
-            lights=None if lights is None else lights[used].double(),
-            intrinsics=None if intrinsics is None else intrinsics.double(),
-            robust=robust,
-        )
-        if problem.lights is not None:
-            _refuse_plane(problem.lights)
-        by = resolve or (chosen.resolvers[0] if chosen.resolvers else "")
-        found = chosen.solve(problem, by)
-        return _spread_out(found, problem, used, like=images)
+        if int(used.sum()) < 3:
+            raise InputError(
+                f"{method}: {int(used.sum())} photographs have samples inside the mask; needed: 3 "
+                "or more, one for each unknown of a pixel. Add photographs."
+            )
+        heavy = heavy[used]
+        radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
+        if lights is not None:
+            own = lights[used].double()
+            _refuse_plane(own)
+            known = calibrated_stereo(radiance, heavy, own, robust=robust)
+            found = _Solution(
+                normals=known.normals, albedo=known.albedo, lights=own, weight=known.weight
+            )
+        elif intrinsics is not None:
+            whole = torch.zeros_like(images[used], dtype=torch.float64)
+            whole[:, :, mask] = radiance
+            shading, own = factorize_in_perspective(whole, mask, intrinsics.double(), heavy > 0)
+            factors = Factored(lights=own.double(), shading=shading.double(), weight=heavy)
+            found = _lambertian(radiance, factors, None, _FACTOR)
+        else:
+            by = resolve or METHODS[method][0]
+            found = _integrable(radiance, heavy, mask, by, robust)
+        return _spread_out(found, heavy, mask, used, like=images)
+
+
+_FACTOR = "a factor between albedo and light"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Solution(Record):
+    """Output of a method, for the pixels inside the mask in raster order, in float64."""
+
+    normals: Float[Tensor, "3 pixel"]
+    albedo: Float[Tensor, "channel pixel"]
+    lights: Float[Tensor, "view 3"]
+    weight: Float[Tensor, "view pixel"]
+    applied: BasRelief | None = None
+    free: str = "nothing"
+
+
+def _integrable(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    resolve: str,
+    robust: bool,
+) -> _Solution:
+    """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
+    factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
+    enough, spanned = determined(factors.weight, factors.lights)
+    total = factors.weight.sum(dim=0)
+    reliability = torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
+    matrix = integrable(factors.shading, reliability, mask).matrix
+    shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
+    if resolve == "rounded":
+        relief = rounded_relief(shading, reliability, mask)
+    elif resolve == "equal_albedo":
+        relief = relief_from_albedo(shading, reliability, mask)
+    elif resolve == "equal_strength":
+        relief = relief_from_strength(lights, shading, reliability, mask)
+    else:
+        used, inside = reliability > 0, torch.zeros_like(mask)
+        inside[mask] = used
+        images = radiance.new_zeros(*radiance.shape[:2], *mask.shape)
+        images[:, :, mask] = radiance
+        groups = chromaticity_groups(images, inside) if images.shape[1] > 1 else None
+        relief = resolve_by_albedo_entropy(shading[:, used], groups)
+        relief = convex(relief, shading, reliability, mask)
+    moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
+    free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
+    return _lambertian(radiance, moved, relief, free)
+
+
+def _lambertian(
+    radiance: Float[Tensor, "view channel pixel"],
+    factors: Factored,
+    applied: BasRelief | None,
+    free: str,
+) -> _Solution:
+    """Return normals and the albedo of each colour, under lights of the median length 1."""
+    size = factors.shading.norm(dim=0)
+    normals = factors.shading / torch.where(size > 0, size, 1)
+    shade = (factors.lights @ normals).clamp_min(0)
+    albedo = chromatic_albedo(radiance, factors.weight, shade)
+    length = factors.lights.norm(dim=1)
+    shining = length[length > 0]
+    factor = shining.median() if len(shining) else length.new_ones(())
+    return _Solution(
+        normals=normals,
+        albedo=albedo * factor,
+        lights=factors.lights / factor,
+        weight=factors.weight,
+        applied=applied,
+        free=free,
+    )
 
 
 def _spread_out(
-    found: Solution, given: Problem, used: Bool[Tensor, " view"], like: Tensor
+    found: _Solution,
+    given: Float[Tensor, "view pixel"],
+    mask: Bool[Tensor, "height width"],
+    used: Bool[Tensor, " view"],
+    like: Tensor,
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
-    mask = given.mask
     enough, spanned = determined(found.weight, found.lights)
     finding = torch.full_like(spanned, int(Finding.FOUND), dtype=torch.long)
     checks = [
@@ -156,7 +256,7 @@ def _spread_out(
     albedo[mask] = found.albedo.mT.to(like)
     lit = torch.zeros(len(used), *mask.shape, dtype=torch.bool, device=mask.device)
     agreeing = lit[used]
-    agreeing[:, mask] = (given.weight > 0) & (found.weight >= 0.5 * given.weight)
+    agreeing[:, mask] = (given > 0) & (found.weight >= 0.5 * given)
     lit[used] = agreeing
     lights = like.new_zeros(len(used), found.lights.shape[1])
     lights[used] = found.lights.to(like)
@@ -201,31 +301,19 @@ def _refuse_shapes(
 
 
 def _refuse_settings(
-    name: str,
-    method: Method,
-    resolve: str | None,
-    lights: Tensor | None,
-    intrinsics: Tensor | None,
+    method: str, resolve: str | None, lights: Tensor | None, intrinsics: Tensor | None
 ) -> None:
-    if method.calibrated and lights is None:
-        raise InputError(f"{name}: there are no lights; needed: one direction a photograph.")
-    if not method.calibrated and lights is not None:
-        raise InputError(f"{name}: finds the lights itself. Leave them out, or use calibrated.")
-    if method.perspective and intrinsics is None:
-        raise InputError(f"{name}: there are no intrinsics; needed: those of the camera.")
-    if not method.perspective and intrinsics is not None:
-        raise InputError(f"{name}: is orthographic. Leave intrinsics out.")
-    if resolve is not None and resolve not in method.resolvers:
+    if method == "calibrated" and lights is None:
+        raise InputError(f"{method}: there are no lights; needed: one direction a photograph.")
+    if method != "calibrated" and lights is not None:
+        raise InputError(f"{method}: finds the lights itself. Leave them out, or use calibrated.")
+    if method == "perspective" and intrinsics is None:
+        raise InputError(f"{method}: there are no intrinsics; needed: those of the camera.")
+    if method != "perspective" and intrinsics is not None:
+        raise InputError(f"{method}: is orthographic. Leave intrinsics out.")
+    if resolve is not None and resolve not in METHODS[method]:
         raise InputError(
-            f"{name}: resolve is {resolve!r}; needed: {', '.join(method.resolvers) or 'none'}."
-        )
-
-
-def _refuse_few(views: int, method: str) -> None:
-    if views < 3:
-        raise InputError(
-            f"{method}: {views} photographs have samples inside the mask; needed: 3 or more, one "
-            "for each unknown of a pixel. Add photographs."
+            f"{method}: resolve is {resolve!r}; needed: {', '.join(METHODS[method]) or 'none'}."
         )
 
 

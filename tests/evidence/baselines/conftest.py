@@ -6,10 +6,10 @@ from comparison import compare_in_view
 from reliefs import WavyPlane
 
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.noise import random_speckle, random_waves
-from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle, random_waves
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 
 SPHERE = Sphere()

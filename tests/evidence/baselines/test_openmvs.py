@@ -50,12 +50,9 @@ PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMe
 
 @pytest.fixture(autouse=True)
 def _no_openmvs(monkeypatch, tmp_path):
-    from pimper_torch.evidence.baselines import openmvs
-
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("PIMPER_OPENMVS", raising=False)
-    assert all(folder.is_absolute() for folder in openmvs.INTERFACE.folders)
 
 
 @pytest.fixture

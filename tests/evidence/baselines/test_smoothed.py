@@ -2,13 +2,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.evidence.baselines.smoothed import Smoothed, SmoothedConfig
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.evidence.baselines.smoothed import Smoothed
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 
 
-def few(**settings):
-    return Smoothed(SmoothedConfig(num_vertices=3000, **settings))
+@pytest.fixture(autouse=True)
+def _few(monkeypatch):
+    monkeypatch.setattr(f"{Smoothed.__module__}._NUM_VERTICES", 3000)
 
 
 @pytest.mark.parametrize("shape", ["sphere", "bumps"])
@@ -17,7 +18,7 @@ def test_the_smooth_surface_is_nearer_to_the_truth_than_the_facets(
 ):
     truth, scene, coarse = photographed(request.getfixturevalue(shape))
     facets = compared(coarse.mesh.replace(normals_world=None), truth, coarse)
-    smooth = compared(few()(scene, coarse).mesh, truth, coarse)
+    smooth = compared(Smoothed()(scene, coarse).mesh, truth, coarse)
     assert smooth.relative_error < 0.75 * facets.relative_error  # measured 0.41 and 0.66
     assert smooth.median_angle_deg < 0.85 * facets.median_angle_deg  # 0.79 and 0.45
     assert smooth.coverage > facets.coverage - 0.01
@@ -27,7 +28,7 @@ def test_a_flat_mesh_stays_where_it_is(photographed, sphere):
     _, scene, coarse = photographed(sphere)
     flat = coarse.mesh.vertices_world @ torch.diag(torch.tensor([1.0, 1.0, 0.0]))
     level = coarse.replace(mesh=coarse.mesh.replace(vertices_world=flat))
-    found = few()(scene, level).mesh
+    found = Smoothed()(scene, level).mesh
     assert found.vertices_world[:, 2].abs().max() < 1e-5
     low, high = flat[coarse.mesh.faces.unique()].aminmax(dim=0)
     assert_close(found.vertices_world.amin(dim=0), low, atol=0.02, rtol=0)  # only corners round
@@ -43,30 +44,26 @@ def test_a_closed_mesh_is_smoothed_too_and_becomes_rounder(photographed, sphere)
         covariance_world=None,
         points=None,
     )
-    found = few()(scene, ball).mesh
+    found = Smoothed()(scene, ball).mesh
     corners = vertices[faces]
     facets_miss = (corners.mean(dim=1).norm(dim=-1) - 1).abs().mean()
     assert (found.vertices_world.norm(dim=-1) - 1).abs().mean() < 0.3 * facets_miss
     assert (found.normals_world * found.vertices_world).sum(dim=-1).min() > 0.95  # outward
 
 
-def test_more_fidelity_passes_closer_to_the_points(photographed, bumps):
+def test_more_fidelity_passes_closer_to_the_points(photographed, bumps, monkeypatch):
     _, scene, coarse = photographed(bumps)
     points = coarse.mesh.vertices_world[coarse.mesh.faces.unique()]
-    missed = [
-        torch.cdist(points, few(fidelity=w)(scene, coarse).mesh.vertices_world).amin(dim=1).max()
-        for w in (1.0, 100.0, 10000.0)
-    ]
+    missed = []
+    for fidelity in (1.0, 100.0, 10000.0):
+        monkeypatch.setattr(f"{Smoothed.__module__}._FIDELITY", fidelity)
+        found = Smoothed()(scene, coarse).mesh
+        missed.append(torch.cdist(points, found.vertices_world).amin(dim=1).max())
     assert missed[0] > 3 * missed[1] > 9 * missed[2]
 
 
-def test_a_mesh_without_anything_to_hold_it_is_refused(photographed, sphere):
+def test_a_mesh_without_facets_is_refused(photographed, sphere):
     _, scene, coarse = photographed(sphere)
-    loose = coarse.replace(is_point=torch.zeros_like(coarse.is_point))
-    with pytest.raises(ReconstructionError, match="0 sparse points"):
-        few(filled_fidelity=0.0)(scene, loose)
     empty = coarse.replace(mesh=coarse.mesh.replace(faces=coarse.mesh.faces[:0]))
-    with pytest.raises(ReconstructionError, match="0 facets"):
-        few()(scene, empty)
-    with pytest.raises(ConfigError, match="fidelity"):
-        SmoothedConfig(fidelity=0.0)
+    with pytest.raises(ReconstructionError, match="no facets"):
+        Smoothed()(scene, empty)

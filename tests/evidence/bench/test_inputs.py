@@ -4,11 +4,10 @@ import time
 
 import pytest
 
-from pimper_torch.evidence.bench.config import BenchConfig
-from pimper_torch.evidence.bench.inputs import prepare
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.bench.bench_inputs import BenchConfig, prepare
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.sfm import reconstruct

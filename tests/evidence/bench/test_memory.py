@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pimper_torch.evidence.bench import memory
-from pimper_torch.evidence.bench.memory import peak_memory
+from pimper_torch.evidence.bench import measure
+from pimper_torch.evidence.bench.measure import peak_memory
 
 MB = 2**20
 
@@ -27,7 +27,7 @@ def test_a_method_does_not_inherit_the_peak_of_the_one_before():
 
 
 def test_where_the_system_cannot_tell_nothing_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(memory, "_SELF", tmp_path / "none")
+    monkeypatch.setattr(measure, "_SELF", tmp_path / "none")
     with peak_memory() as peak:
         assert peak() is None
-    assert Path("/proc/self") != memory._SELF
+    assert Path("/proc/self") != measure._SELF

@@ -11,19 +11,16 @@ from pimper_torch.errors import (
     PimperWarning,
     ReconstructionError,
 )
-from pimper_torch.evidence.bench import run as runner
-from pimper_torch.evidence.bench.config import BenchConfig
-from pimper_torch.evidence.bench.inputs import Inputs
-from pimper_torch.evidence.bench.methods import Outcome, method_named
-from pimper_torch.evidence.bench.panels import error_along_rays
-from pimper_torch.evidence.bench.run import BENCH_NAMES, run_bench
+from pimper_torch.evidence.bench import run_bench as runner
+from pimper_torch.evidence.bench.bench_inputs import BenchConfig, Inputs, Outcome, method_named
+from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, error_along_rays, run_bench
 from pimper_torch.evidence.metrics import TrueSurface
 from pimper_torch.evidence.metrics.in_view import meet_truth
 from pimper_torch.evidence.scenes import SceneObject, render_objects, sparse_scene
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.lights import wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import wandering_lights
+from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.geometry.frames import transform
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.outputs.marker import MARKER
@@ -219,18 +216,18 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, mo
 
 
 def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
-    shift, identity = torch.eye(4).double(), torch.eye(4).double()
+    shift = torch.eye(4).double()
     camera = ball.maps.cameras.cam_from_world[0]
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
     mesh = ball.capture.truth.mesh
     moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
-    error = error_along_rays(meet_truth(moved, identity, ball.maps, 0), ball.maps)
+    error = error_along_rays(meet_truth(moved, ball.maps, 0), ball.maps)
     foreground = ball.maps.truth.foreground[0]
     assert torch.equal(error.isnan(), ~foreground)
     centre = error[22, 30]
     assert_close(centre, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
     half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
-    missed = error_along_rays(meet_truth(half, identity, ball.maps, 0), ball.maps).isinf()
+    missed = error_along_rays(meet_truth(half, ball.maps, 0), ball.maps).isinf()
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 

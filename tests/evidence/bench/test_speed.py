@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from torch.testing import assert_close
 
-from pimper_torch.evidence.bench.memory import peak_memory
+from pimper_torch.evidence.bench.measure import peak_memory
 from pimper_torch.records import StageReport
 
 MB = 2**20

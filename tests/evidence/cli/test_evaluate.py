@@ -7,9 +7,9 @@ from PIL import Image
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.cli.evaluate import named_as
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.io.results import write_result
 from pimper_torch.records import Capture, Estimate, Mesh, Truth, Views

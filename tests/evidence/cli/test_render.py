@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 

@@ -3,8 +3,8 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
 

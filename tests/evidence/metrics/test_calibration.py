@@ -5,8 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.evidence.metrics import EvaluateConfig, evaluate, rows
-from pimper_torch.evidence.metrics.calibration import calibrate
-from pimper_torch.evidence.metrics.sampling import sample_surface
+from pimper_torch.evidence.metrics.surface_distances import calibrate, sample_surface
 from pimper_torch.records import Estimate, Truth
 
 COUNT = 40_000

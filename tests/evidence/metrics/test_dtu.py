@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics import dtu_figures
-from pimper_torch.evidence.metrics.dtu import observed, supersample
+from pimper_torch.evidence.metrics.dtu_protocol import observed, supersample
 from pimper_torch.records import DtuProtocol, Mesh
 
 

@@ -6,11 +6,9 @@ from pimper_torch.evidence.metrics import (
     compare_albedo,
     compare_along_rays,
 )
-from pimper_torch.evidence.metrics.visible import joined
+from pimper_torch.evidence.metrics.surface_distances import joined
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Truth
-
-IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
 def with_maps(make, truth, cameras):
@@ -31,7 +29,7 @@ def test_a_mesh_that_is_the_truth_has_no_error(make):
     sphere, cameras = make.sphere(level=4), make.cameras(count=2)
     mesh = sphere.replace(albedo=3 * (sphere.vertices_world.abs() + 0.1))
     truth = with_maps(make, sphere, cameras)
-    found = compare_along_rays(mesh, IDENTITY, make.capture(truth, cameras=cameras), 1)
+    found = compare_along_rays(mesh, make.capture(truth, cameras=cameras), 1)
     assert found.name == "view_1.png"
     assert found.relative_error < 1e-4  # float32 of the ray caster
     assert found.coverage == 1.0
@@ -46,7 +44,7 @@ def test_transferred_normals_and_those_of_the_shape_are_told_apart(make, generat
     # About its axis the tilt turns nothing: the mean angle is below 10, the shape's is not.
     mesh = sphere.replace(normals_world=sphere.vertices_world @ tilt.mT)
     truth = with_maps(make, sphere, cameras)
-    found = compare_along_rays(mesh, IDENTITY, make.capture(truth, cameras=cameras), 0)
+    found = compare_along_rays(mesh, make.capture(truth, cameras=cameras), 0)
     assert found.shape_normals.mean_deg < 0.5
     normals = truth.normals_world[0][truth.depth[0].isfinite()].double()
     cosine = (normals * (normals @ tilt.mT)).sum(dim=1) / normals.square().sum(dim=1)
@@ -60,8 +58,8 @@ def test_a_true_mesh_serves_where_there_are_no_maps(make):
     table = make.square(side=9.0)
     table = table.replace(vertices_world=table.vertices_world - 3.0)
     truth = Truth(mesh=sphere, surroundings=table)
-    found = compare_along_rays(sphere, IDENTITY, make.capture(truth, cameras=cameras), 0)
-    alone = compare_along_rays(sphere, IDENTITY, make.capture_of(sphere, cameras=cameras), 0)
+    found = compare_along_rays(sphere, make.capture(truth, cameras=cameras), 0)
+    alone = compare_along_rays(sphere, make.capture_of(sphere, cameras=cameras), 0)
     assert found.coverage == 1.0  # the table counts for nothing
     assert found.pixels == alone.pixels
     assert found.shape_normals.mean_deg < 1e-3
@@ -84,11 +82,9 @@ def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
     ball, table, cameras = on_a_table(make)
     half = half_of(ball)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
-    alone = compare_along_rays(half, IDENTITY, capture, 0)
-    found = compare_along_rays(joined(half, table), IDENTITY, capture, 0)
-    unknown = compare_along_rays(
-        joined(half, table), IDENTITY, make.capture_of(ball, cameras=cameras), 0
-    )
+    alone = compare_along_rays(half, capture, 0)
+    found = compare_along_rays(joined(half, table), capture, 0)
+    unknown = compare_along_rays(joined(half, table), make.capture_of(ball, cameras=cameras), 0)
     assert 0.4 < alone.coverage < 0.8
     assert found.coverage == alone.coverage
     assert found.relative_error == pytest.approx(alone.relative_error, abs=1e-6)
@@ -100,11 +96,11 @@ def test_a_surface_behind_the_true_one_is_no_table(make):
     ball, table, cameras = on_a_table(make)
     small = ball.replace(vertices_world=0.9 * ball.vertices_world)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
-    found = compare_along_rays(joined(small, table), IDENTITY, capture, 0)
-    alone = compare_along_rays(small, IDENTITY, capture, 0)
+    found = compare_along_rays(joined(small, table), capture, 0)
+    alone = compare_along_rays(small, capture, 0)
     assert found.coverage == alone.coverage
     raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
-    before = compare_along_rays(joined(ball, raised), IDENTITY, capture, 0)
+    before = compare_along_rays(joined(ball, raised), capture, 0)
     assert before.coverage == 1.0  # in front of the object it is an error, not a miss
 
 
@@ -112,7 +108,7 @@ def test_a_mesh_of_the_table_alone_is_refused(make):
     ball, table, cameras = on_a_table(make)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
     with pytest.raises(InputError, match="lies on the surroundings"):
-        compare_along_rays(table, IDENTITY, capture, 0)
+        compare_along_rays(table, capture, 0)
 
 
 def test_maps_on_a_larger_raster_than_the_photograph_are_compared_inside_it(make):
@@ -123,20 +119,20 @@ def test_maps_on_a_larger_raster_than_the_photograph_are_compared_inside_it(make
         normals_world=None,
         albedo=None,
     )
-    found = compare_along_rays(sphere, IDENTITY, make.capture(padded, cameras=cameras), 0)
+    found = compare_along_rays(sphere, make.capture(padded, cameras=cameras), 0)
     assert found.coverage == 1.0
     assert found.relative_error < 1e-4
     small = truth.replace(depth=truth.depth[:, :20], normals_world=None, albedo=None)
     with pytest.raises(InputError, match="one and the same size"):
-        compare_along_rays(sphere, IDENTITY, make.capture(small, cameras=cameras), 0)
+        compare_along_rays(sphere, make.capture(small, cameras=cameras), 0)
 
 
 def test_nothing_is_compared_where_nothing_is_known(make):
     sphere, cameras = make.sphere(level=2), make.cameras(count=1)
     empty = make.capture(Truth(), cameras=cameras)
-    assert compare_along_rays(sphere, IDENTITY, empty, 0) is None
+    assert compare_along_rays(sphere, empty, 0) is None
     cloud = sphere.replace(faces=sphere.faces[:0])
-    assert compare_along_rays(cloud, IDENTITY, make.capture_of(sphere, cameras=cameras), 0) is None
+    assert compare_along_rays(cloud, make.capture_of(sphere, cameras=cameras), 0) is None
 
 
 def test_albedo_is_judged_up_to_one_scale_and_up_to_one_a_channel():

@@ -1,8 +1,8 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.metrics.page import errors_of
-from pimper_torch.evidence.scenes.meshes import icosphere
+from pimper_torch.evidence.metrics.compared_page import errors_of
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Mesh
 
 

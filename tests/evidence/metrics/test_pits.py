@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.metrics.pits import pitted_percent
+from pimper_torch.evidence.metrics.in_view import pitted_percent
 
 
 @pytest.fixture

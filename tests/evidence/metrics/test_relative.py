@@ -5,11 +5,10 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics import relative_error
-from pimper_torch.evidence.metrics.relative import angles_deg
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.meshes import icosphere, table
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.shapes import Plane, Sphere
+from pimper_torch.evidence.metrics.in_view import angles_deg
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
+from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.records import Mesh
 

@@ -55,9 +55,9 @@ def one_by_one(points, order, distance):
 
 @pytest.mark.parametrize("batch", [7, 1000])
 def test_thinning_in_batches_is_thinning_one_by_one(generator, monkeypatch, batch):
-    from pimper_torch.evidence.metrics import thinning
+    from pimper_torch.evidence.metrics import dtu_protocol
 
-    monkeypatch.setattr(thinning, "_BATCH", batch)
+    monkeypatch.setattr(dtu_protocol, "_BATCH", batch)
     points = torch.rand(300, 3, generator=generator, dtype=torch.float64)
     order = torch.randperm(300, generator=torch.Generator().manual_seed(5))
     kept = thin(points, 0.2, torch.Generator().manual_seed(5))

@@ -8,7 +8,7 @@ from pimper_torch.evidence.metrics import (
     similarity_between_cameras,
     similarity_between_points,
 )
-from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Cameras

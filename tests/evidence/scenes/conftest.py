@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 
 
 @pytest.fixture

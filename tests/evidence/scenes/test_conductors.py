@@ -3,12 +3,10 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.conductors import CONDUCTORS, Conductor
-from pimper_torch.evidence.scenes.environment import random_environment
-from pimper_torch.evidence.scenes.lights import PointLight
-from pimper_torch.evidence.scenes.meshes import icosphere, moved, table
-from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere, moved, table
+from pimper_torch.evidence.scenes.ray_tracing import Stage
+from pimper_torch.evidence.scenes.scene_lights import PointLight, random_environment
+from pimper_torch.evidence.scenes.scene_object import CONDUCTORS, Conductor, SceneObject
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.records import Mesh
 

@@ -2,14 +2,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.lights import Lights
-from pimper_torch.evidence.scenes.meshes import moved, potato, table
-from pimper_torch.evidence.scenes.noise import random_speckle
+from pimper_torch.evidence.scenes.procedural_meshes import moved, potato, table
+from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import Lights
 from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.sensor import SensorConfig
-from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.scene_settings import SensorConfig
+from pimper_torch.evidence.scenes.textures import random_speckle
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +46,11 @@ def sensor(**changes):
 
 
 def test_sampling_finely_where_pixels_differ_is_as_good_as_everywhere(stage, monkeypatch):
-    from pimper_torch.evidence.scenes import frame
+    from pimper_torch.evidence.scenes import ray_tracing
 
     coarse = shot(stage, sensor(supersample=1)).image
     adaptive = shot(stage, sensor(supersample=3)).image
-    monkeypatch.setattr(frame, "_UNEVEN", -1.0)
+    monkeypatch.setattr(ray_tracing, "_UNEVEN", -1.0)
     everywhere = shot(stage, sensor(supersample=3)).image
     gap = (adaptive - everywhere).abs()
     assert gap.max() < 0.03  # what neighbours may differ by and not be looked at

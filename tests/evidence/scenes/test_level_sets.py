@@ -1,14 +1,14 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.level_sets import (
+from pimper_torch.evidence.scenes.procedural_meshes import (
+    lathe,
     mesh_level_set,
     rounded_cylinder,
     smooth_difference,
     smooth_union,
 )
-from pimper_torch.evidence.scenes.meshes import lathe
-from pimper_torch.evidence.scenes.objects import jar_mesh, mug_mesh
+from pimper_torch.evidence.scenes.scene_objects import jar_mesh, mug_mesh
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import half_edges
 

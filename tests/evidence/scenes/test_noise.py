@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.noise import random_speckle, random_waves
+from pimper_torch.evidence.scenes.textures import random_speckle, random_waves
 
 
 def test_waves_have_the_spread_and_the_gradient_they_promise(generator):

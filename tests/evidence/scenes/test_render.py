@@ -3,15 +3,18 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.compositions import potato_on_table
-from pimper_torch.evidence.scenes.lights import Lights, wandering_lights
-from pimper_torch.evidence.scenes.meshes import icosphere, join, potato, table
-from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.render import render_objects, render_shape
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere, join, potato, table
+from pimper_torch.evidence.scenes.render_in_memory import (
+    Sphere,
+    potato_on_table,
+    render_objects,
+    render_shape,
+)
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.scene_lights import Lights, wandering_lights
 from pimper_torch.evidence.scenes.scene_object import SceneObject
-from pimper_torch.evidence.scenes.sensor import SensorConfig
-from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.scene_settings import SensorConfig
+from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.topology import half_edges

@@ -4,12 +4,11 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.frame import render_frame
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.scene import build_scene
-from pimper_torch.evidence.scenes.stage import Stage
-from pimper_torch.evidence.scenes.write import render_scene
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.rendered_folder import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.geometry.projection import project, rays_through

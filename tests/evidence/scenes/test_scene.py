@@ -4,19 +4,19 @@ from scipy.spatial import KDTree
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.evidence.scenes import objects
-from pimper_torch.evidence.scenes.cameras import (
+from pimper_torch.evidence.scenes import scene_objects
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.ray_tracing import Stage
+from pimper_torch.evidence.scenes.scene_cameras import (
     aim_to_fit,
     arc_directions,
     distance_to_fit,
     handheld_directions,
 )
-from pimper_torch.evidence.scenes.config import SceneConfig
-from pimper_torch.evidence.scenes.lights import lights_round
-from pimper_torch.evidence.scenes.meshes import icosphere
-from pimper_torch.evidence.scenes.scene import build_scene
-from pimper_torch.evidence.scenes.stage import Stage
+from pimper_torch.evidence.scenes.scene_lights import lights_round
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.textures import CylinderRegion, Marked, Painted
+from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.pixels import pixel_centers
@@ -295,10 +295,10 @@ def test_paint_covers_and_marks_darken():
     assert Marked(base=painted, marks=gray)(points)[:, 0].tolist() == [0.0625, 0.25, 0.25]
 
 
-@pytest.mark.parametrize("name", objects.RECIPES)
+@pytest.mark.parametrize("name", scene_objects.RECIPES)
 def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, generator):
-    monkeypatch.setattr(objects, "mug_mesh", lambda: _MUG_MESH(cell=0.06))
-    made = objects.RECIPES[name](generator)
+    monkeypatch.setattr(scene_objects, "mug_mesh", lambda: _MUG_MESH(cell=0.06))
+    made = scene_objects.RECIPES[name](generator)
     points = torch.cat([item.mesh.vertices_world for item in made])
     assert abs(float(points[:, 2].min())) < 0.01
     size = points.amax(dim=0) - points.amin(dim=0)
@@ -309,11 +309,11 @@ def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, gener
         assert ((shade > 0) & (shade < 1)).all()
 
 
-_MUG_MESH = objects.mug_mesh
+_MUG_MESH = scene_objects.mug_mesh
 
 
 def test_no_ball_cuts_another():
-    made = objects.balls(torch.Generator().manual_seed(1))
+    made = scene_objects.balls(torch.Generator().manual_seed(1))
     centres = [item.mesh.vertices_world.mean(dim=0) for item in made]
     radii = [
         float((item.mesh.vertices_world[0] - centre).norm())
@@ -326,7 +326,7 @@ def test_no_ball_cuts_another():
 
 
 def test_no_potato_cuts_another():
-    meshes = [item.mesh for item in objects.potatoes(torch.Generator().manual_seed(0))]
+    meshes = [item.mesh for item in scene_objects.potatoes(torch.Generator().manual_seed(0))]
     nearest = []
     for first in range(4):
         for second in range(first):

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.shading import facet_density, reflect
+from pimper_torch.evidence.scenes.scene_object import facet_density, reflect
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

@@ -3,8 +3,8 @@ import torch
 from reliefs import WavyPlane
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.noise import random_waves
-from pimper_torch.evidence.scenes.shapes import Plane, Sphere
+from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere
+from pimper_torch.evidence.scenes.textures import random_waves
 
 
 def rays_from_above(generator, count=500):

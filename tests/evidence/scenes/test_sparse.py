@@ -3,11 +3,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.cameras import arc_cameras
-from pimper_torch.evidence.scenes.noise import random_speckle
-from pimper_torch.evidence.scenes.render import render_shape
-from pimper_torch.evidence.scenes.shapes import Plane, Sphere
-from pimper_torch.evidence.scenes.sparse import sparse_scene
+from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere, render_shape
+from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.evidence.scenes.textures import random_speckle
+from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.projection import project, triangulate_rays
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.alignment.anchors import anchor_certainty, vertex_anchors
+from pimper_torch.paper.align import anchor_certainty, vertex_anchors
 
 
 def bumps(x, y):

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.alignment.align import Align, AlignConfig
-from pimper_torch.paper.alignment.system import Pulls, solve_transforms
+from pimper_torch.paper.align import Align, AlignConfig
+from pimper_torch.paper.seams import Pulls, solve_transforms
 
 RADIUS = 2.0
 CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)

@@ -1,8 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.alignment.align import Align
-from pimper_torch.paper.alignment.reliability import patch_status
+from pimper_torch.paper.align import Align, patch_status
 from pimper_torch.records import AlignStatus
 from pimper_torch.reporting import figures
 

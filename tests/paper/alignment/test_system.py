@@ -1,10 +1,11 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.alignment.overlaps import find_seams, meet_overlaps
-from pimper_torch.paper.alignment.system import (
+from pimper_torch.paper.seams import (
     Pulls,
     curvature_along,
+    find_seams,
+    meet_overlaps,
     mismatches,
     scatter_blocks,
     seam_stiffness,

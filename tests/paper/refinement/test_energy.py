@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.paper.refinement.energy import assemble, seam_weight
+from pimper_torch.paper.refine import assemble, seam_weight
 
 
 def minimiser(subdivision, blend, supported, radius, num_facets, spacing=0.1):

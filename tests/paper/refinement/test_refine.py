@@ -7,7 +7,7 @@ from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spac
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import unit_face_normals
 from pimper_torch.geometry.topology import half_edges
-from pimper_torch.paper.refinement.refine import Refine, RefineConfig
+from pimper_torch.paper.refine import Refine, RefineConfig
 
 SPACING = 0.02
 

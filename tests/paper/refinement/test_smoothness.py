@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.paper.refinement.energy import (
+from pimper_torch.paper.refine import (
     assemble,
     seam_weight,
 )

@@ -8,7 +8,7 @@ from PIL import Image
 from pimper_torch.cli.main import main
 from pimper_torch.single_view.cli import gamma
 from pimper_torch.single_view.cli.gamma import advice
-from pimper_torch.single_view.factorization.gamma import GammaEstimate
+from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 
 
 @pytest.fixture

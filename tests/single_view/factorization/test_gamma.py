@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.radiometry import Srgb
 from pimper_torch.records import Views
-from pimper_torch.single_view.factorization.gamma import (
+from pimper_torch.single_view.factorization.estimate_gamma import (
     MAX_GAMMA,
     estimate_gamma,
     gamma_of_photographs,

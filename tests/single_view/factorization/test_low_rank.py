@@ -9,11 +9,11 @@ from pimper_torch.photometry.variable_projection import (
     solve_variable_projection,
 )
 from pimper_torch.single_view.factorization.low_rank import (
+    factorize_from_many,
     low_rank_problem,
     random_left,
     singular_left,
 )
-from pimper_torch.single_view.factorization.restarts import factorize_from_many
 
 
 def factorize(matrix, weight, start):

@@ -10,7 +10,7 @@ from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
-from pimper_torch.single_view.factorization.manifolds import Free
+from pimper_torch.single_view.factorization.low_rank import Free
 
 MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone()])
 

@@ -1,7 +1,7 @@
 import torch
 from torch.nn.functional import avg_pool2d
 
-from pimper_torch.single_view.factorization.still import camera_moved
+from pimper_torch.single_view.factorization.estimate_gamma import camera_moved
 
 VIEWS, SIZE = 8, 64
 

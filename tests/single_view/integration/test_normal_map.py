@@ -6,8 +6,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.single_view.integration import raster_system
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
-from pimper_torch.single_view.integration.rasters import RasterSystem
+from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import orthographic_steps
 
 ALL = ["discontinuities", "weighted"]
@@ -148,9 +149,8 @@ def test_pixels_need_not_be_square(method):
     assert misfit(found, z) < 2e-4
 
 
-@pytest.mark.parametrize("solver", ["cholesky", "multigrid"])
 @pytest.mark.parametrize("method", ALL)
-def test_holes_islands_and_single_pixels_each_have_their_own_constant(method, solver):
+def test_holes_islands_and_single_pixels_each_have_their_own_constant(method):
     normals, z = bumps(40)
     mask = torch.zeros(40, 40, dtype=torch.bool)
     mask[2:30, 2:30] = True
@@ -162,7 +162,6 @@ def test_holes_islands_and_single_pixels_each_have_their_own_constant(method, so
         mask,
         spacing=(0.05, 0.05),
         method=method,
-        solver=solver,
     )
     parts = torch.zeros_like(mask), torch.zeros_like(mask)
     parts[0][2:30, 2:30], parts[1][34:38, 5:20] = True, True
@@ -257,11 +256,11 @@ def test_a_crease_is_no_jump():
     assert_close(rows, rows[:1].expand_as(rows), rtol=0, atol=1e-6)
 
 
-def test_the_answer_does_not_depend_on_how_linear_systems_are_solved():
+def test_the_answer_does_not_depend_on_how_linear_systems_are_solved(monkeypatch):
     normals, _ = cliff(0.02)
-    exact, iterated = (
-        integrate_normal_map(normals, solver=solver) for solver in ("cholesky", "multigrid")
-    )
+    exact = integrate_normal_map(normals)
+    monkeypatch.setattr(raster_system, "_CHOLESKY_PIXELS", 0)
+    iterated = integrate_normal_map(normals)
     assert_close(iterated.depth, exact.depth, rtol=0, atol=1e-5)
     assert_close(iterated.continuity.right, exact.continuity.right, rtol=0, atol=1e-5)
 

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.equal_lengths import (
+from pimper_torch.single_view.factorization.bas_relief import (
+    BasRelief,
     relief_from_albedo,
     relief_from_strength,
 )

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.photometric_stereo.factorization import evenly, factorize_photographs
+from pimper_torch.single_view.photometric_stereo.regress_lights import evenly, factorize_photographs
 
 
 def in_span(found, true):

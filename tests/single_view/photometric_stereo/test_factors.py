@@ -2,8 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.factors import standard_relief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 
 @pytest.fixture

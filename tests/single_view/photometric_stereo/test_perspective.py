@@ -5,8 +5,7 @@ from torch.autograd.functional import jvp
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.one_view import photograph, point_lights
-from pimper_torch.evidence.scenes.shapes import Sphere
+from pimper_torch.evidence.scenes.render_in_memory import Sphere, photograph, point_lights
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.perspective import (
     factorize_in_perspective,

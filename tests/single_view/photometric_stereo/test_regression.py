@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.single_view.photometric_stereo.regression import determined, regress
+from pimper_torch.single_view.photometric_stereo.regress_lights import determined, regress
 
 
 def test_plain_regression_is_weighted_least_squares(generator):

@@ -1,8 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.photometric_stereo.relief import bulge, rounded_relief
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, bulge, rounded_relief
 
 
 def test_any_relief_of_a_ball_is_made_a_ball_again(ball):

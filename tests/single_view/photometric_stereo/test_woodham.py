@@ -2,7 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.single_view.photometric_stereo.woodham import calibrated_stereo, chromatic_albedo
+from pimper_torch.single_view.photometric_stereo.regress_lights import (
+    calibrated_stereo,
+    chromatic_albedo,
+)
 
 COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
 

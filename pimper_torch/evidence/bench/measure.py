@@ -1,0 +1,116 @@
+"""The machine that figures were measured on, and peak memory."""
+
+import os
+import platform
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+from pimper_torch.cores import usable_cores
+from pimper_torch.records import Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Machine(Record):
+    """A machine and what runs on it.
+
+    Attributes:
+        gpu: Name of the first, or nothing.
+        versions: Of the packages that the figures depend on, as ``name version``.
+    """
+
+    cpu: str
+    cores: int
+    memory_gb: float
+    gpu: str
+    system: str
+    python: str
+    versions: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """Return a summary in a line.
+
+        >>> this_machine().summary  # doctest: +SKIP
+        'AMD EPYC 7763, 2 cores, 23 GB; Linux; Python 3.11.7; pimper_torch 0.1.0, torch 2.13.0'
+        """
+        cores = f"{self.cores} core{'s' if self.cores != 1 else ''}"
+        hardware = [self.cpu, cores, f"{self.memory_gb:.0f} GB", *([self.gpu] if self.gpu else [])]
+        return (
+            f"{', '.join(hardware)}; {self.system}; Python {self.python}; "
+            f"{', '.join(self.versions)}"
+        )
+
+
+_PACKAGES = ("pimper_torch", "torch", "numpy", "scipy", "pycolmap", "embreex")
+
+
+def this_machine() -> Machine:
+    """Describe the machine that this runs on."""
+    return Machine(
+        cpu=_cpu(),
+        cores=usable_cores(),
+        memory_gb=round(_memory_bytes() / 2**30, 1),
+        gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        versions=tuple(f"{name} {_version(name)}" for name in _PACKAGES),
+    )
+
+
+def _cpu() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    named = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
+    return named[1].strip() if named else platform.processor() or platform.machine()
+
+
+def _memory_bytes() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return 0
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+_SELF = Path("/proc/self")
+_RESET_PEAK = "5"  # see proc(5), clear_refs
+
+
+@contextmanager
+def peak_memory() -> Iterator[Callable[[], float | None]]:
+    """Measure the peak of resident memory within the ``with`` block.
+
+    The operating system's own peak is of the whole life of a process, so that a frugal method
+    would inherit that of the one before. What was in use before counts, what external programs
+    use does not.
+
+    Yields:
+        A function that gives the peak since then in MB; ``None`` where the system, other than
+        Linux, cannot tell.
+    """
+    try:
+        (_SELF / "clear_refs").write_text(_RESET_PEAK, encoding="ascii")
+    except OSError:
+        yield lambda: None
+        return
+    yield _peak_mb
+
+
+def _peak_mb() -> float | None:
+    status = (_SELF / "status").read_text(encoding="ascii", errors="replace")
+    found = re.search(r"^VmHWM:\s*(\d+) kB", status, flags=re.MULTILINE)
+    return int(found[1]) / 2**10 if found else None

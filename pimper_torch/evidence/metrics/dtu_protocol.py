@@ -1,0 +1,219 @@
+"""The protocol of the DTU multi-view stereo set of 2014, as in its evaluation code."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.records import DtuProtocol, Mesh, Record
+
+# The fewest points visited at once.
+_BATCH = 100_000
+
+
+def thin(
+    points: Float[Tensor, "point 3"], distance: float, generator: torch.Generator
+) -> Int[Tensor, " kept"]:
+    """Visit points in random order; keep each that no kept point is within ``distance`` of.
+
+    Exactly what visiting one by one gives, done in batches: a batch is first cleared of what
+    earlier points forbid, then settled among itself.
+
+    Args:
+        distance: Two kept points are farther apart than this.
+
+    Returns:
+        Indices of the kept points, in the order they were visited.
+
+    Source: Jensen et al., CVPR 2014, supplementary code.
+    """
+    positions = points.detach().cpu().double()
+    order = torch.randperm(len(positions), generator=generator)
+    kept = order[:0]
+    while len(order):
+        # As large as what is kept, so that few trees are built.
+        batch, order = order.tensor_split([max(_BATCH, len(kept))])
+        if len(kept):
+            nearest, _ = cKDTree(positions[kept].numpy()).query(
+                positions[batch].numpy(), distance_upper_bound=np.nextafter(distance, np.inf)
+            )
+            batch = batch[torch.from_numpy(nearest > distance)]
+        kept = torch.cat([kept, batch[_settled(positions[batch], distance)]])
+    return kept
+
+
+def _settled(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tensor, " point"]:
+    """Keep each point, first to last, that no kept one before it is near.
+
+    A round keeps the points that no undecided point before them is near, and drops the
+    neighbours of what it kept; what is kept is the same as one by one.
+    """
+    undecided = np.ones(len(positions), dtype=bool)
+    kept = np.zeros(len(positions), dtype=bool)
+    pairs = cKDTree(positions.numpy()).query_pairs(distance, output_type="ndarray")
+    first, second = np.sort(pairs, axis=1).T
+    while undecided.any():
+        preceded = np.zeros(len(positions), dtype=bool)
+        preceded[second] = True
+        chosen = undecided & ~preceded
+        kept |= chosen
+        undecided &= ~chosen
+        undecided[second[chosen[first]]] = False
+        open_pairs = undecided[first] & undecided[second]
+        first, second = first[open_pairs], second[open_pairs]
+    return torch.from_numpy(kept)
+
+
+# Of the published code, in millimetres: the density of points, the distance past which a point
+# is an outlier, and the side of the cells by which it searches for neighbours.
+THINNING_MM, CAP_MM, _CELL_MM = 0.2, 20.0, 60.0
+# The sets' objects have some ten million points 0.2 mm apart; a hundred million take gigabytes.
+_MAX_POINTS = 2e8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DtuFigures(Record):
+    """Figures of the protocol, in millimetres.
+
+    Attributes:
+        mean_accuracy: From the result to the scan, inside the observability mask.
+        mean_completeness: From the scan above the table to the result.
+        points: Of the result after thinning.
+        evaluated: Of these, inside the mask.
+        evaluated_true: Points of the scan above the table.
+        capped_fraction: Fraction of the evaluated points left out of accuracy, 20 mm off or more.
+        capped_fraction_true: Fraction of the scan's left out of completeness.
+    """
+
+    mean_accuracy: float
+    median_accuracy: float
+    mean_completeness: float
+    median_completeness: float
+    overall: float
+    points: int
+    evaluated: int
+    evaluated_true: int
+    capped_fraction: float
+    capped_fraction_true: float
+
+
+def dtu_figures(
+    mesh: Mesh,
+    scan: Float[Tensor, "point 3"],
+    protocol: DtuProtocol,
+    generator: torch.Generator,
+) -> DtuFigures:
+    """Judge a result by the protocol.
+
+    The vertices, and points on the faces at about the density that follows, are thinned in
+    random order until no two are within 0.2 mm. Distances are between points. Accuracy is
+    over the result's points whose nearest voxel of the observability mask is set;
+    completeness over the scan's points above the plane of the table, to all of the
+    result's. Distances of 20 mm and more count in neither, and neither do points outside
+    the cells that the code lays on the bounding box.
+
+    Args:
+        mesh: In the frame of the set, millimetres.
+        scan: The set's own points, thinned already.
+        generator: On the CPU; the published code draws without a seed.
+
+    Raises:
+        InputError: No point of the result is inside the mask and near the scan, or no point
+            of the scan near the result.
+
+    Source: Jensen et al., CVPR 2014; the Matlab code that comes with the set.
+    """
+    dense = supersample(mesh, THINNING_MM)
+    points = dense[thin(dense, THINNING_MM, generator)]
+    truth = scan.detach().cpu().double()
+    evaluated = points[observed(points, protocol)]
+    plane = protocol.plane.to(truth)
+    evaluated_true = truth[truth @ plane[:3] + plane[3] > 0]
+    accuracy = _near(evaluated, truth, protocol)
+    completeness = _near(evaluated_true, points, protocol)
+    if len(accuracy) == 0 or len(completeness) == 0:
+        raise InputError(
+            f"of {len(points)} points of the result {len(evaluated)} lie in the observability mask "
+            f"and {len(accuracy)} of these within {CAP_MM:g} mm of the scan; {len(completeness)} "
+            "of the scan's are as near to the result. Needed: a result in the frame and the "
+            "millimetres of the set. Align it by its cameras first."
+        )
+    return DtuFigures(
+        mean_accuracy=float(accuracy.mean()),
+        median_accuracy=float(accuracy.median()),
+        mean_completeness=float(completeness.mean()),
+        median_completeness=float(completeness.median()),
+        overall=float(accuracy.mean() + completeness.mean()) / 2,
+        points=len(points),
+        evaluated=len(evaluated),
+        evaluated_true=len(evaluated_true),
+        capped_fraction=1 - len(accuracy) / len(evaluated),
+        capped_fraction_true=1 - len(completeness) / len(evaluated_true),
+    )
+
+
+def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Tensor, " point"]:
+    """Find which points lie in a voxel of the observability mask."""
+    mask = protocol.obs_mask.cpu()
+    lower = protocol.bounding_box[0].to(points)
+    # Halves round up, as in Matlab; torch's own rounding takes them to even numbers.
+    voxel = ((points - lower) / protocol.resolution + 0.5).floor().long()
+    shape = torch.tensor(mask.shape)
+    inside = ((voxel >= 0) & (voxel < shape)).all(dim=1)
+    x, y, z = torch.where(inside[:, None], voxel, 0).unbind(dim=1)
+    return inside & mask[x, y, z]
+
+
+def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
+    """Return the vertices, and a subdivided mesh on each face about ``distance`` apart.
+
+    The subdivided mesh is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
+    ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
+    half steps. A face too small for a step has its vertices only.
+    """
+    vertices = mesh.vertices_world.detach().cpu().double()
+    faces = mesh.faces.cpu()
+    if len(faces) == 0:
+        return vertices
+    a, b, c = vertices[faces].unbind(dim=1)
+    v1, v2, area = b - a, c - a, face_normals(vertices, faces).norm(dim=1)
+    l1, l2 = v1.norm(dim=1), v2.norm(dim=1)
+    step = distance * (l1 * l2 / area).sqrt()
+    n1, n2 = (l1 / step).floor(), (l2 / step).floor()
+    usable = ((area > 0) & (n1 > 0) & (n2 > 0)).nonzero()[:, 0]
+    n1, n2 = n1[usable].long(), n2[usable].long()
+    counts = (n1 + 1) * (n2 + 1)
+    total = float(counts.double().sum())
+    if total > _MAX_POINTS:
+        raise InputError(
+            f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at "
+            f"most {_MAX_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it "
+            "by its cameras first."
+        )
+    face = torch.arange(len(usable)).repeat_interleave(counts)
+    within = torch.arange(len(face)) - (counts.cumsum(0) - counts)[face]
+    k1 = (within // (n2[face] + 1) + 0.5) / n1[face]
+    k2 = (within % (n2[face] + 1) + 0.5) / n2[face]
+    inside = k1 + k2 < 1
+    chosen = usable[face[inside]]
+    subdivision = a[chosen] + k1[inside, None] * v1[chosen] + k2[inside, None] * v2[chosen]
+    return torch.cat([vertices, subdivision])
+
+
+def _near(
+    points: Float[Tensor, "point 3"], others: Float[Tensor, "other 3"], protocol: DtuProtocol
+) -> Float[Tensor, " near"]:
+    """Return distances to the nearest of the others, of the points that count."""
+    lower, upper = protocol.bounding_box.to(points)
+    reach = lower + _CELL_MM * (((upper - lower) / _CELL_MM).floor() + 1)
+    asked = points[((points >= lower) & (points < reach)).all(dim=1)]
+    if len(asked) == 0 or len(others) == 0:
+        return asked.new_zeros(0)
+    found, _ = cKDTree(others.numpy()).query(asked.numpy(), distance_upper_bound=CAP_MM)
+    distance = torch.from_numpy(np.asarray(found))
+    return distance[distance < CAP_MM]

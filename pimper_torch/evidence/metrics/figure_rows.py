@@ -1,0 +1,295 @@
+"""An evaluation as rows for the terminal and as plain mappings for JSON."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from pimper_torch.evidence.metrics.camera_errors import CameraFigures, LightFigures
+from pimper_torch.evidence.metrics.dtu_protocol import CAP_MM, THINNING_MM, DtuFigures
+from pimper_torch.evidence.metrics.evaluation import Evaluation
+from pimper_torch.evidence.metrics.in_view import ViewFigures
+from pimper_torch.evidence.metrics.surface_distances import (
+    Calibration,
+    DistanceFigures,
+    SurfaceComparison,
+    TwoSided,
+)
+
+
+class Row(NamedTuple):
+    """A figure as a person reads it.
+
+    Attributes:
+        name: Of the convention, as in the JSON.
+        meaning: Of the figure, and over which part of the result.
+    """
+
+    name: str
+    value: str
+    meaning: str
+
+
+def report(evaluation: Evaluation) -> dict[str, object]:
+    """Return all figures as plain mappings, lists and numbers; what is not finite is ``None``.
+
+    Names are those of the records; those that end in ``_percent``, ``_deg`` are in these
+    units, the other lengths in scene units of the truth, and those of ``dtu`` in millimetres.
+    """
+    figures = plain(evaluation)
+    assert isinstance(figures, dict)
+    return figures
+
+
+def rows(
+    evaluation: Evaluation, relighting: Mapping[str, Any] | None = None
+) -> list[tuple[str, list[Row]]]:
+    """Return the figures as a table: its sections with their rows, none of them empty.
+
+    Args:
+        relighting: What ``summary.json`` of the result tells under this name.
+    """
+    sections: list[tuple[str, Iterator[Row]]] = [("alignment", _alignment_rows(evaluation))]
+    if evaluation.surface is not None:
+        sections.append(("surface", _surface_rows(evaluation.surface)))
+    sections += [(f"along the rays of {view.name}", _view_rows(view)) for view in evaluation.views]
+    if evaluation.lights is not None:
+        sections.append(("lights", _light_rows(evaluation.lights)))
+    if evaluation.cameras is not None:
+        sections.append(("cameras", _camera_rows(evaluation.cameras)))
+    if evaluation.dtu is not None:
+        sections.append(("DTU protocol", _dtu_rows(evaluation.dtu)))
+    if relighting is not None:
+        sections.append((f"photographs {relighting['photographs']}", _relit_rows(relighting)))
+    return [(title, found) for title, lines in sections if (found := list(lines))]
+
+
+def _alignment_rows(evaluation: Evaluation) -> Iterator[Row]:
+    alignment = evaluation.alignment
+    yield Row("method", alignment.method, alignment.description)
+    yield Row(
+        "scale, rotation",
+        f"{_number(alignment.scale)}, {alignment.rotation_deg:.2f}°",
+        "of the similarity that carries the result to the truth",
+    )
+    if alignment.residual is not None:
+        state = "came to rest" if alignment.converged else "stopped by the limit of iterations"
+        yield Row(
+            "residual",
+            _number(alignment.residual),
+            f"root mean square of the samples kept, scene units; {state}",
+        )
+
+
+def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
+    yield Row(
+        "diagonal",
+        _number(surface.diagonal),
+        "of the true object's bounding box, scene units; % below are of it",
+    )
+    if surface.accuracy is not None:
+        yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
+    if surface.surroundings_fraction > 0:
+        yield Row(
+            "surroundings_fraction",
+            _fraction(surface.surroundings_fraction),
+            "of the result lies nearer to the surroundings; left out of the accuracy",
+        )
+    if surface.whole is not None:
+        yield from _two_sided_rows(surface.whole, "", "the whole truth")
+    if surface.seen is not None and surface.seen_fraction is not None:
+        part = (
+            f"the {_fraction(surface.seen_fraction)} of it seen from {surface.seen_from} positions"
+        )
+        yield from _two_sided_rows(surface.seen, " (seen)", part)
+    if surface.calibration is not None:
+        yield from _calibration_rows(surface.calibration, surface.diagonal)
+
+
+def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
+    yield Row(
+        "expected_error",
+        f"{found.ratio:.2f}; {_fraction(found.within_one)}, {_fraction(found.within_two)}; "
+        f"{found.rank_correlation:.2f}",
+        "true over expected error, 1 if calibrated; true error within one and two "
+        "expected, 68 and 95 % if calibrated; rank correlation",
+    )
+    for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
+        yield Row(
+            f"{which} tenth",
+            f"{_number(100 * one.expected / diagonal)} %; "
+            f"{_number(100 * one.root_mean_square / diagonal)} %",
+            "expected error; true error, root mean squares",
+        )
+
+
+def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
+    yield _distance_row(
+        f"completeness{mark}", figures.completeness, f"truth to result, over {part}: mean; median"
+    )
+    for name, length, percent, meaning in (
+        ("chamfer_mean", figures.chamfer_mean, figures.chamfer_mean_percent, "mean"),
+        ("chamfer_sum", figures.chamfer_sum, figures.chamfer_sum_percent, "sum"),
+    ):
+        yield Row(
+            name + mark,
+            f"{_number(length)} ({_number(percent)} %)",
+            f"{meaning} of mean accuracy and mean completeness{mark}",
+        )
+    for at in figures.thresholds:
+        yield Row(
+            f"f_score{mark} at {at.threshold_percent:g} %",
+            _fraction(at.f_score),
+            f"precision {_fraction(at.precision)}, recall{mark} {_fraction(at.recall)}, "
+            f"nearer than {_number(at.threshold)}",
+        )
+
+
+def _view_rows(view: ViewFigures) -> Iterator[Row]:
+    yield Row(
+        "relative_error",
+        f"{_number(view.relative_error)} %",
+        "100 ||S - S'|| / ||S - mean S|| where both are met",
+    )
+    yield Row(
+        "coverage", _fraction(view.coverage), f"of {view.pixels} true pixels are met by the result"
+    )
+    for name, angles, meaning in (
+        ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median; pitted"),
+        (
+            "transferred_normals",
+            view.transferred_normals,
+            "normals the mesh carries: mean; median; pitted",
+        ),
+    ):
+        if angles is not None:
+            value = (
+                f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°; {angles.pitted_percent:.2f} %"
+            )
+            yield Row(name, value, meaning)
+    if view.albedo is not None:
+        yield Row(
+            "albedo",
+            f"{view.albedo.one_scale_percent:.1f} %; {view.albedo.one_scale_median_percent:.1f} %",
+            "after one scale: root mean square, least squares; median, median ratio",
+        )
+        yield Row(
+            "albedo, channel scales",
+            f"{view.albedo.channel_scales_percent:.1f} %",
+            "after a scale for each channel: root mean square, least squares",
+        )
+
+
+def _light_rows(lights: LightFigures) -> Iterator[Row]:
+    yield Row(
+        "direction",
+        f"{lights.mean_deg:.2f}°; {lights.median_deg:.2f}°",
+        f"of {lights.lights} lights, in the frame of the truth: mean; median",
+    )
+    yield Row(
+        "direction, rotated",
+        f"{lights.mean_rotated_deg:.2f}°; {lights.median_rotated_deg:.2f}°",
+        f"up to one rotation of all, by {lights.rotation_deg:.2f}°: mean; median",
+    )
+
+
+def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
+    yield Row(
+        "missing",
+        f"{cameras.missing} of {cameras.views}",
+        "photographs without a camera in the result",
+    )
+    yield Row(
+        "rotation",
+        f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°",
+        "after the similarity on cameras: mean; median",
+    )
+    percent = cameras.mean_center_percent
+    away = "" if math.isnan(percent) else f", {_number(percent)} % of the way to the object"
+    yield Row(
+        "center",
+        f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}",
+        f"after the similarity on cameras, scene units: mean; median{away}",
+    )
+    yield Row(
+        "focal",
+        f"{_number(cameras.mean_focal_percent)} %",
+        "mean of the absolute differences of the focal length",
+    )
+    if not math.isnan(cameras.mean_position_percent):
+        yield Row(
+            "positions",
+            f"{cameras.mean_position_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
+            "of the diagonal, that exact rays put points off: after the similarity on "
+            "cameras; after the best one",
+        )
+
+
+def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[Row]:
+    meaning = "mean over {} photographs of sRGB values on the object, each under its fitted light"
+    meaning = meaning.format(len(relighting["views"]))
+    names = {
+        "psnr_db": "PSNR",
+        "psnr_matte_db": "PSNR, matte",
+        "psnr_textured_db": "PSNR, textured",
+    }
+    for key, name in names.items():
+        if (value := relighting.get(key)) is not None:
+            yield Row(name, f"{value:.2f} dB", meaning)
+    for one in relighting["materials"]:
+        yield Row(
+            "roughness, specular, metallic",
+            f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}",
+            f"glTF's material of {one['vertices']:.0%} of the vertices",
+        )
+
+
+def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:
+    cap = f"{CAP_MM:g} mm or more"
+    yield Row(
+        "accuracy",
+        f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
+        f"{dtu.evaluated} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
+        f"{_fraction(dtu.capped_fraction)} {cap}",
+    )
+    yield Row(
+        "completeness",
+        f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
+        f"{dtu.evaluated_true} points of the scan above the table: mean; median; "
+        f"{_fraction(dtu.capped_fraction_true)} {cap}",
+    )
+    yield Row("overall", f"{dtu.overall:.4f} mm", "mean of the two means")
+
+
+def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> Row:
+    value = (
+        f"{_number(figures.mean)} ({_number(figures.mean_percent)} %); "
+        f"{_number(figures.median)} ({_number(figures.median_percent)} %)"
+    )
+    return Row(name, value, meaning)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _fraction(value: float) -> str:
+    return f"{100 * value:.1f} %"
+
+
+def plain(value: object) -> object:
+    """Return records as mappings, tensors and tuples as lists, and numbers not finite as None."""
+    if dataclasses.is_dataclass(value):
+        fields = dataclasses.fields(value)
+        return {field.name: plain(getattr(value, field.name)) for field in fields}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Tensor):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

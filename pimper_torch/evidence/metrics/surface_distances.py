@@ -1,0 +1,493 @@
+"""Distances between two surfaces: accuracy, completeness, and calibration of expected errors."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.stats import spearmanr
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.records import Cameras, Capture, Mesh, Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SurfaceSamples(Record):
+    """Points on a surface, each standing for the same fraction of it.
+
+    Attributes:
+        normals: Of the faces they lie in, unit; ``None`` for a point cloud.
+        corners: Vertices that each lies between; the one that it is of a point cloud.
+        fractions: Of these; they add up to 1.
+    """
+
+    points: Float[Tensor, "sample 3"]
+    normals: Float[Tensor, "sample 3"] | None
+    corners: Int[Tensor, "sample corner"]
+    fractions: Float[Tensor, "sample corner"]
+
+    def interpolate(self, per_vertex: Float[Tensor, " vertex"]) -> Float[Tensor, " sample"]:
+        """Blend what is known at the vertices of the surface."""
+        values = per_vertex.detach().to(self.fractions)[self.corners]
+        return (self.fractions * values).sum(dim=1)
+
+
+def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfaceSamples:
+    """Draw points uniformly by area; of a point cloud, points without repetition.
+
+    The draw is stratified: the faces' areas laid end to end are cut in ``count`` equal
+    pieces, and one point is drawn in each, which makes averages less noisy than independent
+    draws do and favours no face.
+
+    Args:
+        mesh: A cloud gives its points, all of them if they are no more than ``count``.
+
+    Raises:
+        InputError: The surface has no extent: no vertices, or faces without any area.
+    """
+    vertices = mesh.vertices_world.detach().cpu().double()
+    faces = mesh.faces.cpu()
+    if len(vertices) == 0:
+        raise InputError("the surface has no vertices; needed: a mesh or a point cloud.")
+    if len(faces) == 0:
+        chosen = torch.randperm(len(vertices), generator=generator)[:count]
+        corners = chosen[:, None]
+        return SurfaceSamples(
+            points=vertices[chosen],
+            normals=None,
+            corners=corners,
+            fractions=torch.ones_like(corners, dtype=torch.float64),
+        )
+    normals = face_normals(vertices, faces)
+    ends = normals.norm(dim=1).cumsum(dim=0)
+    if not float(ends[-1]) > 0:
+        raise InputError(
+            f"all {len(faces)} faces of the surface are degenerate; needed: triangles with area."
+        )
+    face = _drawn(ends, count, generator)
+    # Folding the unit square along its diagonal keeps the density of the triangle even.
+    u, v = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    fold = u + v > 1
+    u, v = torch.where(fold, 1 - u, u), torch.where(fold, 1 - v, v)
+    a, b, c = vertices[faces[face]].unbind(dim=1)
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return SurfaceSamples(
+        points=points,
+        normals=normalize(normals[face], dim=1),
+        corners=faces[face],
+        fractions=torch.stack([1 - u - v, u, v], dim=1),
+    )
+
+
+def _drawn(
+    ends: Float[Tensor, " face"], count: int, generator: torch.Generator
+) -> Int[Tensor, " sample"]:
+    jitter = torch.rand(count, generator=generator, dtype=torch.float64)
+    positions = (torch.arange(count) + jitter) / count * ends[-1]
+    return torch.searchsorted(ends, positions, right=True).clamp_max(len(ends) - 1)
+
+
+# Fraction of the object's diagonal that a surface may lie in front of a point without hiding it:
+# the ray caster's float32 needs a millionth, depth maps of files a thousandth.
+_HIDDEN_BEHIND = 1e-3
+
+
+def count_seeing(
+    samples: SurfaceSamples, capture: Capture, diagonal: float
+) -> Int[Tensor, " sample"] | None:
+    """Count the positions of the camera that each true point is seen from.
+
+    A view sees a point that lies inside its picture and behind nothing else: by ray casting
+    the true mesh with its surroundings and the face's front towards the camera, or, for a
+    cloud, by the true depth maps. Views taken from one position (``capture.position``) count
+    once, however many lights they were taken under.
+
+    Args:
+        diagonal: Of the object's bounding box, scene units.
+
+    Returns:
+        ``None`` where nothing tells: no cameras, or neither a mesh nor depth maps.
+    """
+    truth, cameras = capture.truth, capture.cameras
+    if cameras is None or (truth.mesh is None and truth.depth is None):
+        return None
+    tolerance = _HIDDEN_BEHIND * diagonal
+    caster = None
+    if truth.mesh is not None and len(truth.mesh.faces):
+        whole = joined(truth.mesh, truth.surroundings)
+        caster = RayCaster(whole.vertices_world, whole.faces)
+    elif truth.depth is None:
+        return None
+    count = torch.zeros(len(samples.points), dtype=torch.long)
+    for position in torch.unique(capture.position):
+        seen = torch.zeros(len(count), dtype=torch.bool)
+        views = (capture.position == position).nonzero()[:, 0].tolist()
+        # A ray caster sees the same in all of them; depth maps may have other holes.
+        for view in views[:1] if caster is not None else views:
+            if caster is not None:
+                seen |= _seen_by_casting(samples, cameras, view, caster, tolerance)
+            else:
+                assert truth.depth is not None
+                seen |= _seen_in_depth(samples, cameras, view, truth.depth[view], tolerance)
+        count += seen
+    return count
+
+
+def joined(mesh: Mesh, other: Mesh | None) -> Mesh:
+    """Put two surfaces in one, geometry only; the faces of ``mesh`` come first."""
+    vertices = mesh.vertices_world
+    if other is None:
+        return Mesh(vertices_world=vertices, faces=mesh.faces)
+    return Mesh(
+        vertices_world=torch.cat([vertices, other.vertices_world.to(vertices)]),
+        faces=torch.cat([mesh.faces, other.faces + len(vertices)]),
+    )
+
+
+def _seen_by_casting(
+    samples: SurfaceSamples, cameras: Cameras, view: int, caster: RayCaster, tolerance: float
+) -> Bool[Tensor, " sample"]:
+    _, _, seen = _in_picture(samples.points, cameras, view)
+    center = cameras.centers_world[view].to(samples.points)
+    if samples.normals is not None:
+        seen &= ((center - samples.points) * samples.normals).sum(dim=1) > 0
+    asked = seen.nonzero()[:, 0]
+    hidden = caster.occluded(samples.points[asked], center, tolerance)
+    seen[asked[hidden]] = False
+    return seen
+
+
+def _seen_in_depth(
+    samples: SurfaceSamples,
+    cameras: Cameras,
+    view: int,
+    depth_true: Float[Tensor, "height width"],
+    tolerance: float,
+) -> Bool[Tensor, " sample"]:
+    pixels, depth, seen = _in_picture(samples.points, cameras, view)
+    column, row = pixels.nan_to_num(0).floor().long().unbind(dim=1)
+    height, width = depth_true.shape
+    there = depth_true[row.clamp(0, height - 1), column.clamp(0, width - 1)].to(depth)
+    return seen & there.isfinite() & ((depth - there).abs() <= tolerance)
+
+
+def _in_picture(
+    points: Float[Tensor, "sample 3"], cameras: Cameras, view: int
+) -> tuple[Float[Tensor, "sample 2"], Float[Tensor, " sample"], Bool[Tensor, " sample"]]:
+    pixels, depth = project(
+        points, cameras.cam_from_world[view].to(points), cameras.intrinsics[view].to(points)
+    )
+    size = cameras.sizes_px[view].to(points)
+    return pixels, depth, (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+
+
+_BINS = 10
+
+# Median of the absolute value of unit Gaussian noise.
+_MEDIAN_OF_ONE = 0.6745
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationBin(Record):
+    """A tenth of the surface, by expected error; scene units.
+
+    Attributes:
+        expected: Root mean square of the expected errors.
+        robust: Median of the true errors over 0.6745, the standard deviation that Gaussian
+            noise of this median has: blind to outliers.
+    """
+
+    expected: float
+    root_mean_square: float
+    robust: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration(Record):
+    """How expected errors compare with true ones.
+
+    Attributes:
+        ratio: Median of true over expected error, over 0.6745: 1 for Gaussian noise of the
+            expected standard deviation, more where the surface is too sure of itself.
+        within_one: Share with a true error up to the expected one; 68 % for Gaussian noise.
+        within_two: Share with one up to twice the expected one; 95 %.
+        rank_correlation: Spearman's, between expected and true errors; NaN if all expected ones
+            are the same.
+        bins: Of equal fractions of the surface, by rising expected error.
+    """
+
+    ratio: float
+    within_one: float
+    within_two: float
+    rank_correlation: float
+    bins: tuple[CalibrationBin, ...]
+    samples: int
+
+
+def calibrate(
+    expected: Float[Tensor, " sample"], true: Float[Tensor, " sample"]
+) -> Calibration | None:
+    """Compare expected with true errors over samples of equal area.
+
+    Args:
+        expected: Standard errors, scene units.
+        true: Distances to the truth, scene units.
+
+    Returns:
+        ``None`` if fewer than ten samples have a finite expected error above 0.
+    """
+    known = expected.isfinite() & (expected > 0)
+    expected, true = expected[known].double().cpu(), true[known].double().cpu()
+    if len(expected) < _BINS:
+        return None
+    fraction = true / expected
+    order = expected.argsort()
+    varied = bool(expected.min() < expected.max())
+    correlation = spearmanr(expected.numpy(), true.numpy()).statistic if varied else math.nan
+    return Calibration(
+        ratio=float(fraction.median()) / _MEDIAN_OF_ONE,
+        within_one=float((fraction <= 1).double().mean()),
+        within_two=float((fraction <= 2).double().mean()),
+        rank_correlation=float(correlation),
+        bins=tuple(
+            CalibrationBin(
+                expected=float(expected[one].square().mean().sqrt()),
+                root_mean_square=float(true[one].square().mean().sqrt()),
+                robust=float(true[one].median()) / _MEDIAN_OF_ONE,
+            )
+            for one in torch.tensor_split(order, _BINS)
+        ),
+        samples=len(expected),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DistanceFigures(Record):
+    """Distances of samples of one surface to the other.
+
+    Attributes:
+        mean_percent: Of the diagonal of the true object's bounding box.
+        samples: How many; each stands for the same area.
+    """
+
+    mean: float
+    median: float
+    mean_percent: float
+    median_percent: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThresholdFigures(Record):
+    """How much of each surface lies near the other.
+
+    Attributes:
+        precision: Fraction of the estimate nearer to the truth than the threshold.
+        recall: Fraction of the truth nearer to the estimate than the threshold.
+        f_score: Their harmonic mean; 0 if both are 0.
+    """
+
+    threshold: float
+    threshold_percent: float
+    precision: float
+    recall: float
+    f_score: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TwoSided(Record):
+    """Figures of both directions, for the whole truth or for a part of it.
+
+    Attributes:
+        completeness: From the truth to the estimate.
+        chamfer_mean: Mean of mean accuracy and mean completeness, scene units.
+        chamfer_sum: Their sum, which other papers call Chamfer distance.
+    """
+
+    completeness: DistanceFigures
+    chamfer_mean: float
+    chamfer_sum: float
+    chamfer_mean_percent: float
+    chamfer_sum_percent: float
+    thresholds: tuple[ThresholdFigures, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceComparison(Record):
+    """How a surface compares with the true one.
+
+    Attributes:
+        diagonal: Of the true object's bounding box along the axes of the truth, scene units.
+        accuracy: From the estimate to the truth; ``None`` if all of it belongs to the
+            surroundings.
+        surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
+            surroundings than to the object, and is left out of the accuracy.
+        seen: With that of the truth seen from at least ``seen_from`` positions; ``None`` if
+            it is unknown, or none is.
+        seen_from: How many positions of the camera.
+        seen_fraction: Fraction of the truth that is seen so; ``None`` if unknown.
+        calibration: Of the estimate's expected error, over its samples that count for the
+            accuracy; ``None`` if it tells none.
+    """
+
+    diagonal: float
+    accuracy: DistanceFigures | None
+    surroundings_fraction: float
+    whole: TwoSided | None
+    seen: TwoSided | None
+    seen_from: int
+    seen_fraction: float | None
+    calibration: Calibration | None = None
+
+
+class TrueSurface:
+    """The true surface prepared for the comparison with any number of estimates.
+
+    Samples are drawn evenly over each surface, and each is compared with the nearest point
+    of the other surface itself, not with its samples or vertices. Points stand for the
+    surface where one has no faces.
+
+    Args:
+        capture: With the true mesh or points, and its cameras for what is seen.
+        seen_from: How many positions of the camera must see a true point that is counted as
+            seen; see :func:`pimper_torch.evidence.metrics.surface_distances.count_seeing`.
+
+    Raises:
+        InputError: There is no true surface, or it has no extent.
+    """
+
+    def __init__(
+        self, capture: Capture, *, seen_from: int = 3, samples: int = 200_000, seed: int = 0
+    ) -> None:
+        truth, surroundings = true_surface(capture), capture.truth.surroundings
+        self.diagonal = bounding_diagonal(truth)
+        self._generator = torch.Generator().manual_seed(seed)
+        drawn = sample_surface(truth, samples, self._generator)
+        count = count_seeing(drawn, capture, self.diagonal)
+        self._points, self._samples = drawn.points, samples
+        self._state = self._generator.get_state()
+        self._seen, self._seen_from = None if count is None else count >= seen_from, seen_from
+        self._object = NearestSurface(truth)
+        self._surroundings = None
+        if surroundings is not None and len(surroundings.vertices_world):
+            self._surroundings = NearestSurface(surroundings)
+
+    def compare(
+        self, mesh: Mesh, thresholds_percent: Sequence[float] = (0.25, 0.5, 1.0)
+    ) -> SurfaceComparison:
+        """Measure the distances between an estimate and the truth, area by area.
+
+        Args:
+            mesh: The estimate, in the frame of the truth.
+            thresholds_percent: Of the diagonal, for precision, recall and F-score.
+
+        Raises:
+            InputError: The estimate has no extent.
+        """
+        self._generator.set_state(self._state)  # the order of the estimates changes nothing
+        drawn = sample_surface(mesh, self._samples, self._generator)
+        ours = drawn.points
+        to_truth = self._object.query(ours).distance
+        aside = torch.zeros(len(ours), dtype=torch.bool)
+        if self._surroundings is not None:
+            aside = self._surroundings.query(ours).distance < to_truth
+        to_truth = to_truth[~aside]
+        calibration = None
+        if mesh.expected_error is not None:
+            calibration = calibrate(drawn.interpolate(mesh.expected_error)[~aside], to_truth)
+        to_estimate = NearestSurface(mesh).query(self._points).distance
+
+        def two_sided(distances: Float[Tensor, " sample"]) -> TwoSided | None:
+            if len(distances) == 0 or len(to_truth) == 0:
+                return None
+            return _two_sided(to_truth, distances, self.diagonal, thresholds_percent)
+
+        seen = self._seen
+        return SurfaceComparison(
+            diagonal=self.diagonal,
+            accuracy=_figures(to_truth, self.diagonal) if len(to_truth) else None,
+            surroundings_fraction=float(aside.double().mean()),
+            whole=two_sided(to_estimate),
+            seen=None if seen is None else two_sided(to_estimate[seen]),
+            seen_from=self._seen_from,
+            seen_fraction=None if seen is None else float(seen.double().mean()),
+            calibration=calibration,
+        )
+
+
+def true_surface(capture: Capture) -> Mesh:
+    """Return the true mesh of the object, or its points as a mesh without faces."""
+    truth = capture.truth
+    if truth.mesh is not None:
+        return truth.mesh
+    if truth.points_world is not None:
+        return Mesh(vertices_world=truth.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
+    raise InputError("the truth has neither a mesh nor points, so no distance can be measured.")
+
+
+def bounding_diagonal(mesh: Mesh) -> float:
+    """Return the diagonal of the box, along the axes of the world, round what a mesh shows.
+
+    Vertices without a face count only where there are no faces at all.
+    """
+    vertices = mesh.vertices_world.double()
+    used = vertices[torch.unique(mesh.faces)] if len(mesh.faces) else vertices
+    return float((used.amax(dim=0) - used.amin(dim=0)).norm())
+
+
+def _two_sided(
+    to_truth: Float[Tensor, " ours"],
+    to_estimate: Float[Tensor, " theirs"],
+    diagonal: float,
+    thresholds_percent: Sequence[float],
+) -> TwoSided:
+    accuracy, completeness = _figures(to_truth, diagonal), _figures(to_estimate, diagonal)
+    total = accuracy.mean + completeness.mean
+    return TwoSided(
+        completeness=completeness,
+        chamfer_mean=total / 2,
+        chamfer_sum=total,
+        chamfer_mean_percent=50 * total / diagonal,
+        chamfer_sum_percent=100 * total / diagonal,
+        thresholds=tuple(
+            _at_threshold(to_truth, to_estimate, percent, diagonal)
+            for percent in thresholds_percent
+        ),
+    )
+
+
+def _at_threshold(
+    to_truth: Float[Tensor, " ours"],
+    to_estimate: Float[Tensor, " theirs"],
+    percent: float,
+    diagonal: float,
+) -> ThresholdFigures:
+    threshold = percent / 100 * diagonal
+    precision = float((to_truth < threshold).double().mean())
+    recall = float((to_estimate < threshold).double().mean())
+    both = precision + recall
+    return ThresholdFigures(
+        threshold=threshold,
+        threshold_percent=percent,
+        precision=precision,
+        recall=recall,
+        f_score=2 * precision * recall / both if both > 0 else 0.0,
+    )
+
+
+def _figures(distances: Float[Tensor, " sample"], diagonal: float) -> DistanceFigures:
+    mean, median = float(distances.mean()), float(distances.median())
+    return DistanceFigures(
+        mean=mean,
+        median=median,
+        mean_percent=100 * mean / diagonal,
+        median_percent=100 * median / diagonal,
+        samples=len(distances),
+    )

@@ -1,0 +1,341 @@
+"""Ray tracing of one photograph of a scene, with the truth about every pixel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.evidence.scenes.procedural_meshes import join
+from pimper_torch.evidence.scenes.scene_lights import Lights, PointLight
+from pimper_torch.evidence.scenes.scene_object import (
+    SceneObject,
+    normals_at_vertices,
+    reflect,
+)
+from pimper_torch.evidence.scenes.scene_settings import SensorConfig, expose
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.records import Cameras, Record
+
+# Clear of the surface in embree's float32, yet below what a pixel shows.
+_CLEARANCE = 2e-4
+# Conductors that mirror one another; what is mirrored once more is left out.
+_MIRRORS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Spots(Record):
+    """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss."""
+
+    hits: Hits
+    points: Float[Tensor, "ray 3"]
+    normals: Float[Tensor, "ray 3"]
+    albedo: Float[Tensor, "ray channel"]
+    object_index: Int[Tensor, " ray"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Shaded(Record):
+    """What spots send to the eye.
+
+    Attributes:
+        mirrored: Radiance of the highlight, and of what a conductor mirrors.
+        lit: True where the point light reaches.
+    """
+
+    matte: Float[Tensor, "ray channel"]
+    mirrored: Float[Tensor, "ray channel"]
+    lit: Bool[Tensor, " ray"]
+
+
+class Stage:
+    """Objects in one ray caster; float32.
+
+    Args:
+        objects: Their faces, in this order, are those of ``mesh``.
+    """
+
+    def __init__(self, objects: Sequence[SceneObject]) -> None:
+        self.objects = tuple(objects)
+        self.mesh = join(*(one.mesh for one in objects))
+        vertices = self.mesh.vertices_world
+        self._caster = RayCaster(vertices, self.mesh.faces)
+        self._normals = torch.cat([normals_at_vertices(one) for one in objects])
+        counts = torch.tensor([len(one.mesh.faces) for one in objects])
+        self._ends = torch.cumsum(counts, dim=0)
+        self._starts = self._ends - counts
+        # A conductor's fraction of mirrored light is Fresnel's own; 1 leaves the lobe alone.
+        self._specular = torch.tensor([1.0 if one.conductor else one.specular for one in objects])
+        self._metal = torch.tensor([one.conductor is not None for one in objects])
+        self._roughness = torch.tensor([one.roughness for one in objects])
+        self.outside = torch.tensor([one.surroundings for one in objects])
+        extent = vertices.amax(dim=0) - vertices.amin(dim=0)
+        self.clearance = _CLEARANCE * float(extent.norm())
+
+    def cast(self, origins: Float[Tensor, "ray 3"], along: Float[Tensor, "ray 3"]) -> Hits:
+        """Find what rays meet first."""
+        return self._caster.cast(origins, along)
+
+    def trace(self, eye: Float[Tensor, "*origin 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
+        """Look along rays from one position, or from one each, and see what is there."""
+        hits = self._caster.cast(eye, rays)
+        hit = hits.face >= 0
+        points = eye + torch.where(hit, hits.distance, 1)[:, None] * rays
+        object_index = torch.where(hit, torch.bucketize(hits.face, self._ends, right=True), -1)
+        return Spots(
+            hits=hits,
+            points=points,
+            normals=normalize(hits.interpolate(self._normals, self.mesh.faces), dim=-1),
+            albedo=self._albedo(hits, points, object_index),
+            object_index=object_index,
+        )
+
+    def lit(
+        self,
+        points: Float[Tensor, "ray 3"],
+        normals: Float[Tensor, "ray 3"],
+        position: Float[Tensor, " 3"],
+    ) -> Bool[Tensor, " ray"]:
+        """Find where a point light is above a surface's horizon and no object is in between."""
+        start = points + self.clearance * normals
+        toward = position - start
+        (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
+        distance = toward[facing].norm(dim=-1, keepdim=True)
+        met = self._caster.cast(start[facing], toward[facing] / distance).distance
+        lit = torch.zeros(len(points), dtype=torch.bool)
+        return lit.index_copy(0, facing, met >= distance[:, 0])
+
+    def shade(
+        self,
+        spots: Spots,
+        eye: Float[Tensor, "*origin 3"],
+        point_light: PointLight,
+        *,
+        flash: Float[Tensor, " 3"] | None = None,
+        bounces: int = _MIRRORS,
+    ) -> Shaded:
+        """Return the radiance that reaches the eye.
+
+        Args:
+            eye: Where it is, or where each ray comes from.
+            flash: Where the flash is, and casts shadows from; by default at the eye, which sees
+                none of them.
+            bounces: Of conductors that mirror one another.
+        """
+        specular, roughness = (
+            self._specular[spots.object_index],
+            self._roughness[spots.object_index],
+        )
+        to_eye = normalize(eye - spots.points, dim=-1)
+        lit = self.lit(spots.points, spots.normals, point_light.position)
+        flash_position = eye if flash is None else flash
+        flashed = spots.object_index >= 0
+        if flash is not None and point_light.flash > 0:
+            flashed = self.lit(spots.points, spots.normals, flash)
+        window = point_light.from_window(spots.normals)
+        received = torch.full_like(specular, point_light.ambient).add(window)[:, None]
+        mirrored = torch.zeros_like(spots.points)
+        white = torch.ones_like(specular[:1])
+        colour = white if point_light.colour is None else point_light.colour
+        for position, irradiance, reached, tone in (
+            (point_light.position, point_light.irradiance, lit, colour),
+            (flash_position, point_light.flash, flashed, white),
+        ):
+            if irradiance == 0:
+                continue
+            toward, arriving = point_light.arriving(spots.points, position, irradiance)
+            matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
+            half = normalize(toward + to_eye, dim=-1)
+            tint = self._tint(spots.object_index, (half * toward).sum(dim=-1))
+            received = received + torch.where(reached, arriving * matte, 0)[:, None] * tone
+            mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint * tone
+        (metal,) = torch.nonzero(
+            self._metal[spots.object_index] & (spots.object_index >= 0), as_tuple=True
+        )
+        if len(metal) and bounces > 0:
+            seen = self._mirrored(
+                spots, metal, to_eye[metal], point_light, flash_position, bounces - 1
+            )
+            mirrored = mirrored.index_add(0, metal, seen)
+        return Shaded(matte=spots.albedo * received, mirrored=mirrored, lit=lit)
+
+    def _mirrored(
+        self,
+        spots: Spots,
+        metal: Int[Tensor, " metal"],
+        to_eye: Float[Tensor, "metal 3"],
+        point_light: PointLight,
+        flash: Float[Tensor, " 3"],
+        bounces: int,
+    ) -> Float[Tensor, "metal channel"]:
+        """Return what smooth conductors show of other objects and of the environment."""
+        normals = spots.normals[metal]
+        cosine = (normals * to_eye).sum(dim=-1, keepdim=True)
+        along = normalize(2 * cosine * normals - to_eye, dim=-1)
+        start = spots.points[metal] + self.clearance * normals
+        there = self.trace(start, along)
+        shaded = self.shade(there, start, point_light, flash=flash, bounces=bounces)
+        hit = (there.object_index >= 0)[:, None]
+        radiance = torch.where(hit, shaded.matte + shaded.mirrored, point_light.surroundings(along))
+        return self._tint(spots.object_index[metal], cosine[:, 0]) * radiance
+
+    def _tint(
+        self, object_index: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
+    ) -> Float[Tensor, "ray 3"]:
+        """Return Fresnel's factor of conductors, 1 of all others."""
+        tint = cosine.new_ones(len(cosine), 3)
+        for index, one in enumerate(self.objects):
+            if one.conductor is not None:
+                own = (object_index == index)[:, None]
+                tint = torch.where(own, one.conductor.reflectance(cosine), tint)
+        return tint
+
+    def _albedo(
+        self, hits: Hits, points: Float[Tensor, "ray 3"], object_index: Int[Tensor, " ray"]
+    ) -> Float[Tensor, "ray channel"]:
+        albedo = points.new_zeros(len(points), 3)
+        for index, one in enumerate(self.objects):
+            (own,) = torch.nonzero(object_index == index, as_tuple=True)
+            if len(own) == 0:
+                continue
+            if one.texture is not None:
+                found = one.texture(points[own])
+            else:
+                assert one.mesh.albedo is not None
+                corners = one.mesh.faces[hits.face[own] - self._starts[index]]
+                weights = hits.barycentric[own][..., None]
+                found = (weights * one.mesh.albedo.float()[corners]).sum(dim=1)
+            albedo = albedo.index_copy(0, own, found.to(albedo).expand(-1, 3))
+        return albedo
+
+
+# Rays worked on at once: what they need stays in the processor's cache.
+_BATCH = 1 << 16
+# Square roots of radiance that differ by more are sampled finely: about 4 levels of 255.
+_UNEVEN = 0.015
+# A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
+_NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Frame(Record):
+    """A photograph that no camera took, and what the rays through its pixels' centres meet.
+
+    Attributes:
+        depth: Along the camera's z; infinite where the ray meets nothing.
+        normals_world: Unit, outward; zero where the ray meets nothing.
+        albedo: Linear; zero where the ray meets nothing.
+        lit: True where the point light reaches the surface.
+        highlight: True where a highlight adds noticeably to the matte part: a hundredth of
+            saturation or more, and a twentieth of the matte part. So does all that a conductor
+            mirrors.
+    """
+
+    image: Float[Tensor, "channel height width"]
+    depth: Float[Tensor, "height width"]
+    normals_world: Float[Tensor, "height width 3"]
+    albedo: Float[Tensor, "height width channel"]
+    foreground: Bool[Tensor, "height width"]
+    lit: Bool[Tensor, "height width"]
+    highlight: Bool[Tensor, "height width"]
+
+
+def render_frame(
+    stage: Stage,
+    cameras: Cameras,
+    lights: Lights,
+    view: int,
+    generator: torch.Generator,
+    sensor: SensorConfig,
+) -> Frame:
+    """Ray trace one photograph; float32.
+
+    One ray through each pixel's centre; where a pixel differs from its neighbours, a grid of
+    rays over its area instead.
+    """
+    look = _Look(stage, cameras, lights, view, sensor.exposure)
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    centers = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
+    seen = [look.at(pixels) for pixels in torch.split(centers, _BATCH)]
+    radiance = torch.cat([one.radiance for one in seen])
+    if sensor.supersample > 1:
+        (uneven,) = torch.nonzero(_uneven(radiance.reshape(height, width, -1)), as_tuple=True)
+        fine = [
+            look.over(centers[rows], sensor.supersample)
+            for rows in torch.split(uneven, _BATCH // 4)
+        ]
+        if fine:
+            radiance = radiance.index_copy(0, uneven, torch.cat(fine))
+    image = expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor)
+    object_index = torch.cat([one.spots.object_index for one in seen]).reshape(height, width)
+    return Frame(
+        image=image,
+        depth=torch.cat([one.spots.hits.distance for one in seen]).reshape(height, width),
+        normals_world=torch.cat([one.spots.normals for one in seen]).reshape(height, width, 3),
+        albedo=torch.cat([one.spots.albedo for one in seen]).reshape(height, width, -1),
+        foreground=(object_index >= 0) & ~stage.outside[object_index],
+        lit=torch.cat([one.lit for one in seen]).reshape(height, width),
+        highlight=torch.cat([one.highlight for one in seen]).reshape(height, width),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Seen(Record):
+    spots: Spots
+    radiance: Float[Tensor, "ray channel"]
+    lit: Bool[Tensor, " ray"]
+    highlight: Bool[Tensor, " ray"]
+
+
+class _Look:
+    """One camera under one light."""
+
+    def __init__(
+        self, stage: Stage, cameras: Cameras, lights: Lights, view: int, exposure: float
+    ) -> None:
+        self._stage, self._exposure = stage, exposure
+        self._cam_from_world = cameras.cam_from_world[view]
+        self._intrinsics = cameras.intrinsics[view]
+        self._eye = cameras.centers_world[view].float()
+        self._point_light = lights.point_light(view)
+
+    def at(self, pixels: Float[Tensor, "pixel 2"]) -> _Seen:
+        """Look through positions in the image."""
+        rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
+        spots = self._stage.trace(self._eye, rays)
+        shaded = self._stage.shade(spots, self._eye, self._point_light)
+        hit = (spots.object_index >= 0)[:, None]
+        beyond = self._point_light.surroundings(rays)
+        radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)
+        mirrored = self._exposure * shaded.mirrored.mean(dim=-1)
+        matte = shaded.matte.mean(dim=-1)
+        relative = mirrored > _NOTICEABLE_FRACTION * self._exposure * matte
+        return _Seen(
+            spots=spots,
+            radiance=radiance,
+            lit=shaded.lit,
+            highlight=(mirrored > _NOTICEABLE) & relative,
+        )
+
+    def over(self, centers: Float[Tensor, "pixel 2"], side: int) -> Float[Tensor, "pixel channel"]:
+        """Average the radiance over the areas of pixels."""
+        steps = (torch.arange(side).to(centers) + 0.5) / side - 0.5
+        offsets = torch.cartesian_prod(steps, steps)
+        return torch.stack([self.at(centers + offset).radiance for offset in offsets]).mean(dim=0)
+
+
+def _uneven(radiance: Float[Tensor, "height width channel"]) -> Bool[Tensor, " pixel"]:
+    """Find pixels that differ from one beside, above or below them; one row an image."""
+    level = radiance.clamp(0, 1).sqrt()
+    marked = torch.zeros(radiance.shape[:2], dtype=torch.bool)
+    across = (level[:, 1:] - level[:, :-1]).abs().amax(dim=-1) > _UNEVEN
+    down = (level[1:] - level[:-1]).abs().amax(dim=-1) > _UNEVEN
+    marked[:, 1:] |= across
+    marked[:, :-1] |= across
+    marked[1:] |= down
+    marked[:-1] |= down
+    return marked.reshape(-1)

@@ -1,0 +1,225 @@
+"""Sparse clouds with tracks from the truth, as if structure from motion had run."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.config import require
+from pimper_torch.evidence.scenes.render_in_memory import RenderedScene
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.records import Cameras, Mesh, SparseScene
+from pimper_torch.sfm.colmap import pinhole_lenses
+from pimper_torch.sfm.model import SparseModel
+
+
+def sparse_scene(
+    scene: RenderedScene,
+    num_points: int,
+    generator: torch.Generator,
+    *,
+    min_views: int = 3,
+    noise_px: float = 0.0,
+    outlier_fraction: float = 0.0,
+    in_views: tuple[int, ...] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> SparseScene:
+    """Sample visible surface points, follow them through the views and triangulate them.
+
+    Without noise the points lie on the surface to the precision of the depth maps. Noise
+    is put on the observations, and the points are triangulated from those again, so that
+    their errors are along the rays as in real clouds.
+
+    Args:
+        generator: Decides which points, and the noise.
+        outlier_fraction: Fraction of the points that are moved along their first ray by up to
+            half their depth, keeping their short, wrong tracks.
+        in_views: Pick points in the maps of these views; ``None`` is all of them, so that
+            some points lie on sides that the middle view does not see.
+        dtype: Of photographs, cameras and points; the default is what structure from
+            motion gives.
+    """
+    require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
+    require(0 <= outlier_fraction < 1, "outlier_fraction", outlier_fraction, "at least 0, below 1")
+    cameras = scene.cameras
+    views = tuple(range(cameras.num_views)) if in_views is None else in_views
+    points = _pick(scene, views, 4 * num_points, generator)
+    pixels, seen = _follow(scene, points)
+    (kept,) = torch.nonzero(seen.sum(dim=1) >= min_views, as_tuple=True)
+    kept = kept[:num_points]
+    points, pixels, seen = points[kept], pixels[kept], seen[kept]
+    if noise_px > 0:
+        spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+        pixels = pixels + noise_px * spread.to(pixels)
+        points = triangulate_rays(cameras, pixels, seen)
+    num_outliers = round(outlier_fraction * len(points))
+    if num_outliers > 0:
+        points, seen = _mislead(points, seen, cameras, num_outliers, generator)
+    where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
+    errors = (where - pixels).norm(dim=-1)
+    point_index, view_index = torch.nonzero(seen, as_tuple=True)
+    return SparseScene(
+        views=scene.views.replace(images=scene.views.images.to(dtype)),
+        cameras=cameras.replace(
+            intrinsics=cameras.intrinsics.to(dtype),
+            cam_from_world=cameras.cam_from_world.to(dtype),
+        ),
+        points_world=points.to(dtype),
+        reprojection_errors_px=((errors * seen).sum(dim=1) / seen.sum(dim=1)).to(dtype),
+        observation_point=point_index,
+        observation_view=view_index,
+        observation_pixels=pixels[seen].to(dtype),
+        lenses=pinhole_lenses(cameras),
+    )
+
+
+def _pick(
+    scene: RenderedScene, views: tuple[int, ...], count: int, generator: torch.Generator
+) -> Float[Tensor, "point 3"]:
+    """Unproject pixels drawn at random from the depth maps of some views."""
+    cameras, found = scene.cameras, []
+    fraction = -(-count // len(views))
+    for view in views:
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
+        (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
+        hit = hit[torch.randperm(len(hit), generator=generator)[:fraction]]
+        pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)[hit]
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+        found.append(cameras.centers_world[view] + depth[hit, None] * rays)
+    points = torch.cat(found)
+    return points[torch.randperm(len(points), generator=generator)]
+
+
+def _follow(
+    scene: RenderedScene, points: Float[Tensor, "point 3"]
+) -> tuple[Float[Tensor, "point view 2"], Bool[Tensor, "point view"]]:
+    """Project points to all views, and compare their depth with what is seen there.
+
+    A point counts as seen when the depths of the 3x3 pixels round it bracket its own and
+    lie on one surface. The rim of an object, and the image's border, are left out.
+    """
+    cameras = scene.cameras
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    seen = torch.zeros(depth.shape, dtype=torch.bool)
+    for view in range(cameras.num_views):
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        u, v = pixels[view].floor().long().unbind(dim=-1)
+        framed = (depth[view] > 0) & (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)
+        (inside,) = torch.nonzero(framed, as_tuple=True)
+        patch = torch.stack(
+            [
+                scene.depth[view, v[inside] + dv, u[inside] + du]
+                for dv in (-1, 0, 1)
+                for du in (-1, 0, 1)
+            ]
+        ).to(depth)
+        own = depth[view, inside]
+        slack = 1e-4 * own
+        smooth = patch.amax(dim=0) - patch.amin(dim=0) < 0.05 * own
+        bracketed = (own > patch.amin(dim=0) - slack) & (own < patch.amax(dim=0) + slack)
+        seen[view, inside] = smooth & bracketed
+    return pixels.movedim(0, 1), seen.mT
+
+
+def _mislead(
+    points: Float[Tensor, "point 3"],
+    seen: Bool[Tensor, "point view"],
+    cameras: Cameras,
+    count: int,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, "point view"]]:
+    """Move the first ``count`` points along their first rays; keep two views of each."""
+    wrong: Int[Tensor, " point"] = torch.arange(count)
+    order = torch.cumsum(seen[wrong].long(), dim=1)
+    seen = torch.cat([seen[wrong] & (order <= 2), seen[count:]])
+    first = seen[wrong].long().argmax(dim=1)
+    eyes = cameras.centers_world[first]
+    factor = 1 + (torch.rand(count, 1, generator=generator, dtype=torch.float64) - 0.5).to(points)
+    moved = eyes + factor * (points[wrong] - eyes)
+    return torch.cat([moved, points[count:]]), seen
+
+
+_STEEPEST = 0.2  # cosine below which a surface is too slanted for its features to be found
+_CLEARANCE = 1e-3  # of the distance to the camera
+
+
+def true_model(
+    surface: Mesh,
+    blockers: Mesh,
+    cameras: Cameras,
+    names: tuple[str, ...],
+    generator: torch.Generator,
+    *,
+    num_points: int = 1500,
+    min_views: int = 3,
+) -> tuple[SparseModel, Float[Tensor, "point channel"]]:
+    """Draw points evenly over a surface and follow them through the photographs.
+
+    Args:
+        surface: Where the points lie; it has an albedo.
+        blockers: Everything that may stand in front of them.
+        num_points: At most; fewer where less of the surface is seen.
+        min_views: Views that see a point at least, or all there are.
+
+    Returns:
+        Cameras, points and exact observations, and the points' albedo.
+    """
+    points, normals, albedo = _scatter(surface, 6 * num_points, generator)
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    seen = _seen(points, normals, pixels, depth, blockers, cameras)
+    fewest = min(min_views, cameras.num_views)
+    (kept,) = torch.nonzero(seen.sum(dim=0) >= fewest, as_tuple=True)
+    kept = kept[:num_points]
+    point, view = torch.nonzero(seen[:, kept].mT, as_tuple=True)
+    model = SparseModel(
+        names=names,
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.double(),
+        points_world=points[kept],
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, kept[point]],
+    )
+    return model, albedo[kept]
+
+
+def _scatter(
+    mesh: Mesh, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, "point channel"]]:
+    """Draw points, their faces' normals and their albedo, evenly by area."""
+    assert mesh.albedo is not None
+    normals = face_normals(mesh.vertices_world, mesh.faces)
+    area = normals.norm(dim=-1).cumsum(dim=0)
+    draws = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    face = torch.searchsorted(area, draws[:, 0] * area[-1]).clamp_max(len(mesh.faces) - 1)
+    root = draws[:, 1].sqrt()
+    weights = torch.stack([1 - root, root * (1 - draws[:, 2]), root * draws[:, 2]], dim=-1)
+    corners = mesh.faces[face]
+    points = (weights[..., None] * mesh.vertices_world[corners]).sum(dim=1)
+    albedo = (weights[..., None] * mesh.albedo.double()[corners]).sum(dim=1)
+    return points, normals[face] / normals[face].norm(dim=-1, keepdim=True), albedo
+
+
+def _seen(
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    pixels: Float[Tensor, "view point 2"],
+    depth: Float[Tensor, "view point"],
+    blockers: Mesh,
+    cameras: Cameras,
+) -> Bool[Tensor, "view point"]:
+    caster = RayCaster(blockers.vertices_world, blockers.faces)
+    found = []
+    for view in range(cameras.num_views):
+        eye = cameras.centers_world[view]
+        toward = eye - points
+        distance = toward.norm(dim=-1)
+        facing = (normals * toward).sum(dim=-1) > _STEEPEST * distance
+        size = cameras.sizes_px[view].to(pixels)
+        framed = (depth[view] > 0) & ((pixels[view] > 1) & (pixels[view] < size - 1)).all(dim=-1)
+        hidden = caster.occluded(points, eye, _CLEARANCE * distance)
+        found.append(facing & framed & ~hidden)
+    return torch.stack(found)

@@ -1,0 +1,366 @@
+"""Alignment: bas-relief transforms that make neighbouring patches agree."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.config import Range, require_ranges
+from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.linalg.sums import average
+from pimper_torch.paper.seams import (
+    Pulls,
+    Seams,
+    curvature_along,
+    find_seams,
+    meet_overlaps,
+    mismatches,
+    seam_stiffness,
+    solve_transforms,
+    transformed,
+)
+from pimper_torch.progress import report
+from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
+from pimper_torch.stage import Stage
+
+# Height fields this close, in edge lengths, agree.
+SAME_PLACE = 5e-3
+
+# A seam that fewer rays than this fraction meet says nothing of its patches.
+_MET_ENOUGH = 0.25
+
+
+def common_distance(
+    distance: Float[Tensor, "*sample"], met: Bool[Tensor, "*sample"]
+) -> Float[Tensor, ""]:
+    """Return the distance that half of all samples stay below, at least ``SAME_PLACE``."""
+    return distance[met].median().clamp_min(SAME_PLACE)
+
+
+def patch_status(
+    facets: Int[Tensor, "seam 2"], met: Bool[Tensor, "seam ray"], count: int
+) -> Int[Tensor, " face"]:
+    """Assign every patch its :class:`~pimper_torch.records.AlignStatus`."""
+    overlapping = met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
+    status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
+    status[facets[overlapping].flatten()] = int(AlignStatus.ALIGNED)
+    return status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Anchors(Record):
+    """The vertices of every facet, which its height field is to pass through.
+
+    Attributes:
+        samples: ``(x, y, z)`` of the height field over the vertex, before any transform, patch
+            frame.
+        variance: Of the vertex along the facet's normal, scene units squared.
+        known: Whether there is height field over the vertex.
+    """
+
+    samples: Float[Tensor, "face 3 3"]
+    variance: Float[Tensor, "face 3"]
+    known: Bool[Tensor, "face 3"]
+
+
+def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
+    """Anchor every height field at its facet's three vertices."""
+    faces, covariance = patches.coarse.mesh.faces, patches.coarse.covariance_world
+    vertices = patches.coarse.mesh.vertices_world[faces].double()
+    samples = torch.zeros_like(vertices)
+    variance = torch.zeros_like(samples[..., 0])
+    known = torch.zeros_like(faces, dtype=torch.bool)
+    for templates, depths in zip(patches.buckets, buckets, strict=True):
+        facet, frames = templates.facet, templates.patch_from_world.double()
+        across = transform(frames, vertices[facet])[..., :2]
+        grid = templates.origin.double(), templates.spacing.double()
+        height = sample_raster(depths.depth[:, None], across, *grid, valid=depths.valid)
+        support = sample_raster(depths.valid[:, None].to(depths.depth), across, *grid)
+        found = torch.cat([across, height.mT], dim=-1)
+        samples = samples.index_copy(0, facet, found)
+        known[facet] = support[:, 0] > 0.5
+        if covariance is not None:
+            along = frames[:, None, 2, :3, None]
+            spread = along.mT @ covariance[faces[facet]].double() @ along
+            variance[facet] = spread[..., 0, 0].clamp_min(0)
+    return Anchors(samples=samples, variance=variance, known=known)
+
+
+def anchor_certainty(
+    variance: Float[Tensor, "*batch"], noise: Float[Tensor, ""]
+) -> Float[Tensor, "*batch"]:
+    r"""Return the weight of anchors, :math:`s^2 / (s^2 + \sigma^2)`: 1 for an exact one.
+
+    Args:
+        variance: :math:`\sigma^2` of each point, along the height field's z.
+        noise: s, the height fields' own error, from the disagreement at the seams.
+    """
+    return noise.square() / (noise.square() + variance)
+
+
+# An arc over an edge whose centre stands out by 0.7 % of its length has this C; flatter
+# height fields are not told apart.
+_FLAT = 3e-3
+
+# Vertices that were filled in between points of the cloud are guesses.
+_FILLED_VERTEX = 0.1
+
+# Solves within the first round, so that weights that depend on the answer settle; later
+# rounds begin nearer to it and take one less.
+_REWEIGHTINGS = 3
+
+
+# Lines of samples across each overlap, samples along each, and the distance of the outermost lines
+# from the edge in template samples: `paper` has overlaps of 6.
+_ROWS, _COLUMNS, _REACH = 3, 12, 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignConfig:
+    """Settings of the alignment.
+
+    Attributes:
+        iterations: Rounds: meeting the overlaps as transformed so far, and solving.
+        anchor: Weight of a facet's vertex next to the agreement of a seam; less for points whose
+            uncertainty exceeds the disagreement at the seams.
+        prior: Weight that holds each transform at the identity. Where neighbours agree but
+            for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
+            4 %; where they agree in nothing, 1e-4 lets them be flattened.
+        scale_limit: Maximum factor by which a height field is flattened or stretched.
+    """
+
+    iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
+    anchor: Annotated[float, Range(least=0, most=1e12)] = 1.0
+    prior: Annotated[float, Range(above=0, most=1e12)] = 3e-4
+    scale_limit: Annotated[float, Range(above=1)] = 4.0
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Problem(Record):
+    """What stays the same from round to round; lengths in scene units."""
+
+    patches: PatchSet
+    seams: Seams
+    vertices: Anchors
+    unit: Float[Tensor, ""]
+
+    @property
+    def in_scene(self) -> Float[Tensor, " 4"]:
+        """What carries transforms from units of the edge length to scene units."""
+        return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
+
+
+class Align(Stage):
+    r"""Undo the bas-relief transform that photometry leaves each patch with.
+
+    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z)`
+    in its own frame, without contradicting its photographs. All h are found together: rays along
+    the bisector of two facets' normals meet both height fields over the edge they share, and
+
+    .. math::
+        \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
+        - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'} |^2}
+
+    with P the foot points on the facets' planes and N their normals. Each round meets the
+    overlaps anew and solves one sparse linear system.
+
+    :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, with C the mean square of the height field's
+    curvature along the seam times the edge's length, which grows as :math:`h_z^2`: flattening both
+    height fields does not make :math:`k |r|^2` smaller. The derivative of k enters the right-hand
+    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve.
+
+    Over coplanar facets a common affine change leaves height fields in agreement, and
+    :math:`h = 0` has no error. Folds determine scales; anchors, each height field passing through
+    its facet's vertices, determine tilts; the prior toward the identity determines the rest. A
+    patch that meets no neighbour stays on the mesh, where its own anchors put it.
+
+    Invariant to rigid motions and the scale of the world. Differentiable in the depths.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
+    ours.
+    """
+
+    def __init__(self, config: AlignConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or AlignConfig()
+
+    def forward(self, depths: DepthPatches) -> DepthPatches:
+        """Align all patches.
+
+        Returns:
+            Changed depths with their transforms, an :class:`~pimper_torch.records.AlignStatus`
+            each, and the distance of neighbours before and after each round; the input where no
+            patch meets a neighbour.
+        """
+        config, patches = self.config, depths.patches
+        seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)
+        if len(seams.facets) == 0:
+            return depths
+        problem = _Problem(
+            patches=patches,
+            seams=seams,
+            vertices=vertex_anchors(patches, depths.buckets),
+            unit=seams.edge_lengths.median(),
+        )
+        # h_0 is in units of the edge length here, so that no term of the system has a unit.
+        identity = problem.unit.new_tensor([0, 0, 1, 0])
+        transforms = identity.expand(patches.num_patches, 4)
+        apart = []
+        for done in range(config.iterations):
+            pulls = self._met(problem, depths, transforms)
+            if not bool((pulls.weight > 0).any()):
+                return depths
+            apart.append(_root_mean_square(pulls, transforms))
+            transforms = self._solve_round(pulls, transforms, fresh=done == 0)
+            report(done + 1, config.iterations)
+        with torch.no_grad():
+            pulls = self._met(problem, depths, transforms)
+            status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
+        aligned = (status == int(AlignStatus.ALIGNED))[:, None]
+        if not bool(aligned.all()):
+            on_mesh = self._on_mesh(problem, pulls, transforms)
+            transforms = torch.where(aligned, transforms, on_mesh)
+            with torch.no_grad():
+                pulls = self._met(problem, depths, transforms)
+        with torch.no_grad():
+            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
+        return depths.replace(
+            buckets=_apply(depths, transforms * problem.in_scene, status),
+            mismatch=mismatch.detach().to(depths.buckets[0].depth),
+        )
+
+    def _on_mesh(
+        self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
+    ) -> Float[Tensor, "face 4"]:
+        """Put every height field where its own anchors alone have it."""
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        everyone = torch.ones_like(transforms[:, 0])
+        held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
+        nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
+        identity = transforms.new_tensor([0, 0, 1, 0]).expand_as(transforms)
+        found = solve_transforms(held, identity, *nothing)
+        return _limit_scales(found, self.config.scale_limit)
+
+    def _met(
+        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
+    ) -> Pulls:
+        """Meet the overlaps as transformed so far, and list what follows from that."""
+        seams, unit = problem.seams, problem.unit
+        overlaps = meet_overlaps(
+            seams, problem.patches, depths.buckets, transforms * problem.in_scene
+        )
+        met = overlaps.met.flatten(1)
+        prior = unit.new_full((4,), self.config.prior)
+        prior[3] = torch.inf  # patches do not move along their normals
+        count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
+        corners = _with_one(problem.vertices.samples / unit)
+        pulls = Pulls(
+            facets=seams.facets,
+            normals=seams.normals,
+            samples=_with_one(overlaps.samples.flatten(2, 3) / unit),
+            gap=(overlaps.feet[:, 0] - overlaps.feet[:, 1]).flatten(1, 2) / unit,
+            weight=met.to(unit) / count[:, None],
+            curvature=curvature_along(overlaps.samples[..., 2], overlaps.met, seams.edge_lengths),
+            corners=corners,
+            corner_weight=torch.zeros_like(corners[..., 0]),
+            prior_weight=prior,
+        )
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
+        touching = seams.facets[met.any(dim=1)].flatten()
+        moves = torch.zeros_like(corners[:, 0, 0]).index_fill(0, touching, 1)
+        return self._anchored(pulls, problem, _noise(pulls, distance), moves)
+
+    def _anchored(
+        self,
+        pulls: Pulls,
+        problem: _Problem,
+        noise: Float[Tensor, ""],
+        moves: Float[Tensor, " face"],
+    ) -> Pulls:
+        """Add what holds height fields to vertices, for the patches that may move."""
+        vertices, coarse = problem.vertices, problem.patches.coarse
+        is_point = coarse.is_point[coarse.mesh.faces]
+        certain = anchor_certainty(vertices.variance / problem.unit.square(), noise)
+        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
+        return pulls.replace(corner_weight=self.config.anchor * weight * moves[:, None])
+
+    def _solve_round(
+        self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
+    ) -> Float[Tensor, "face 4"]:
+        for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
+            distance = mismatches(pulls, transforms).norm(dim=-1)
+            terms = _curvature_terms(pulls, transforms, distance)
+            # What tilts and shifts can repair says nothing about scales.
+            only_level = fresh and solve == 0
+            transforms = solve_transforms(
+                _with_scales_held(pulls) if only_level else pulls, transforms, *terms
+            )
+            limited = _limit_scales(transforms, self.config.scale_limit)
+            if not torch.equal(limited, transforms):
+                transforms = solve_transforms(_with_scales_held(pulls), limited, *terms)
+        return transforms
+
+
+def _curvature_terms(
+    pulls: Pulls, transforms: Float[Tensor, "face 4"], distance: Float[Tensor, "seam ray"]
+) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
+    """Return k of every seam, and what its derivative adds to the right-hand sides."""
+    scales = transforms[pulls.facets, 2]
+    stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
+    apart = (pulls.weight * distance.square()).sum(dim=1)
+    return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
+
+
+def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
+    """Estimate by how much one height field is off, from how far two are apart."""
+    met = pulls.weight > 0
+    return (
+        common_distance(distance, met) / 2**0.5
+        if bool(met.any())
+        else torch.ones_like(distance.sum())
+    )
+
+
+def _with_scales_held(pulls: Pulls) -> Pulls:
+    held = pulls.prior_weight.clone()
+    held[2] = torch.inf
+    return pulls.replace(prior_weight=held)
+
+
+def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Tensor, "face 4"]:
+    hx, hy, hz, h0 = transforms.unbind(dim=-1)
+    return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
+
+
+def _with_one(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
+
+
+def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, ""]:
+    square = mismatches(pulls, transforms).square().sum(dim=-1)
+    return average(square[pulls.weight > 0]).sqrt()
+
+
+def _apply(
+    depths: DepthPatches, transforms: Float[Tensor, "face 4"], status: Int[Tensor, " face"]
+) -> tuple[Depths, ...]:
+    buckets = []
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
+        own = transforms[templates.facet]
+        depth = transformed(templates.points_patch.double(), height_field.depth.double(), own)
+        # Transforms chain: whoever aligns twice still learns the way from the first height field.
+        chained = own[:, 2:3] * height_field.transform + own * own.new_tensor([1, 1, 0, 1])
+        buckets.append(
+            height_field.replace(
+                depth=depth.to(height_field.depth),
+                transform=chained.to(height_field.transform),
+                status=status[templates.facet],
+            )
+        )
+    return tuple(buckets)

@@ -1,1 +1,0 @@
-"""Reliefs of all patches, put in one frame."""

@@ -1,0 +1,303 @@
+"""Points of the cloud: reliable ones, a well-spread subset, and vertices filled in between them."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, Delaunay, cKDTree
+from torch import Tensor
+
+from pimper_torch.coarse.covariances import point_covariances
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import barycentric_2d
+from pimper_torch.records import Cameras, CoarseMesh, FacetPoints, Mesh, SparseScene
+
+
+def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:
+    """Find the views whose optical axes are within an angle of the reference's."""
+    axes = cameras.cam_from_world[:, 2, :3]
+    cosine = (axes @ axes[reference]).clamp(-1, 1)
+    return cosine >= torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
+
+
+def behind_others(
+    pixels: Float[Tensor, "point 2"],
+    points_cam: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, " point"],
+    *,
+    neighbours: int,
+    slope: float,
+) -> Bool[Tensor, " point"]:
+    """Find points that a nearer surface occludes in the image, or probably does.
+
+    Of the nearest points in the image those count that are nearer to the camera by more than
+    ``slope`` times their lateral distance. If three or more leave no open half-plane, the point is
+    occluded. If they are all on one side, as beside a contour or where the surface is steep, it is
+    occluded only if the view has no observation of it.
+    """
+    nearest = nearest_in_image(pixels, neighbours)
+    steps = points_cam[nearest] - points_cam[:, None]
+    front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > slope)
+    count = front.sum(dim=1)
+    aside = pixels[nearest] - pixels[:, None]
+    angle = torch.atan2(aside[..., 1], aside[..., 0])
+    ordered = torch.where(front, angle, torch.inf).sort(dim=1).values
+    gaps = torch.diff(ordered, dim=1)
+    widest = torch.where(gaps.isfinite(), gaps, 0).amax(dim=1)
+    last = ordered.gather(1, (count - 1).clamp_min(0)[:, None])[:, 0]
+    widest = torch.maximum(widest, ordered[:, 0] + 2 * torch.pi - last)
+    return (count >= 3) & ((widest < torch.pi) | ~observed)
+
+
+def neighbours_agree(
+    pixels: Float[Tensor, "point 2"],
+    points_cam: Float[Tensor, "point 3"],
+    *,
+    neighbours: int,
+    max_slope: float,
+    max_deviation: float,
+) -> Bool[Tensor, " point"]:
+    """Find points that lie on the same surface as those around them in the image.
+
+    A point of another surface is steep against most of them: ``|dz|`` over the lateral distance
+    exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more than
+    ``max_deviation`` of the neighbourhood's radius. The worst are dropped first, in rounds, so that
+    one outlier does not take its neighbours along.
+    """
+    keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    for fraction in (0.9, 0.75, 0.6, 0.5):
+        index = keep.nonzero()[:, 0]
+        if len(index) <= neighbours:
+            break
+        nearest = nearest_in_image(pixels[index], neighbours)
+        steep = _steepness(points_cam[index], nearest) > max_slope
+        off = _deviation(points_cam[index], nearest) > max_deviation
+        keep[index[(steep.float().mean(dim=1) > fraction) | off]] = False
+    return keep
+
+
+def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor, "point {count}"]:
+    """List every point's nearest others."""
+    coordinates = pixels.detach().cpu().numpy()
+    _, index = cKDTree(coordinates).query(coordinates, k=list(range(2, count + 2)))
+    return torch.as_tensor(index, device=pixels.device)
+
+
+def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
+    """Find the corners of the points' convex hull in the image.
+
+    Chosen before all others, they let the mesh reach as far as the cloud does.
+    """
+    corners = ConvexHull(pixels.detach().cpu().double().numpy()).vertices
+    marked = torch.zeros(len(pixels), dtype=torch.bool)
+    marked[torch.from_numpy(corners.astype("int64"))] = True
+    return marked.to(pixels.device)
+
+
+def well_accompanied(
+    pixels: Float[Tensor, "point 2"], max_isolation: float
+) -> Bool[Tensor, " point"]:
+    """Find all points but isolated corners of the hull, one hull after another.
+
+    Isolation is the distance to the third nearest point over the median of its neighbours'.
+    """
+    keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    while keep.sum() > 8:
+        index = keep.nonzero()[:, 0]
+        nearest = nearest_in_image(pixels[index], 8)
+        third = (pixels[index[nearest[:, 2]]] - pixels[index]).norm(dim=-1)
+        isolation = third / third[nearest].median(dim=1).values.clamp_min(1e-9)
+        alone = on_hull(pixels[index]) & (isolation > max_isolation)
+        if not alone.any():
+            break
+        keep[index[alone]] = False
+    return keep
+
+
+def spread(
+    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], distance_px: float
+) -> Int[Tensor, " chosen"]:
+    """Choose points at least ``distance_px`` apart, the best first."""
+    coordinates = pixels.detach().cpu().numpy()
+    close = cKDTree(coordinates).query_ball_point(coordinates, distance_px)
+    blocked = torch.zeros(len(pixels), dtype=torch.bool)
+    chosen: list[int] = []
+    for point in quality.argsort(descending=True, stable=True).tolist():
+        if not blocked[point]:
+            chosen.append(point)
+            blocked[torch.tensor(close[point])] = True
+    return torch.tensor(chosen, dtype=torch.long, device=pixels.device)
+
+
+def spread_to_count(
+    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], target: int
+) -> Int[Tensor, " chosen"]:
+    """Choose about ``target`` well-spread points by bisecting their distance."""
+    if target >= len(pixels):
+        return torch.arange(len(pixels), device=pixels.device)
+    extent = pixels.amax(dim=0) - pixels.amin(dim=0)
+    # Not from the whole image's size down: with such a distance all points are neighbours.
+    low, high = 0.0, float(torch.maximum((extent.prod() / target).sqrt(), extent.norm() / target))
+    chosen = spread(pixels, quality, high)
+    while len(chosen) > target:
+        low, high = high, 2 * high
+        chosen = spread(pixels, quality, high)
+    for _ in range(20):
+        between = (low + high) / 2
+        chosen = spread(pixels, quality, between)
+        low, high = (between, high) if len(chosen) > target else (low, between)
+    return chosen
+
+
+def _steepness(
+    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+) -> Float[Tensor, "point neighbour"]:
+    steps = points_cam[nearest] - points_cam[:, None]
+    return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
+
+
+def _deviation(
+    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+) -> Float[Tensor, " point"]:
+    """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
+    steps = (points_cam[nearest] - points_cam[:, None]).double()
+    radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)
+    scaled = steps / radius[:, None, None]
+    design = torch.cat([scaled[..., :2], torch.ones_like(scaled[..., :1])], dim=-1)
+    ridge = 1e-3 * torch.eye(3, dtype=design.dtype, device=design.device)
+    weight = 1 / (1 + scaled[..., 2].square())  # start from those on the point's own side
+    plane = torch.zeros_like(design[:, 0])
+    for _ in range(5):  # re-weighted: a neighbour across a depth edge must not tilt the plane
+        normal = (weight[..., None] * design).mT @ design + ridge
+        right = ((weight * scaled[..., 2])[..., None] * design).sum(dim=1)
+        plane = torch.linalg.solve(normal, right)
+        residual = (scaled[..., 2] - (design @ plane[..., None])[..., 0]).abs()
+        weight = 1 / (1 + (residual / (residual.median(dim=1).values[:, None] + 0.02)) ** 2)
+    return plane[:, 2].abs().to(points_cam.dtype)
+
+
+# Points that each value of the spline is computed from: one of all points costs the cube of
+# their number. A choice; beyond about 50 nearest ones the value hardly changes.
+_SPLINE_NEIGHBOURS = 50
+
+
+def fill_pixels(
+    pixels: Float[Tensor, "point 2"], faces: Int[Tensor, "face 3"], edge_px: float
+) -> Float[Tensor, "filled 2"]:
+    """Return pixels of a triangular grid, inside facets and away from their vertices."""
+    known = pixels.detach().cpu().double().numpy()
+    low, high = known.min(axis=0), known.max(axis=0)
+    rows = np.arange(low[1], high[1], edge_px * math.sqrt(3) / 2)
+    columns = np.arange(low[0], high[0], edge_px)
+    grid = np.concatenate(
+        [
+            np.stack([columns + (index % 2) * edge_px / 2, np.full_like(columns, v)], axis=1)
+            for index, v in enumerate(rows)
+        ]
+        or [np.zeros((0, 2))]
+    )
+    distance, _ = cKDTree(known).query(grid)
+    proposed = torch.from_numpy(grid[distance > 0.8 * edge_px]).to(pixels)
+    return proposed[_inside_any(proposed, pixels, faces)]
+
+
+def interpolate_inverse_depth(
+    pixels: Float[Tensor, "point 2"],
+    inverse_depth: Float[Tensor, " point"],
+    wanted: Float[Tensor, "filled 2"],
+    smoothing: float,
+) -> Float[Tensor, " filled"]:
+    """Evaluate a smoothing thin-plate spline of inverse depth, which is affine on a plane.
+
+    Args:
+        smoothing: Relative to the spread of the values.
+    """
+    if len(wanted) == 0:
+        return wanted.new_zeros(0)
+    # Local, as it takes long to load and other chains do without.
+    from scipy.interpolate import RBFInterpolator
+
+    known = pixels.detach().cpu().double().numpy()
+    values = inverse_depth.detach().cpu().double().numpy()
+    center, unit = known.mean(axis=0), known.std() + 1e-12
+    spline = RBFInterpolator(
+        (known - center) / unit,
+        values,
+        neighbors=min(_SPLINE_NEIGHBOURS, len(known)),
+        smoothing=smoothing,
+        kernel="thin_plate_spline",
+    )
+    at = (wanted.detach().cpu().double().numpy() - center) / unit
+    return torch.from_numpy(spline(at)).to(inverse_depth)
+
+
+def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
+    """Triangulate points of an image, so that faces show their front to its camera."""
+    simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
+    faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
+    a, b, c = pixels[faces].unbind(dim=1)
+    ab, ac = b - a, c - a
+    rotated = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
+    return torch.where(rotated[:, None], faces.flip(1), faces)
+
+
+def _inside_any(
+    points: Float[Tensor, "filled 2"],
+    pixels: Float[Tensor, "point 2"],
+    faces: Int[Tensor, "face 3"],
+) -> Tensor:
+    kept = {tuple(sorted(face)) for face in faces.tolist()}
+    found = Delaunay(pixels.detach().cpu().double().numpy())
+    simplex = found.find_simplex(points.detach().cpu().double().numpy())
+    allowed = np.array([tuple(sorted(face)) in kept for face in found.simplices.tolist()] + [False])
+    return torch.from_numpy(allowed[simplex]).to(points.device)
+
+
+# Pairs of points and facets that are tested at once; bounds memory to some 100 MB.
+_TESTS_AT_ONCE = 2_000_000
+
+
+def with_cloud(
+    scene: SparseScene,
+    reliable: Int[Tensor, " reliable"],
+    mesh: Mesh,
+    reference: int,
+    source: Int[Tensor, " vertex"],
+) -> CoarseMesh:
+    """Return a coarse mesh of facets and the points of the cloud on them, with covariances.
+
+    Args:
+        source: The point of the cloud at each vertex, -1 for none.
+    """
+    is_point = source >= 0
+    at_vertices = point_covariances(scene, source.clamp_min(0))
+    between = reliable[~torch.isin(reliable, source)]
+    camera = scene.cameras.cam_from_world[reference], scene.cameras.intrinsics[reference]
+    pixels, _ = project(scene.points_world[between], *camera)
+    corners, _ = project(mesh.vertices_world[mesh.faces], *camera)
+    facet = facets_under(pixels, corners)
+    between, facet = between[facet >= 0], facet[facet >= 0]
+    return CoarseMesh(
+        mesh=mesh,
+        reference=reference,
+        is_point=is_point,
+        covariance_world=torch.where(is_point[:, None, None], at_vertices, 0),
+        points=FacetPoints(
+            points_world=scene.points_world[between],
+            covariance_world=point_covariances(scene, between),
+            facet=facet,
+        ),
+    )
+
+
+def facets_under(
+    pixels: Float[Tensor, "point 2"], corners_px: Float[Tensor, "face 3 2"]
+) -> Int[Tensor, " point"]:
+    """Find the facet that contains each point of an image, -1 outside all."""
+    found = []
+    for some in torch.split(pixels, max(1, _TESTS_AT_ONCE // max(1, len(corners_px)))):
+        within = (barycentric_2d(some[:, None], corners_px[None]) >= 0).all(dim=-1)
+        facet = within.to(torch.int8).argmax(dim=1)
+        found.append(torch.where(within.any(dim=1), facet, -1))
+    return torch.cat(found)

@@ -1,0 +1,187 @@
+r"""Refinement: height fields of all patches in, one joined surface out.
+
+.. math:: E(S) = \int \lambda (1 - G) |\cup S_\mu - S|^2 + G |\nabla S|^2
+
+over the flat facets, in linear finite elements on the subdivided mesh: lumped masses, cotangents,
+and G averaged over each face. S is the position of every vertex, so that the three coordinates are
+three right-hand sides of one system.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.config import Range, require_ranges
+from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
+from pimper_torch.fusion.continuation import about_mean
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
+from pimper_torch.geometry.subdivision import Subdivision, subdivide
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.linalg.sums import average
+from pimper_torch.linalg.systems import solutions
+from pimper_torch.records import Convergence, DepthPatches, Record, StopCause, Surface
+from pimper_torch.stage import Stage
+
+# Fidelity, as a fraction of the usual, that ties what no patch supports to the flat facets: it
+# makes the system definite on an island without support, and is nothing elsewhere.
+_TIE = 1e-9
+
+# A needle's area is taken as at least this fraction of its longest edge squared: its cotangents
+# would otherwise spoil the condition of the whole system.
+_MIN_SHAPE = 1e-4
+
+
+def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    r"""Return G: where a facet is a seam and where it is its centre.
+
+    :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
+
+    >>> corner, edge, centre = [1.0, 0, 0], [0.5, 0.5, 0], [1 / 3] * 3
+    >>> seam_weight(torch.tensor([corner, edge, centre]))
+    tensor([0.7071, 0.5000, 0.0000])
+    """
+    return (barycentric - barycentric.roll(1, dims=-1)).abs().sum(dim=-1).sqrt() / 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class System(Record):
+    """Normal equations ``(M + L) S = M (union)``.
+
+    Attributes:
+        rows: Of the entries of ``M + L``; entries named twice add up.
+        values: The entries, float64; symmetric and positive definite.
+    """
+
+    rows: Int[Tensor, " entry"]
+    cols: Int[Tensor, " entry"]
+    values: Float[Tensor, " entry"]
+    mass: Float[Tensor, " vertex"]
+
+
+def assemble(
+    subdivision: Subdivision,
+    fidelity: Float[Tensor, " facet"],
+    supported: Bool[Tensor, " vertex"],
+) -> System:
+    """Assemble the normal equations of the energy; constant to autograd.
+
+    Args:
+        fidelity: Lambda of each facet, 1/length^2.
+        supported: Where the union is known. Elsewhere the mass is nearly zero.
+    """
+    weights = seam_weight(subdivision.barycentric.double())
+    mesh = elements(subdivision.points.detach().double(), subdivision.faces)
+    mass = lumped_mass(mesh, fidelity.double()[subdivision.face_facet])
+    mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
+    seams = weights[subdivision.faces].mean(dim=1)
+    rows, cols, values = cotangent_laplacian(mesh, seams, _MIN_SHAPE)
+    diagonal = torch.arange(mesh.count, device=mass.device)
+    return System(
+        rows=torch.cat([rows, diagonal]),
+        cols=torch.cat([cols, diagonal]),
+        values=torch.cat([values, mass]),
+        mass=mass,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefineConfig:
+    """Settings of the refinement.
+
+    Attributes:
+        smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
+            ``1 / (r * spacing)^2``. Where G is constant, a wave of length ``w`` keeps
+            ``1 / (1 + (2 pi R / w)^2)`` of its height, with ``R = r sqrt(G / (1 - G))`` vertices.
+    """
+
+    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 2.0
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+class Refine(Stage):
+    """Join the patches and smooth their seams, keeping the centre of every facet.
+
+    One sparse factorization of the energy over the subdivided mesh, three right-hand sides.
+    :mod:`~pimper_torch.fusion.blend` is the union. Vertices that no patch supports are filled by
+    the smoothness term and have information 0.
+
+    Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
+    the templates are constants.
+    """
+
+    def __init__(self, config: RefineConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RefineConfig()
+
+    def forward(self, depths: DepthPatches) -> Surface:
+        """Refine the union of all patches.
+
+        The convergence's residual is the root mean square distance between the union and the
+        surface, in scene units. Without any valid height field, as under one light for all views,
+        the surface is that of the facets, its seams smoothed, with information 0.
+        """
+        patches = depths.patches
+        mesh = patches.coarse.mesh
+        spacing = vertex_spacing(patches, 1.0)
+        subdivision = subdivide(mesh.vertices_world.detach(), mesh.faces, spacing)
+        directions = ray_directions(subdivision, patches.coarse).detach()
+        blend = blend_patches(depths, subdivision, directions, torch.inf)
+        if not bool(blend.supported.any()):
+            blend = blend.replace(supported=torch.ones_like(blend.supported))
+        points = subdivision.points + blend.heights[:, None] * directions
+        radius = self.config.smoothing_radius_samples
+        refined = smooth_seams(subdivision, points, blend.supported, spacing, radius)
+        vertices = refined.to(points)
+        apart = (refined - points.double())[blend.supported].detach()
+        return Surface(
+            vertices_world=vertices,
+            faces=subdivision.faces,
+            facet=subdivision.facet,
+            barycentric=subdivision.barycentric,
+            normals_world=_normals(blend, vertices, subdivision),
+            albedo=about_mean(blend.albedo, blend.observed, face_edges(subdivision.faces)[0]),
+            information=blend.normal_information,
+            height_information=blend.offset_information,
+            convergence=Convergence(
+                iterations=torch.ones(1, dtype=torch.long, device=points.device),
+                residual=average(apart.square().sum(dim=-1)).sqrt()[None].to(points),
+                cause=torch.full((1,), int(StopCause.CONVERGED), device=points.device),
+            ),
+        )
+
+
+def smooth_seams(
+    subdivision: Subdivision,
+    points: Float[Tensor, "vertex 3"],
+    supported: Bool[Tensor, " vertex"],
+    spacing: Float[Tensor, " facet"],
+    radius: float,
+) -> Float[Tensor, "vertex 3"]:
+    """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.
+
+    Args:
+        points: The union of the patches at each vertex.
+        supported: Where the union is known.
+        radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
+    """
+    fidelity = (radius * spacing.double()) ** -2
+    system = assemble(subdivision, fidelity, supported)
+    rhs = system.mass[:, None] * points.double()
+    (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
+    return found
+
+
+def _normals(
+    blend: Blend, vertices: Float[Tensor, "vertex 3"], subdivision: Subdivision
+) -> Float[Tensor, "vertex 3"]:
+    """Take photometric normals where there are any, else those of the surface itself."""
+    own = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
+    photometric = blend.seen & (blend.normals_world.detach().norm(dim=-1) > 0.5)
+    return torch.where(photometric[:, None], blend.normals_world, own)

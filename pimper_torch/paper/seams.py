@@ -1,0 +1,338 @@
+r"""Seams of neighbouring patches: the rays that meet both, and the equations of the alignment.
+
+The unknown of a patch is :math:`h_\mu = (h_x, h_y, h_z, h_0)`; its height field becomes
+:math:`h_\mu^T S` with :math:`S = (x, y, z, 1)`. Lengths of the equations are in units of one length
+of the mesh, so that all terms, and their weights, have no unit.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.height_fields import intersect_height_field
+from pimper_torch.geometry.topology import face_pairs
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.records import PatchSet, Record
+from pimper_torch.records.patches import Depths, Templates
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Seams(Record):
+    """Rays through the strips along shared edges.
+
+    Attributes:
+        origins: A point of each ray, world; rows are lines parallel to the edge.
+        directions: Of all rays of a seam: the bisector of the two inward normals; unit.
+        normals: Inward unit normals of the two facets, world.
+        seam_of: The seams of every facet, -1 for an edge without a neighbour.
+        place_of: Index of each seam and side in ``seam_of``, flattened.
+    """
+
+    facets: Int[Tensor, "seam 2"]
+    origins: Float[Tensor, "seam row column 3"]
+    directions: Float[Tensor, "seam 3"]
+    normals: Float[Tensor, "seam 2 3"]
+    edge_lengths: Float[Tensor, " seam"]
+    seam_of: Int[Tensor, "face 3"]
+    place_of: Int[Tensor, "seam 2"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Overlaps(Record):
+    """The two height fields of every seam, met by the same rays.
+
+    Attributes:
+        samples: ``(x, y, z)`` of the patch's own height field, before any transform, patch frame.
+        feet: The foot points of the samples on their facets' planes, world.
+        met: True where both height fields were met.
+    """
+
+    samples: Float[Tensor, "seam 2 row column 3"]
+    feet: Float[Tensor, "seam 2 row column 3"]
+    met: Bool[Tensor, "seam row column"]
+
+
+def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float) -> Seams:
+    """Lay rays over all edges that two facets share.
+
+    Args:
+        reach_samples: Distance of the outermost lines from the edge, in template samples.
+    """
+    frames, spacing = _by_facet(patches)
+    vertices = patches.coarse.mesh.vertices_world.double()
+    facets, ends = face_pairs(patches.coarse.mesh.faces)
+    normals = frames[facets, 2, :3]
+    directions = normalize(normals.sum(dim=1), dim=-1)
+    start, end = vertices[ends].unbind(dim=1)
+    edge_lengths = (end - start).norm(dim=-1)
+    across = normalize(torch.linalg.cross(directions, end - start), dim=-1)
+
+    along = (torch.arange(columns, device=start.device, dtype=start.dtype) + 0.5) / columns
+    offset = torch.linspace(-1, 1, rows, device=start.device, dtype=start.dtype)
+    reach = reach_samples * spacing[facets].mean(dim=1)
+    on_edge = start[:, None] + along[:, None] * (end - start)[:, None]
+    beside = (reach[:, None] * offset)[..., None] * across[:, None]
+    seam_of, place_of = _places(facets, len(frames))
+    return Seams(
+        facets=facets,
+        origins=on_edge[:, None] + beside[:, :, None],
+        directions=directions,
+        normals=normals,
+        edge_lengths=edge_lengths,
+        seam_of=seam_of,
+        place_of=place_of,
+    )
+
+
+def meet_overlaps(
+    seams: Seams,
+    patches: PatchSet,
+    buckets: tuple[Depths, ...],
+    transforms: Float[Tensor, "face 4"],
+) -> Overlaps:
+    """Meet both height fields of every seam, as transformed now, with the seam's rays.
+
+    Differentiable in the depths and the transforms.
+    """
+    found = [
+        _meet_bucket(seams, templates, depths, transforms[templates.facet])
+        for templates, depths in zip(patches.buckets, buckets, strict=True)
+    ]
+    facets = torch.cat([templates.facet for templates in patches.buckets])
+    position = torch.empty_like(facets)
+    position[facets] = torch.arange(len(facets), device=facets.device)
+    rows, columns = seams.origins.shape[1:3]
+
+    def pick(parts: list[Tensor]) -> Tensor:
+        by_place = torch.cat(parts)[position].flatten(0, 1)[seams.place_of]
+        return by_place.reshape(*seams.place_of.shape, rows, columns, *by_place.shape[3:])
+
+    samples, feet, met = (pick(list(parts)) for parts in zip(*found, strict=True))
+    return Overlaps(samples=samples, feet=feet, met=met.all(dim=1))
+
+
+def _meet_bucket(
+    seams: Seams,
+    templates: Templates,
+    depths: Depths,
+    transforms: Float[Tensor, "patch 4"],
+) -> tuple[
+    Float[Tensor, "patch 3 ray 3"], Float[Tensor, "patch 3 ray 3"], Bool[Tensor, "patch 3 ray"]
+]:
+    count = len(templates.facet)
+    own = seams.seam_of[templates.facet]
+    seam = own.clamp_min(0)
+    patch_from_world = templates.patch_from_world.double()
+    origins_world = seams.origins.flatten(1, 2)[seam]
+    directions_world = seams.directions[seam][:, :, None].expand_as(origins_world)
+    origins = transform(patch_from_world, origins_world.flatten(1, 2))
+    directions = rotate(patch_from_world, directions_world.flatten(1, 2))
+    # A ray meets the transformed height field where the ray transformed back meets the height
+    # field.
+    points, hit = intersect_height_field(
+        depths.depth,
+        depths.valid,
+        templates.origin.double(),
+        templates.spacing.double(),
+        *_transformed_back(origins, directions, transforms),
+    )
+    feet = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], dim=-1)
+    shape = (count, 3, origins_world.shape[2])
+    return (
+        points.reshape(*shape, 3),
+        transform(invert_rigid(patch_from_world), feet).reshape(*shape, 3),
+        hit.reshape(shape) & (own >= 0)[..., None],
+    )
+
+
+def _transformed_back(
+    origins: Float[Tensor, "patch ray 3"],
+    directions: Float[Tensor, "patch ray 3"],
+    transforms: Float[Tensor, "patch 4"],
+) -> tuple[Float[Tensor, "patch ray 3"], Float[Tensor, "patch ray 3"]]:
+    hx, hy, hz, h0 = transforms[:, :, None].unbind(dim=1)
+    height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
+    sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]
+    return (
+        torch.cat([origins[..., :2], (height / hz)[..., None]], dim=-1),
+        torch.cat([directions[..., :2], (sinking / hz)[..., None]], dim=-1),
+    )
+
+
+def transformed(
+    points: Float[Tensor, "patch height width 3"],
+    depth: Float[Tensor, "patch height width"],
+    transforms: Float[Tensor, "patch 4"],
+) -> Float[Tensor, "patch height width"]:
+    """Apply bas-relief transforms: ``h . (x, y, z, 1)``; x and y are taken from ``points``."""
+    hx, hy, hz, h0 = transforms[:, :, None, None].unbind(dim=1)
+    return hx * points[..., 0] + hy * points[..., 1] + hz * depth + h0
+
+
+def _by_facet(
+    patches: PatchSet,
+) -> tuple[Float[Tensor, "face 4 4"], Float[Tensor, " face"]]:
+    order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
+    frames = torch.cat([templates.patch_from_world for templates in patches.buckets])
+    spacing = torch.cat([templates.spacing for templates in patches.buckets])
+    return frames[order].double(), spacing[order].double()
+
+
+def _places(
+    facets: Int[Tensor, "seam 2"], count: int
+) -> tuple[Int[Tensor, "face 3"], Int[Tensor, "seam 2"]]:
+    """Number the seams of each facet from 0."""
+    facet = facets.reshape(-1)
+    order = torch.argsort(facet, stable=True)
+    per_facet = torch.bincount(facet, minlength=count)
+    first = torch.cumsum(per_facet, dim=0) - per_facet
+    rank = torch.empty_like(facet)
+    rank[order] = torch.arange(len(facet), device=facet.device) - first[facet[order]]
+    place = 3 * facet + rank
+    seam_of = torch.full((3 * count,), -1, dtype=torch.long, device=facet.device)
+    seam_of[place] = torch.arange(len(facets), device=facet.device).repeat_interleave(2)
+    return seam_of.reshape(count, 3), place.reshape(-1, 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pulls(Record):
+    """The terms of the alignment.
+
+    Attributes:
+        normals: Inward unit normals of the facets, world.
+        samples: ``S`` of both height fields where a ray meets them.
+        gap: Foot point of the first sample minus that of the second, world.
+        weight: Of each ray, 0 where ignored; adds up to at most 1 over a seam.
+        curvature: ``C`` of both height fields before any transform; see :func:`curvature_along`.
+        corners: ``S`` of every height field at its facet's corners.
+        prior_weight: Of each component of h, towards the identity; infinite for fixed ones.
+    """
+
+    facets: Int[Tensor, "seam 2"]
+    normals: Float[Tensor, "seam 2 3"]
+    samples: Float[Tensor, "seam 2 ray 4"]
+    gap: Float[Tensor, "seam ray 3"]
+    weight: Float[Tensor, "seam ray"]
+    curvature: Float[Tensor, "seam 2"]
+    corners: Float[Tensor, "face 3 4"]
+    corner_weight: Float[Tensor, "face 3"]
+    prior_weight: Float[Tensor, " 4"]
+
+
+def mismatches(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, "seam ray 3"]:
+    r"""Return :math:`P_\mu + N_\mu h_\mu^T S_\mu - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'}`."""
+    heights = torch.einsum("perc,pec->per", pulls.samples, transforms[pulls.facets])
+    lifted = heights[..., None] * pulls.normals[:, :, None]
+    return pulls.gap + lifted[:, 0] - lifted[:, 1]
+
+
+def curvature_along(
+    heights: Float[Tensor, "seam 2 row column"],
+    met: Bool[Tensor, "seam row column"],
+    edge_lengths: Float[Tensor, " seam"],
+) -> Float[Tensor, "seam 2"]:
+    r"""Return the mean square of a height field's curvature along the edge, times its length.
+
+    :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
+    quarter of the edge :math:`\ell`, which noise of normals hardly reaches.
+    """
+    columns = heights.shape[-1]
+    stride = max(1, columns // 4)
+    ahead, centre, behind = (
+        raster[..., start : columns - 2 * stride + start]
+        for raster, start in ((heights, 2 * stride), (heights, stride), (heights, 0))
+    )
+    known = met[..., 2 * stride :] & met[..., stride:-stride] & met[..., : -2 * stride]
+    bend = (
+        (ahead - 2 * centre + behind) * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
+    )
+    square = torch.where(known[:, None], bend, 0).square().sum(dim=(-2, -1))
+    return square / known.sum(dim=(-2, -1)).clamp_min(1)[:, None]
+
+
+def seam_stiffness(
+    curvature: Float[Tensor, "seam 2"],
+    scales: Float[Tensor, "seam 2"],
+    floor: float,
+) -> Float[Tensor, " seam"]:
+    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`.
+
+    Args:
+        scales: ``h_z`` of both patches; ``C`` grows with its square.
+        floor: Added to the sum, so that flat neighbours have a finite k.
+    """
+    return 1 / (floor + (curvature * scales.square()).sum(dim=1))
+
+
+def solve_transforms(
+    pulls: Pulls,
+    transforms: Float[Tensor, "face 4"],
+    stiffness: Float[Tensor, " seam"],
+    uplift: Float[Tensor, "seam 2"],
+) -> Float[Tensor, "face 4"]:
+    r"""Find the transforms that minimise the weighted squares of all terms.
+
+    .. math::
+        \sum_{seams} k \sum_{rays} w |r|^2 + \sum_{corners} w (h^T S)^2
+        + \sum_{patches} \sum_c w_c (h_c - e_c)^2
+
+    Args:
+        transforms: Those so far; fixed components keep their values.
+        uplift: Added to the right-hand sides of both ``h_z`` of a seam; see
+            :class:`~pimper_torch.paper.align.Align`.
+    """
+    free = torch.nonzero(pulls.prior_weight.isfinite()).flatten()
+    if len(free) == 0:
+        return transforms
+    identity = pulls.prior_weight.new_tensor([0, 0, 1, 0])
+    fixed = torch.where(pulls.prior_weight.isfinite(), 0, transforms)
+    samples, corners = pulls.samples[..., free], pulls.corners[..., free]
+    # What components that are not free contribute counts as given.
+    gap = mismatches(pulls, fixed)
+    given = (pulls.corners * fixed[:, None]).sum(dim=-1)
+
+    weight = stiffness[:, None] * pulls.weight
+    weighted = weight[:, None, :, None] * samples
+    own = torch.einsum("perc,perd->pecd", weighted, samples)
+    cosine = (pulls.normals[:, 0] * pulls.normals[:, 1]).sum(dim=-1)
+    cross = -cosine[:, None, None] * torch.einsum("prc,prd->pcd", weighted[:, 0], samples[:, 1])
+    along = torch.einsum("pex,prx->per", pulls.normals, gap)
+    wanted = torch.einsum("perc,per->pec", weighted, along)
+    wanted = torch.stack([-wanted[:, 0], wanted[:, 1]], dim=1)
+    wanted = wanted + uplift[..., None] * identity[free]
+
+    held = pulls.corner_weight[..., None] * corners
+    diagonal = torch.einsum("fvc,fvd->fcd", held, corners)
+    prior = pulls.prior_weight[free]
+    diagonal = diagonal + torch.diag(prior)
+    rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", held, given)
+    first, second = pulls.facets.unbind(dim=1)
+    diagonal = diagonal.index_add(0, first, own[:, 0]).index_add(0, second, own[:, 1])
+    rhs = rhs.index_add(0, first, wanted[:, 0]).index_add(0, second, wanted[:, 1])
+
+    every = torch.arange(len(transforms), device=first.device)
+    rows, cols, values = scatter_blocks(
+        torch.cat([every, first, second]),
+        torch.cat([every, second, first]),
+        torch.cat([diagonal, cross, cross.mT]),
+    )
+    factor = SparseCholesky(rows, cols, values, rhs.numel(), "the alignment of the patches")
+    found = factor.solve(rhs.reshape(-1))
+    return fixed.index_copy(1, free, found.reshape(len(transforms), -1))
+
+
+def scatter_blocks(
+    block_rows: Int[Tensor, " block"],
+    block_cols: Int[Tensor, " block"],
+    blocks: Float[Tensor, "block unknown unknown"],
+) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
+    """Return rows, columns and values of a sparse matrix of small dense blocks, with duplicates."""
+    side = blocks.shape[-1]
+    within = torch.arange(side, device=blocks.device)
+    rows = (side * block_rows[:, None, None] + within[:, None]).expand(blocks.shape)
+    cols = (side * block_cols[:, None, None] + within).expand(blocks.shape)
+    return rows.reshape(-1), cols.reshape(-1), blocks.reshape(-1)

@@ -1,0 +1,519 @@
+r"""Radiometric self-calibration: the gamma under which first-order light fits the photographs.
+
+Views of the same samples under several lights are, as radiance, a matrix of rank 3 (distant
+point lights) or 4 (ambient light besides); under a wrong response they are not. For each exponent
+the residual is that of the encoded values, where the noise is,
+
+.. math:: e = M - (L R)^{1/\gamma}, \qquad f(\gamma) = \min_{L, R} \sum \rho(e),
+
+so that it is comparable over exponents. A residual in radiance, even relative to radiance
+itself, is not: ``M ** gamma`` tends to a matrix of ones, which is of rank 1, as gamma falls.
+To first order noise adds to ``f`` its variance times the degrees of freedom, whatever the
+exponent, and does not shift the minimum.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
+from pimper_torch.records import Record, Views
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
+
+# Widths of the band of details in pixels: wider than noise, narrower than shading; choices.
+_NARROW, _WIDE = 3, 9
+_DARKEST_DETAIL, _MAX_CONTRAST = 0.02, 0.3  # of encoded values, and of details in their logarithm
+_MIN_CONTRAST = 2e-3  # root mean square of details; half a level of 255 in the middle
+# Variance in the band over that above it: 0.11 for noise that is independent from pixel to pixel.
+_MIN_TEXTURE = 0.3
+# Correlation of two views' details where they lie, in standard deviations of that at all other
+# shifts: 0 for views of a moving camera, 4 and more for those of a fixed one; a choice between.
+_MIN_AGREEMENT = 1.5
+
+
+def camera_moved(
+    encoded: Float[Tensor, "view channel height width"], where: Bool[Tensor, "height width"]
+) -> bool:
+    """Return whether details of the photographs lie at other pixels in every one.
+
+    Details are those of the logarithm of the values, between pixel noise and shading, so that
+    light hardly changes them. False where the photographs have none.
+    """
+    logs = encoded.mean(dim=1, keepdim=True).clamp_min(_DARKEST_DETAIL).log()
+    smooth = _mean(logs, _NARROW)
+    where = where.clone()
+    where[:_WIDE], where[-_WIDE:] = False, False  # means lean to one side there
+    where[:, :_WIDE], where[:, -_WIDE:] = False, False
+    details = where * (smooth - _mean(smooth, _WIDE)).clamp(-_MAX_CONTRAST, _MAX_CONTRAST)[:, 0]
+    grain = where * (logs - smooth).clamp(-_MAX_CONTRAST, _MAX_CONTRAST)[:, 0]
+    texture = details.square().sum(dim=(1, 2)) / grain.square().sum(dim=(1, 2)).clamp_min(1e-12)
+    contrast = (details.square().sum(dim=(1, 2)) / where.sum().clamp_min(1)).sqrt()
+    if float(texture.median()) < _MIN_TEXTURE or float(contrast.median()) < _MIN_CONTRAST:
+        return False
+    spectra = torch.fft.rfft2(details)
+    count = len(details)
+    agreements = []
+    for first in range(count):
+        for second in {(first + 1) % count, (first + count // 2) % count}:
+            product = spectra[first] * spectra[second].conj()
+            correlation = torch.fft.irfft2(product, s=details.shape[1:])
+            spread = correlation.std().clamp_min(1e-12)
+            agreements.append(correlation[0, 0] / spread)
+    return float(torch.stack(agreements).median()) < _MIN_AGREEMENT
+
+
+def _mean(
+    planes: Float[Tensor, "view 1 height width"], size: int
+) -> Float[Tensor, "view 1 height width"]:
+    return avg_pool2d(planes, size, 1, size // 2, count_include_pad=False)
+
+
+# Further linearizations about the fit, with outlier weights: a choice, as each exponent starts from
+# the last one's fit.
+ITERATIONS = 1
+_ITERATIONS, _FIT_TOLERANCE = 30, 1e-7
+_FILL_STEPS = 30  # to a start good enough for the solver
+
+# Lower bound of the encoded value about which the fit is linearized: a choice.
+_DARKEST = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class EncodedMatrix(Record):
+    """Encoded values of the same samples in several views.
+
+    Attributes:
+        scale: Of Cauchy's loss; 0 is least squares.
+    """
+
+    encoded: Float[Tensor, "view sample"]
+    seen: Bool[Tensor, "view sample"]
+    used: Bool[Tensor, "view sample"]
+    scale: float
+    rank: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class EncodedFit(Record):
+    """The fit under one response.
+
+    Attributes:
+        loss: Of each entry; 0 where not used.
+        weight: Of each entry, less for outliers.
+        left: Left factor, the initial value for the next response.
+    """
+
+    predicted: Float[Tensor, "view sample"]
+    loss: Float[Tensor, "view sample"]
+    weight: Float[Tensor, "view sample"]
+    left: Float[Tensor, "view rank"]
+
+
+def fit_encoded(
+    problem: EncodedMatrix,
+    response: Response,
+    start: EncodedFit | None,
+    iterations: int = ITERATIONS,
+) -> EncodedFit:
+    """Fit first-order light to encoded values through a response; constant to autograd.
+
+    The encoded residual is linearized, first about the values or a former fit, then about the
+    fit: it is then least squares in radiance, weighted by the square of the response's slope.
+
+    Args:
+        start: Fit of a similar response; ``None`` starts from the values.
+    """
+    mask = problem.used.double()
+    about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
+    left: Tensor | None = None
+    if start is not None:
+        about, weight, left = start.predicted, mask * start.weight, start.left
+    for iteration in range(iterations + 1):
+        rate = _derivative(response, about)
+        target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
+        heavy = weight / rate.square()
+        heavy = heavy / heavy.max()
+        if left is None:
+            left = _start(target, mask, problem.rank)
+        matrix = low_rank_problem(target[None], heavy[None], left[None])
+        solved = solve_variable_projection(matrix, _ITERATIONS, _FIT_TOLERANCE)
+        left = solved.lights[0]
+        linear = left @ solved.shading[0]
+        about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
+        residual = mask * (problem.encoded - about)
+        if problem.scale and iteration < iterations:
+            weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
+    loss = residual.square()
+    if problem.scale:
+        loss = problem.scale**2 * torch.log1p(loss / problem.scale**2)
+    assert left is not None, "there is one round at least"
+    return EncodedFit(predicted=about, loss=loss, weight=weight, left=left)
+
+
+def _derivative(
+    response: Response, encoded: Float[Tensor, "view sample"]
+) -> Float[Tensor, "view sample"]:
+    with torch.enable_grad():
+        at = encoded.detach().requires_grad_()
+        (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
+    return rate
+
+
+def _start(
+    matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
+) -> Float[Tensor, "view rank"]:
+    """Impute missing values by albedo times brightness, then by low-rank approximations."""
+    gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
+    level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
+    return singular_left(matrix[None], mask[None], rank, guess[None], _FILL_STEPS - 1)[0]
+
+
+def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
+    """Leave out samples and views with too few entries to constrain the factors."""
+    for _ in range(2):
+        used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
+    return used
+
+
+def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
+    """Count the residual degrees of freedom."""
+    views, samples = (int(used.any(dim=axis).sum()) for axis in (1, 0))
+    return int(used.sum()) - rank * (views + samples - rank)
+
+
+def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
+    """Return the residuals' robust standard deviation, corrected for the degrees of freedom."""
+    residual = (problem.encoded - fit.predicted)[problem.used]
+    size = float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
+    free = max(freedom(problem.used, problem.rank), 1)
+    return size * (int(problem.used.sum()) / free) ** 0.5
+
+
+# Range of the search, a choice: it holds all curves in use; 1 is linear.
+MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
+# Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
+_TRIALS = 8
+# Of gamma's logarithm: a choice, a tenth of the smallest standard errors.
+_TOLERANCE = 1e-4
+# Relative difference between estimates of data without noise.
+_ROUNDING = 1e-3
+
+# Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
+_MAX_UNCERTAIN = 0.1
+
+# Maximum residual: a choice, four levels of 255; more is shadows, highlights, or another curve.
+_MAX_RESIDUAL = 0.015
+
+# Encoded value up to which shading is not first-order.
+_DARK = 0.1
+
+# Samples; more are subsampled evenly.
+_MAX_SAMPLES = 300
+
+# Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
+_MIN_SCALE = 5e-4
+# Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
+# (Holland & Welsch, 1977).
+_CAUCHY = 2.385
+
+# The estimate is checked without these fractions of the entries, the darkest: a choice.
+_DARKEST_FRACTIONS = (1 / 3, 1 / 2)
+# Fewer degrees of freedom give no reliable standard error: a choice.
+_MIN_FREE = 100
+# Difference from the estimate of the brighter entries, in its standard errors, above which the
+# standard error grows, and above which the brighter entries replace the estimate: choices.
+_SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
+
+# Selections of entries by the fit; the first still starts from a selection by noisy values.
+_CHOICES = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class GammaEstimate(Record):
+    """The estimated exponent of a gamma curve, ``radiance = encoded ** gamma``.
+
+    Attributes:
+        standard_error: Of gamma, from its variation over samples, or views if that is larger.
+        determined: False where the standard error is more than a tenth of gamma, the minimum is
+            at an end of the range, or residuals exceed a camera's noise.
+        residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
+    """
+
+    gamma: float
+    standard_error: float
+    determined: bool
+    residual: float
+    residual_linear: float
+    residual_srgb: float
+    entries: int
+
+    def __str__(self) -> str:
+        """Return the estimate in a sentence."""
+        found = (
+            f"gamma {self.gamma:.3f} +- {self.standard_error:.3f}; residual "
+            f"{100 * self.residual:.2f} % of full scale, {100 * self.residual_linear:.2f} % if "
+            f"linear, {100 * self.residual_srgb:.2f} % if sRGB"
+        )
+        if self.determined:
+            return f"{found}."
+        noisy = self.residual > _MAX_RESIDUAL
+        why = (
+            "shadows, highlights or another curve leave more than noise"
+            if noisy
+            else "light or surfaces vary too little"
+        )
+        return f"gamma is not determined by these photographs, {why} ({found})."
+
+
+def estimate_gamma(
+    encoded: Float[Tensor, "view sample"],
+    seen: Bool[Tensor, "view sample"],
+    *,
+    rank: int = 4,
+) -> GammaEstimate:
+    """Estimate gamma from the same surface samples under several lights.
+
+    Dark and saturated values are left out: first by their observed values, then by those the fit
+    predicts, as selecting by noisy values biases gamma. Outliers lose weight. Where the estimate
+    from the brighter entries differs significantly, it is taken: ambient light in attached shadows
+    is not first-order.
+
+    Args:
+        encoded: As the files hold them, 1 being full scale.
+        seen: False where missing. Dark and saturated values may be seen.
+        rank: 3 for distant point lights alone, 4 with ambient light.
+
+    Raises:
+        InputError: Values outside [0, 1] or not finite, an impossible rank, or fewer
+            views or samples than the rank needs.
+
+    Constant to autograd.
+    """
+    if not 1 <= rank <= 9:
+        raise InputError(
+            f"rank is {rank}; needed: 3 for distant point lights, 4 with ambient light."
+        )
+    values = encoded[seen]
+    if not bool(values.isfinite().all()):
+        raise InputError(
+            f"{int((~values.isfinite()).sum())} encoded values are no numbers; needed: numbers, or "
+            "`seen` false for these."
+        )
+    if values.numel() and not 0 <= float(values.min()) <= float(values.max()) <= 1:
+        raise InputError(
+            f"encoded values reach from {float(values.min()):.4g} to {float(values.max()):.4g}; "
+            "needed: fractions of the files' full scale, 0 to 1."
+        )
+    with torch.no_grad():
+        problem = _problem(encoded, seen, rank)
+        for _ in range(_CHOICES):
+            problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
+        return _estimate_of(_consistent_minimum(problem))
+
+
+def gamma_of_photographs(
+    views: Views,
+    *,
+    mask: Bool[Tensor, "height width"] | None = None,
+    rank: int = 4,
+) -> GammaEstimate:
+    """Estimate the gamma of photographs that a fixed camera took under several lights.
+
+    Args:
+        views: Read with :data:`~pimper_torch.radiometry.LINEAR`; pixels that any of their masks
+            leaves out are left out.
+        mask: True on the object, for all photographs.
+
+    Raises:
+        InputError: As :func:`estimate_gamma`, for unlike sizes, and where the camera moved.
+    """
+    if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
+        raise InputError(
+            "the photographs have unlike sizes; needed: photographs of one fixed camera."
+        )
+    inside = views.inside if views.masks is None else views.inside & views.masks
+    where = inside.all(dim=0)
+    if mask is not None:
+        if mask.shape != where.shape:
+            raise InputError(
+                f"the mask is {mask.shape[1]} x {mask.shape[0]}, the photographs are "
+                f"{where.shape[1]} x {where.shape[0]}; needed: a mask of the same size."
+            )
+        where = where & mask
+    if camera_moved(views.images, where):
+        raise InputError(
+            "the photographs show their details at other pixels each, so that the camera or "
+            "the object moved; needed: photographs of one fixed camera and object, under several "
+            "lights. Gamma cannot be found from these: take such a series."
+        )
+    encoded = views.images[:, views.images.shape[1] // 2][:, where]
+    return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Minimum(Record):
+    """The minimum of the loss over gamma, and its standard error.
+
+    Attributes:
+        inner: Whether it is not at an end of the range.
+    """
+
+    problem: EncodedMatrix
+    gamma: float
+    fit: EncodedFit
+    inner: bool
+    error: float
+
+
+def _problem(
+    encoded: Float[Tensor, "view sample"],
+    seen: Bool[Tensor, "view sample"],
+    rank: int,
+) -> EncodedMatrix:
+    """Subsample, and use entries that are neither dark nor saturated."""
+    used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
+    views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
+    if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
+        raise InputError(
+            f"only {len(samples)} samples are lit in more than {rank} of {len(seen)} views; "
+            f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
+            "other lights, expose so that less is dark or saturated, or lower the rank."
+        )
+    count = min(_MAX_SAMPLES, len(samples))
+    spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
+    chosen = samples[spaced.to(samples.device)]
+    return EncodedMatrix(
+        encoded=torch.where(seen, encoded, 0)[views][:, chosen].double(),
+        seen=seen[views][:, chosen],
+        used=enough(used[views][:, chosen], rank),
+        scale=0.0,
+        rank=rank,
+    )
+
+
+def _chosen_by_fit(
+    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"]
+) -> EncodedMatrix:
+    """Use entries that the fit predicts to be lit and not saturated, with outlier weights."""
+    encoded = problem.encoded
+    known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
+    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: a cast shadow
+    lit = lit & (predicted < SATURATED - _DARK / 2) & (encoded < SATURATED)
+    used = enough(known & lit, problem.rank)
+    if int(used.any(dim=0).sum()) <= 4 * problem.rank:
+        used = problem.used
+    residual = (encoded - predicted)[used]
+    scale = _CAUCHY * float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
+    return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
+
+
+def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
+    """Return the best exponent of a coarse grid, and its fit."""
+    trials = torch.logspace(
+        math.log10(MIN_GAMMA), math.log10(MAX_GAMMA), _TRIALS, dtype=torch.float64
+    )
+    fits: list[EncodedFit] = []
+    for exponent in trials.tolist():
+        former = fits[-1] if fits else None
+        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, iterations))
+    best = min(range(_TRIALS), key=lambda trial: float(fits[trial].loss.sum()))
+    return float(trials[best]), fits[best]
+
+
+def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
+    """Minimize the loss between two exponents."""
+    fit = start
+
+    def loss(logarithm: float) -> float:
+        nonlocal fit
+        fit = fit_encoded(problem, Gamma(exponent=math.exp(logarithm)), fit)
+        return float(fit.loss.sum())
+
+    bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _TOLERANCE})
+    gamma = math.exp(found.x)
+    fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
+    return _Minimum(
+        problem=problem,
+        gamma=gamma,
+        fit=fit,
+        inner=MIN_GAMMA * 1.01 < gamma < MAX_GAMMA / 1.01,
+        error=_standard_error(problem, gamma, fit),
+    )
+
+
+def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
+    """Estimate from all entries, or from the brighter ones where theirs differs significantly.
+
+    Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
+    """
+    best, fit = _grid_search(problem, ITERATIONS)
+    step = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
+    found = [_minimise(problem, fit, best / step, best * step)]
+    predicted = found[0].fit.predicted
+    for fraction in _DARKEST_FRACTIONS:
+        level = predicted[problem.used].quantile(fraction)
+        used = enough(problem.used & (predicted > level), problem.rank)
+        if freedom(used, problem.rank) < _MIN_FREE:
+            break
+        found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
+    for position, estimate in enumerate(found):
+        subsets = [brighter for brighter in found[position + 1 :] if brighter.inner]
+        differences = [abs(brighter.gamma - estimate.gamma) for brighter in subsets]
+        consistent = [
+            each <= _MAX_ERRORS * brighter.error + _ROUNDING * estimate.gamma
+            for each, brighter in zip(differences, subsets, strict=True)
+        ]
+        if all(consistent):
+            excess = [
+                each - _SUSPECT_ERRORS * brighter.error
+                for each, brighter in zip(differences, subsets, strict=True)
+            ]
+            return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
+    raise AssertionError("nothing contradicts the last estimate")
+
+
+def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
+    r"""Return gamma's sandwich standard error over samples, or over views if that is larger.
+
+    With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
+    second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`; it needs no model
+    of the noise. Infinite where the loss has next to no curvature.
+    """
+    step = 0.02 * gamma
+    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
+    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
+    centre = float(fit.loss.sum())
+    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * centre) / step**2
+    slope = (above.loss - below.loss) / (2 * step)
+    noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
+    # On data without noise everything but the curvature is rounding.
+    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
+    return noise / curvature if curved else math.inf
+
+
+def _estimate_of(found: _Minimum) -> GammaEstimate:
+    """Return the estimate, with residuals under the linear and the sRGB response."""
+    problem = found.problem
+    residual = residual_spread(problem, found.fit)
+    linear = fit_encoded(problem, Linear(), found.fit, 2 * ITERATIONS)
+    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ITERATIONS)
+    sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
+    return GammaEstimate(
+        gamma=found.gamma,
+        standard_error=found.error,
+        determined=sure and residual < _MAX_RESIDUAL,
+        residual=residual,
+        residual_linear=residual_spread(problem, linear),
+        residual_srgb=residual_spread(problem, srgb),
+        entries=int(problem.used.sum()),
+    )

@@ -1,0 +1,320 @@
+r"""Regression of each pixel's radiance on lights that are known or factorized, robust to shadows.
+
+A pixel's radiance under lights ``l`` is :math:`x_v = l_v^\top b`; the rows of the lights may
+be directions, harmonics, or the left factor of a factorization :math:`X = L S`, which is defined up
+to an invertible matrix. With known lights, :math:`x_{vc} = \rho_c\, l_v^\top n` has one normal for
+all colours and an albedo for each.
+
+Source: Woodham, Photometric method for determining surface orientation from multiple images,
+Optical Engineering 19(1), 1980.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.errors import InputError
+from pimper_torch.photometry.quadratics import PackedCholesky, outer, unpacked
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.records import Record
+from pimper_torch.single_view.factorization.low_rank import low_rank_problem
+
+# The scale of the weights starts at this multiple and is multiplied by the second per iteration,
+# down to 1: choices, so that the initial fit does not decide which samples are outliers.
+_WIDEST, _NARROWING = 4.0, 0.7
+# Minimum scale, as a fraction of the brightness: a choice, far below the 4e-3 of 8-bit steps.
+_MIN_SCALE = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Regressed(Record):
+    """The result of a regression.
+
+    Attributes:
+        shading: ``b`` of every pixel; zero without samples.
+        weight: Final weight of each sample; 0 where it lies in shadow.
+    """
+
+    shading: Float[Tensor, "unknown pixel"]
+    weight: Float[Tensor, "view pixel"]
+
+
+def regress(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view unknown"],
+    *,
+    robust: bool = True,
+    iterations: int = 15,
+) -> Regressed:
+    r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
+
+    Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
+    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; a view whose
+    light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
+    initial fit weights samples by their brightness, up to the pixel's median: shadows are dark.
+
+    An underdetermined pixel has one of its minima; see :func:`determined`.
+
+    Source: Holland & Welsch 1977 for the weights; robust weights in place of thresholds on
+    shadows and highlights are common practice since Ikehata et al., CVPR 2012.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen, radiance, 0).double()
+        given = weight.double()
+        rows = lights.double()
+        if not robust:
+            return _fit(x, given, rows)
+        found = _fit(x, given * brightness(x, seen), rows)
+        for iteration in range(iterations):
+            widen = max(1.0, _WIDEST * _NARROWING**iteration)
+            reliability, lit = reweigh(x, given, rows @ found.shading, widen)
+            found = _fit(x, reliability * lit, rows)
+        return found
+
+
+def reweigh(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    predicted: Float[Tensor, "view pixel"],
+    widen: float,
+) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
+    """Return the samples' weights by their residuals, and whether a light comes from the front.
+
+    Args:
+        predicted: By a fit; below zero for lights from behind.
+        widen: Multiple of the scale.
+    """
+    lit = predicted > 0
+    residual = torch.where(lit, radiance - predicted, radiance)
+    seen = (weight > 0) & lit
+    level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
+    scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
+    return weight * cauchy_weights(residual, widen * scale.maximum(_MIN_SCALE * level)), lit
+
+
+def brightness(
+    radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"]
+) -> Float[Tensor, "view pixel"]:
+    """Return weights proportional to brightness, up to the median of the pixel."""
+    x = torch.where(seen, radiance, torch.nan)
+    centre = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+    centre = torch.where(centre > 0, centre, x.nan_to_num(nan=0.0).amax(dim=0))
+    fraction = x.nan_to_num(nan=0.0).clamp_min(0) / torch.where(centre > 0, centre, 1)
+    return fraction.clamp_max(1)
+
+
+def determined(
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view unknown"],
+    least: float = 1e-4,
+) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
+    """Find which pixels have as many samples as unknowns, and lights that span them.
+
+    Args:
+        least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
+            1 % in the images is as large as the solution.
+    """
+    count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
+    size = lights.double().norm(dim=0)
+    basis = lights.double() / torch.where(size > 0, size, 1)
+    unknowns = lights.shape[1]
+    values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
+    spanned = values[:, 0] > least * values[:, -1]
+    return count >= unknowns, spanned & (values[:, -1] > 0)
+
+
+def _fit(
+    x: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    rows: Float[Tensor, "view unknown"],
+) -> Regressed:
+    """Solve the normal equations."""
+    factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
+    return Regressed(shading=factored.solve(rows.mT @ (weight * x)), weight=weight)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Calibrated(Record):
+    """Normals and albedo of pixels.
+
+    Attributes:
+        normals: Unit, in the frame of the lights; zero where a pixel is black.
+        weight: Final weight of each sample; 0 where missing or in shadow.
+    """
+
+    normals: Float[Tensor, "3 pixel"]
+    albedo: Float[Tensor, "channel pixel"]
+    weight: Float[Tensor, "view pixel"]
+
+
+def calibrated_stereo(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    lights: Float[Tensor, "view 3"],
+    *,
+    robust: bool = True,
+) -> Calibrated:
+    r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
+
+    Weights are those of the mean of the colours; see :func:`regress`. Normal and albedos are then
+    the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top = C C^\top`
+    and ``b_c`` the solution of one colour, :math:`C^\top n` is the leading eigenvector of
+    :math:`\sum_c C^\top b_c b_c^\top C`.
+
+    Args:
+        lights: Direction to the point light times its irradiance.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen[:, None], radiance, 0).double()
+        gray = regress(x.mean(dim=1), weight, lights, robust=robust)
+        rows = lights.double()
+        heavy = gray.weight
+        packed = outer(rows.mT) @ heavy
+        factored = PackedCholesky(packed, 3)
+        found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
+        normals, albedo = _shared(unpacked(packed, 3), found)
+        return Calibrated(normals=normals, albedo=albedo, weight=heavy)
+
+
+def chromatic_albedo(
+    radiance: Float[Tensor, "view channel pixel"],
+    weight: Float[Tensor, "view pixel"],
+    shade: Float[Tensor, "view pixel"],
+) -> Float[Tensor, "channel pixel"]:
+    """Fit the albedo of each colour, not negative, to the shading of albedo 1."""
+    x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
+    square = (weight * shade * shade).sum(dim=0)
+    product = ((weight * shade)[:, None] * x).sum(dim=0)
+    return (product / torch.where(square > 0, square, 1)).clamp_min(0)
+
+
+def _shared(
+    inner: Float[Tensor, "pixel 3 3"], found: Float[Tensor, "channel 3 pixel"]
+) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "channel pixel"]]:
+    """Assign each pixel the least-squares normal over all colours, and the albedos under it."""
+    vectors = found.permute(2, 1, 0)  # pixel, 3, channel
+    scale = inner.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(torch.finfo(inner.dtype).tiny)
+    eye = torch.eye(3).to(inner)
+    root = torch.linalg.cholesky_ex(inner + 1e-12 * scale[:, None, None] * eye).L
+    white = root.mT @ vectors
+    if white.shape[2] == 1:
+        lead = white[..., 0]
+    else:
+        lead = torch.linalg.eigh(white @ white.mT).eigenvectors[..., -1]
+    normal = torch.linalg.solve_triangular(root.mT, lead[..., None], upper=True)[..., 0]
+    size = normal.norm(dim=1, keepdim=True)
+    normal = normal / torch.where(size > 0, size, 1)
+    weighted = (inner @ normal[..., None])[..., 0]
+    square = (weighted * normal).sum(dim=1, keepdim=True)
+    albedo = (weighted[..., None] * vectors).sum(dim=1) / torch.where(square > 0, square, 1)
+    sign = torch.where(albedo.sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
+    black = (vectors == 0).all(dim=2).all(dim=1)
+    normal = torch.where(black[:, None], 0, sign * normal)
+    return normal.mT, (sign * albedo).clamp_min(0).mT
+
+
+# Lights are estimated from so many pixels at most, shading for all: a choice.
+_MAX_PIXELS = 4000
+# Steps of variable projection: for the first solution, and after every change of weights: choices.
+_FIRST_STEPS, _NEXT_STEPS = 100, 5
+_ITERATIONS = 20
+_WIDEST_FACTORED, _NARROWING_FACTORED = 4.0, 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Factored(Record):
+    """Factors of the photographs.
+
+    Attributes:
+        lights: ``L``, orthonormal columns.
+        shading: ``S``; the noise of its components is white.
+        weight: Final weight of each sample; 0 where missing or in shadow.
+    """
+
+    lights: Float[Tensor, "view rank"]
+    shading: Float[Tensor, "rank pixel"]
+    weight: Float[Tensor, "view pixel"]
+
+
+def factorize_photographs(
+    radiance: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
+    rank: int,
+    *,
+    robust: bool = True,
+) -> Factored:
+    """Factorize photographs with missing samples, shadows and highlights; constant to autograd.
+
+    Complete and without robust weights, it is the singular value decomposition. Otherwise lights
+    are estimated from an even subset of pixels by variable projection, with Cauchy's weights if
+    ``robust``; the shading of all pixels is regressed on them.
+
+    Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition.
+    """
+    with torch.no_grad():
+        seen = weight > 0
+        x = torch.where(seen, radiance, 0).double()
+        given = weight.double()
+        usable = torch.nonzero(seen.sum(dim=0) > rank)[:, 0]
+        views = int(seen.any(dim=1).sum())
+        if views < rank or len(usable) <= rank:
+            raise InputError(
+                f"factorization: {views} views have samples, {len(usable)} pixels more than "
+                f"{rank}; needed: {rank} views and more than {rank} such pixels. Add photographs "
+                "or widen the mask."
+            )
+        if not robust and bool((given == given[seen].max()).all()):
+            left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
+            return Factored(lights=left, shading=left.mT @ x, weight=given)
+        some = usable[evenly(len(usable), _MAX_PIXELS).to(usable.device)]
+        first = given[:, some]
+        if robust:
+            first = first * brightness(x[:, some], seen[:, some])
+        begin = _filled(x[:, some], first, rank)
+        problem = low_rank_problem(x[None, :, some], first[None], begin[None])
+        left = solve_variable_projection(problem, _FIRST_STEPS).lights[0]
+        if robust:
+            left = _settle(x[:, some], given[:, some], first, left)
+        found = regress(x, given, left, robust=robust)
+        return Factored(lights=left, shading=found.shading, weight=found.weight)
+
+
+def _settle(
+    x: Float[Tensor, "view pixel"],
+    given: Float[Tensor, "view pixel"],
+    first: Float[Tensor, "view pixel"],
+    left: Float[Tensor, "view rank"],
+) -> Float[Tensor, "view rank"]:
+    """Alternate weights and factors, the scale of the weights falling to its final value."""
+    weight = first
+    for iteration in range(_ITERATIONS):
+        problem = low_rank_problem(x[None], weight[None], left[None])
+        solved = solve_variable_projection(problem, _NEXT_STEPS)
+        left = solved.lights[0]
+        widen = max(1.0, _WIDEST_FACTORED * _NARROWING_FACTORED**iteration)
+        reliability, lit = reweigh(x, given, left @ solved.shading[0], widen)
+        weight = reliability * lit
+    return left
+
+
+def _filled(
+    x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
+) -> Float[Tensor, "view rank"]:
+    """Impute missing samples by view's times pixel's brightness, and take singular vectors."""
+    gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
+    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    albedo = (weight * x).sum(dim=0, keepdim=True) / level
+    fraction = weight / weight.amax().clamp_min(1e-300)
+    filled = fraction * x + (1 - fraction) * gain * albedo
+    return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
+
+
+def evenly(count: int, most: int) -> Int[Tensor, " chosen"]:
+    """Return indices spaced evenly over ``range(count)``."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long()
