@@ -3,15 +3,15 @@
 import math
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import singledispatch
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.geometry.topology import boundary_loops
 from pimper_torch.patches.warp import missing_fraction
@@ -30,6 +30,8 @@ from pimper_torch.records import (
     SweptPatches,
 )
 from pimper_torch.silhouettes.contours import Contours
+
+R = TypeVar("R")
 
 
 @runtime_checkable
@@ -69,14 +71,12 @@ class _Recording:
     """The reports of a call, and who hears of them.
 
     Attributes:
-        open: When the stages began that are under way.
         aside: Seconds by line of what no stage does.
     """
 
     observer: Observer
     began: float
     reports: list[StageReport] = field(default_factory=list)
-    open: dict[str, float] = field(default_factory=dict)
     aside: dict[str, float] = field(default_factory=dict)
 
     def finish(self, name: str, began: float, told: dict[str, int | float]) -> None:
@@ -113,46 +113,30 @@ def gathered(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
     return (*(one for one in reports if one.name not in ASIDE), *lines)
 
 
-# Of the call that this thread is in. Hooks belong to a module, which threads share.
+# Of the call that this thread is in; of none inside a stage.
 _recording: ContextVar[_Recording | None] = ContextVar("recording", default=None)
 
 
 @contextmanager
-def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
-    """Time the direct submodules of ``chain`` while the ``with`` block calls them.
+def recorded(observer: Observer) -> Iterator[list[StageReport]]:
+    """Report the stages that the ``with`` block calls; see :func:`called`.
 
-    Threads that share ``chain`` have reports of their own. A block inside another one that is in no
-    stage is part of it.
+    A block inside another one that is in no stage is part of it.
 
     Yields:
-        The list that a report is appended to whenever a submodule has run, and at the end one of
-        each line of what no submodule did.
+        The list that a report is appended to whenever a stage has run, and at the end one of each
+        line of what no stage did.
     """
     recording, outer = _Recording(observer, time.perf_counter()), _recording.get()
-    hooks = []
-    for name, module in chain.named_children():
-
-        def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
-            if _recording.get() is recording:
-                recording.open[name] = time.perf_counter()
-                observer.started(name)
-
-        def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
-            if _recording.get() is recording:
-                recording.finish(name, recording.open.pop(name), figures(output))
-
-        hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
     token = _recording.set(recording)
     try:
         with listening(observer.progressed):
             yield recording.reports
         recording.reports[:] = recording.lines()
-        if outer is not None and not outer.open:
+        if outer is not None:
             outer.reports.extend(recording.reports)
     finally:
         _recording.reset(token)
-        for hook in hooks:
-            hook.remove()
 
 
 def accounted() -> tuple[StageReport, ...]:
@@ -183,12 +167,20 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     recording.finish(name, began, told)
 
 
+def called(name: str, call: Callable[..., R], *inputs: object) -> R:
+    """Call a stage, and report it with the figures of its record."""
+    with stage(name) as told:
+        record = call(*inputs)
+        told |= figures(record)
+    return record
+
+
 @contextmanager
 def aside(line: str) -> Iterator[None]:
     """Count what the ``with`` block takes to a line of its own, unless a stage is under way."""
     recording, began = _recording.get(), time.perf_counter()
     yield
-    if recording is not None and not recording.open:
+    if recording is not None:
         took = time.perf_counter() - began
         recording.aside[line] = recording.aside.get(line, 0.0) + took
 

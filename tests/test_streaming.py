@@ -31,7 +31,9 @@ def given():
 
 
 def streamed(given, factorize: nn.Module | None = None):
-    return photometry_and_heights(Warp(), factorize or Factorize(), Sweep(), *given)
+    views, _, patches = given
+    sources = Warp().prepare(views).hidden_by(patches.coarse.mesh)
+    return photometry_and_heights(Warp(), factorize or Factorize(), Sweep(), *given, sources)
 
 
 def values(swept):

@@ -8,10 +8,10 @@ from typing import ClassVar
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.running import Running
 from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
-from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
@@ -24,12 +24,9 @@ from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
-    Cameras,
     CoarseMesh,
     DepthPatches,
     Mesh,
-    PatchSet,
-    PatchViews,
     PhotometricPatches,
     SparseScene,
     Surface,
@@ -81,6 +78,8 @@ class Published(Chain):
     multi-view and multi-illumination images, 2015.
     """
 
+    put_off = ("warp",)
+
     def __init__(
         self,
         config: PublishedConfig | None = None,
@@ -98,8 +97,8 @@ class Published(Chain):
             config.coarse_surface
         )
         self.decompose = Decompose(config.decompose)
-        self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
-        self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
+        self.warp: Warping = Warp(config.warp)
+        self.factorize: Factorizing = Factorize(config.factorize)
         self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
         self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
         self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
@@ -107,31 +106,33 @@ class Published(Chain):
         self._swap(stages)
 
     def passes(
-        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
     ) -> Iterator[Step]:
         """Run once through the stages."""
-        placed = self.placed(views, sparse_model, mesh)
+        placed = self.placed(run, views, sparse_model, mesh)
         few = one_view_a_pose(placed, tuple(self.references()))
-        outlines = self.kept(self.silhouettes, few.scene)
+        outlines = run(self.silhouettes, few.scene)
         mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
         scene = settled(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)
         if mesh is None:
-            coarse = self.kept(self.triangulate, shown)
+            coarse = run(self.triangulate, shown)
         else:
             contours = Contours.none(outlines, shown.cameras)
-            coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+            coarse = run(self.coarse_surface, shown, contours, mesh)
         if shown is not scene:
             coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         self.show(scene, coarse)
-        patches = self.decompose(coarse, scene.cameras, None, 1.0)
-        self.need(PHOTOMETRY)
-        photometric = self.kept(
-            photometry, self.warp, self.factorize, scene.views, scene.cameras, patches
-        )
-        heights = self.kept(self.align, self.kept(self.integrate, photometric))
-        surface = self.kept(self.refine, heights)
+        patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
+        seen = run(self.warp, scene.views, scene.cameras, patches)
+        photometric = run(self.factorize, seen)
+        heights = run(self.align, run(self.integrate, photometric))
+        surface = run(self.refine, heights)
         yield Step(
             scale=1.0,
             last=True,
@@ -140,10 +141,3 @@ class Published(Chain):
             heights=heights,
             surface=surface,
         )
-
-
-def photometry(
-    warp: Warping, factorize: Factorizing, views: Views, cameras: Cameras, patches: PatchSet
-) -> PhotometricPatches:
-    """Return normals, albedo and light of all patches."""
-    return factorize(warp(views, cameras, patches, None))
