@@ -16,7 +16,6 @@ from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
 from pimper_torch.kernels.compile import compile_ahead
-from pimper_torch.kernels.switch import Kernels, using
 from pimper_torch.ledger import Entry, left_out_of
 from pimper_torch.records import (
     Cameras,
@@ -117,14 +116,12 @@ class Chain(Stage):
 
     def __init__(
         self,
-        kernels: Kernels,
         observer: Observer | None,
         store: Store | None = None,
         on_failure: OnFailure = "skip",
     ) -> None:
         super().__init__()
         self.on_failure: OnFailure = on_failure
-        self.kernels: Kernels = kernels
         self.observer = observer or Silent()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
@@ -148,7 +145,7 @@ class Chain(Stage):
     def running(self) -> Running:
         """Return how stages are called in a run."""
         names = {module: name for name, module in self.named_children()}
-        return Running(names=names, store=self.store, kernels=self.kernels, put_off=self.put_off)
+        return Running(names=names, store=self.store, put_off=self.put_off)
 
     def references(self) -> Iterator[str]:
         """List the photographs that stages were asked to take for the reference view."""
@@ -240,12 +237,10 @@ class Chain(Stage):
         for named in self.references():
             view_named(named, names)  # not first after structure from motion
         passes = self.passes(self.running(), views, sparse_model, mesh)
-        if self.kernels == "numba":
-            compile_ahead()
+        compile_ahead()
         entries: list[Entry] = []
         while True:
             with (
-                using(self.kernels),
                 collecting(self.on_failure, entries),
                 recorded(self.observer) as reports,
             ):
@@ -288,7 +283,6 @@ class Chain(Stage):
             step = next(steps)
             reports += step.reports
         with (
-            using(self.kernels),
             collecting(self.on_failure) as entries,
             recorded(self.observer) as last,
         ):

@@ -17,7 +17,6 @@ from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.kernels.switch import Kernels
 from pimper_torch.memory import bytes_of, largest_problem
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
@@ -54,9 +53,6 @@ class CoarseToFineConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
-            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
             the first pass.
@@ -66,7 +62,6 @@ class CoarseToFineConfig:
     """
 
     chain: ClassVar[str] = "coarse-to-fine"
-    kernels: Kernels = "numba"
     on_failure: OnFailure = "skip"
     max_memory: str = ""
     hold_out: Annotated[int, Range(least=0, most=1_000_000)] = 0
@@ -110,7 +105,7 @@ class CoarseToFine(Chain):
     ) -> None:
         self.config = config = config or CoarseToFineConfig()
         store = opened(cache)
-        super().__init__(config.kernels, observer, store, config.on_failure)
+        super().__init__(observer, store, config.on_failure)
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()

@@ -12,7 +12,6 @@ from pimper_torch.chains.running import Running
 from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
-from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.alignment.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate
@@ -48,15 +47,11 @@ class PublishedConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
-            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """
 
     chain: ClassVar[str] = "published"
-    kernels: Kernels = "numba"
     on_failure: OnFailure = "skip"
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -89,7 +84,7 @@ class Published(Chain):
     ) -> None:
         self.config = config = config or PublishedConfig()
         store = opened(cache)
-        super().__init__(config.kernels, observer, store, config.on_failure)
+        super().__init__(observer, store, config.on_failure)
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)

@@ -14,7 +14,6 @@ from pimper_torch.chains.streaming import Prepares, photometry_and_heights
 from pimper_torch.errors import OutputError, caution, held, overheard
 from pimper_torch.failures import distinct, skipped
 from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SURFACE, SWEEP, all_compiled, load
-from pimper_torch.kernels.switch import Kernels
 from pimper_torch.ledger import kept_entries, noted_entries, repeat_entries
 from pimper_torch.memory import release_memory
 from pimper_torch.patches.sources import Sources
@@ -69,7 +68,6 @@ class Running:
 
     names: Mapping[nn.Module, str]
     store: Store | None
-    kernels: Kernels
     put_off: Sequence[str] = ()
     last: bool = True
     sources: Sources | None = None
@@ -135,7 +133,7 @@ class Running:
             parts = [part for each in _flat(stage, *inputs) for part in _parts(each)]
             if not all(is_known(part.__module__) for part in parts):
                 return None
-            hashed = digest(code(), stage, self.kernels, *inputs)
+            hashed = digest(code(), stage, *inputs)
         return hashed and f"{name}-{hashed}"
 
     def _made(self, name: str, stage: Callable[..., Any], inputs: tuple[object, ...]) -> object:
@@ -165,7 +163,7 @@ class Running:
         return self.sources.hidden_by(patches.surface or patches.coarse.mesh)
 
     def _wait_for_kernels(self, name: str) -> None:
-        if name in _KERNELS and self.kernels == "numba" and not all_compiled():
+        if name in _KERNELS and not all_compiled():
             with reported_stage("compile"):
                 load(_KERNELS[name])
 
