@@ -6,18 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from pimper_torch import reporting
+from pimper_torch import journal, reporting
+from pimper_torch.journal import aside, current
 from pimper_torch.progress import report
 from pimper_torch.records import Mesh, StageReport
 from pimper_torch.reporting import (
     Silent,
     accounted,
-    aside,
     called,
     figures,
     gathered,
     recorded,
-    repeat,
     seconds_of,
     stage,
 )
@@ -77,14 +76,14 @@ def test_threads_have_reports_of_their_own():
             inside.wait()
             called(stage, tetrahedron)
             inside.wait()
-            told[stage] = [entry.name for entry in reports]
+        told[stage] = [entry.name for entry in reports]
 
     threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert told == {"first": ["first"], "second": ["second"]}
+    assert told == {name: [name, "between stages"] for name in listeners}
     for name, listener in listeners.items():
         assert listener.heard == [f"started {name}", "1/1", f"finished {name}"]
 
@@ -101,8 +100,9 @@ class Clock:
 
 def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(reporting, "time", clock)
-    kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={})
+    for module in (journal, reporting):
+        monkeypatch.setattr(module, "time", clock)
+    kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={}, kept=True)
     with recorded(Silent()) as reports:
         with stage("read"), aside("keep"):  # a stage's own, whatever it does
             clock.sleep(1)
@@ -111,7 +111,7 @@ def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
                 with aside("keep"):
                     clock.sleep(2)
                 called("first", tetrahedron)
-                repeat([kept])
+                current().tell(kept)
                 clock.sleep(4)
         so_far = accounted()
         clock.sleep(8)

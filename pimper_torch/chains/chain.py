@@ -16,7 +16,7 @@ from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
 from pimper_torch.kernels.compile import compile_ahead
-from pimper_torch.ledger import Entry, left_out_of
+from pimper_torch.ledger import left_out_of
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -238,12 +238,9 @@ class Chain(Stage):
             view_named(named, names)  # not first after structure from motion
         passes = self.passes(self.running(), views, sparse_model, mesh)
         compile_ahead()
-        entries: list[Entry] = []
+        entries: list[object] = []
         while True:
-            with (
-                collecting(self.on_failure, entries),
-                recorded(self.observer) as reports,
-            ):
+            with collecting(self.on_failure, entries), recorded(self.observer) as reports:
                 step = next(passes, None)
                 if step is not None:
                     self._watched(step)
@@ -282,10 +279,7 @@ class Chain(Stage):
             del step  # the next pass needs its memory
             step = next(steps)
             reports += step.reports
-        with (
-            collecting(self.on_failure) as entries,
-            recorded(self.observer) as last,
-        ):
+        with collecting(self.on_failure) as entries, recorded(self.observer) as last:
             found = self.running()(self.extract, step.surface)
             warn_of(entries)
         return Reconstruction(

@@ -1,9 +1,10 @@
 """How a chain calls its stages: kept, reported, and a few patches at a time."""
 
-import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
 from types import FunctionType
 from typing import Any, ParamSpec, TypeVar
 
@@ -11,16 +12,15 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from pimper_torch.chains.streaming import Prepares, photometry_and_heights
-from pimper_torch.errors import OutputError, caution, held, overheard
-from pimper_torch.failures import distinct, skipped
+from pimper_torch.errors import held
+from pimper_torch.journal import HASH, aside
 from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SURFACE, SWEEP, all_compiled, load
-from pimper_torch.ledger import kept_entries, noted_entries, repeat_entries
 from pimper_torch.memory import release_memory
 from pimper_torch.patches.sources import Sources
-from pimper_torch.records import Failure, PatchSet, Record, StageReport, Views
-from pimper_torch.reporting import HASH, KEEP, aside, called, noted, repeat
+from pimper_torch.records import PatchSet, Record, Views
+from pimper_torch.reporting import called
 from pimper_torch.reporting import stage as reported_stage
-from pimper_torch.store import Store, digest, settled
+from pimper_torch.store import Store, digest, kept
 from pimper_torch.store.code import code, is_known
 
 P = ParamSpec("P")
@@ -38,7 +38,7 @@ _KERNELS: Mapping[str, Sequence[str]] = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Later:
     """The record of a stage that is made when another one asks for it."""
 
@@ -46,7 +46,7 @@ class Later:
     inputs: tuple[Any, ...]
 
 
-@dataclasses.dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Running:
     """Calls the stages of a chain in one run: ``run(self.fuse, heights, contours)``.
 
@@ -80,6 +80,9 @@ class Running:
             name = self.names.get(stage, name)
         if name in self.put_off:
             return typing.cast(R, Later(stage, given))
+        if name in _KERNELS and not all_compiled():
+            with reported_stage("compile"):
+                load(_KERNELS[name])
         with nullcontext() if self.last else held():
             return typing.cast(R, self._kept(name, stage, given))
 
@@ -91,39 +94,13 @@ class Running:
 
     def _kept(self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]) -> object:
         """Find the record of a stage, or make it and keep it."""
-        cls = None if name in _NOT_KEPT else _returns(stage)
-        key = None if self.store is None or cls is None else self._key(name, stage, inputs)
-        if self.store is None or cls is None or key is None:
-            self._wait_for_kernels(name)
-            return self._made(name, stage, inputs)
-        with aside(KEEP):
-            found = self.store.find(key, cls)
-        if found is not None:
-            record, told = found
-            skipped(*(Failure(**failure) for failure in told["failures"]))
-            repeat_entries(told["left_out"])
-            repeat([StageReport(**report) for report in told["reports"]])
-            for message in told["cautions"]:
-                caution(message)
-            return _beside(record, inputs)
-        self._wait_for_kernels(name)
-        with overheard() as cautions, noted() as reports, noted_entries() as entries:
-            result = settled(typing.cast(Record, self._made(name, stage, inputs)))
-        failures = distinct(entries)
-        if any(failure.what == "memory" for failure in failures):
-            return result  # smaller batches round otherwise
-        about = {
-            "reports": list(map(dataclasses.asdict, reports)),
-            "cautions": cautions,
-            "failures": list(map(dataclasses.asdict, failures)),
-            "left_out": kept_entries(entries),
-        }
-        try:
-            with aside(KEEP):
-                self.store.keep(key, result, about)
-        except OutputError as error:
-            caution(str(error))
-        return result
+        cls = None if self.store is None or name in _NOT_KEPT else _returns(stage)
+        key = None if cls is None else self._key(name, stage, inputs)
+        make: Callable[[], Any] = partial(self._made, name, stage, inputs)
+        if cls is None or key is None:
+            return make()
+        record, _ = kept(self.store, key, cls, make)
+        return _beside(record, inputs)
 
     def _key(
         self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]
@@ -161,11 +138,6 @@ class Running:
             return None
         self.sources = self.sources or warp.prepare(views)
         return self.sources.hidden_by(patches.surface or patches.coarse.mesh)
-
-    def _wait_for_kernels(self, name: str) -> None:
-        if name in _KERNELS and not all_compiled():
-            with reported_stage("compile"):
-                load(_KERNELS[name])
 
 
 def _flat(*values: object) -> Iterator[object]:
