@@ -102,13 +102,10 @@ class Chain(Stage):
     soon as they are there; one that is assigned to ``watch`` with the scene as soon as cameras are
     known, and with every step that is done. Photographs whose names are in ``needed`` are never
     held out.
-
-    Attributes:
-        put_off: Stages whose records are made when another one asks for them: all samples of all
-            views take more memory than there is.
     """
 
     put_off: ClassVar[tuple[str, ...]] = ()
+    """Stages that work when another one asks for their records, see :class:`Running`."""
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
     silhouettes: Callable[[SparseScene], Silhouettes]
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]

@@ -50,11 +50,9 @@ class Later:
 class Running:
     """Calls the stages of a chain in one run: ``run(self.fuse, heights, contours)``.
 
-    A stage's record is that of an earlier run where the store has it, and is kept else. What the
-    earlier run reported, skipped and warned of is told again. A stage of another package is called
-    every time, as its code is not known, and so is one that gradients are asked of. What was found
-    in smaller batches for lack of memory is not kept. Where a record cannot be kept, a warning says
-    so.
+    A stage's record is that of an earlier run where the store has it, and is kept else, see
+    :func:`~pimper_torch.store.kept`. A stage of another package is called every time, as its code
+    is not known, and so is one that gradients are asked of.
 
     Attributes:
         names: Of the stages.
@@ -126,7 +124,8 @@ class Running:
                 seen.stage, photometric[0].stage, stage, views, cameras, patches, sources
             )
         else:
-            record = called(name, stage, called("warp", seen.stage, *seen.inputs, sources))
+            whole = called("warp", seen.stage, *seen.inputs, sources)
+            record = called(name, stage, *(whole if one is seen else one for one in inputs))
         if self.last:
             self.sources = None  # as much memory as the photographs themselves
         release_memory()
