@@ -49,7 +49,7 @@ def main() -> None:
         views, raw = load_views(photos, max_size_px=options.max_size_px), "| |"
         if soft:
             views = views.replace(priors=(read_silhouettes(soft, views),))
-        scene = chain.placed(views, None)
+        scene = chain.placed(chain.running(), views, None)
         known = known_masks(masks, scene)
         if soft:
             alone = overlaps(soft_masks(scene), known)

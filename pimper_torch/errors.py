@@ -6,7 +6,9 @@ Every message says where, what was found, what was needed, and what to do.
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
+from dataclasses import replace
+
+from pimper_torch.journal import current, writing
 
 
 class PimperError(Exception):
@@ -45,59 +47,43 @@ class PimperWarning(UserWarning):
     """The result is delivered, but something about it should be known."""
 
 
-_held: ContextVar[list[str] | None] = ContextVar("held", default=None)
-_listeners: ContextVar[tuple[list[str], ...]] = ContextVar("listeners", default=())
-
-
 def caution(message: str, stacklevel: int = 1) -> None:
     """Warn of something, at once or, inside :func:`held`, when the block's owner says so.
 
     Args:
         stacklevel: As of :func:`warnings.warn`, counted from the caller.
     """
-    for listener in _listeners.get():
-        listener.append(message)
-    held_back = _held.get()
-    if held_back is None:
+    journal = current()
+    journal.tell(message)
+    if not journal.quiet:
         warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
-    else:
-        held_back.append(message)
 
 
-@contextmanager
-def overheard() -> Iterator[list[str]]:
-    """Note what is cautioned of inside the block, which is told all the same.
-
-    Yields:
-        The messages so far.
-    """
-    messages: list[str] = []
-    token = _listeners.set((*_listeners.get(), messages))
-    try:
-        yield messages
-    finally:
-        _listeners.reset(token)
+def cautioned() -> list[str]:
+    """Return what was cautioned of so far in this call."""
+    return [event for event in current().so_far() if isinstance(event, str)]
 
 
 @contextmanager
 def held() -> Iterator[list[str]]:
-    """Hold back what is cautioned of in one round of many, as the last round's is enough.
+    """Hold back what is cautioned of inside the ``with`` block.
 
-    Where the block ends in an error, what was held back is told before it.
+    Where the block ends in an error, it is told before.
 
     Yields:
-        The messages so far, for :func:`caution` after the last round.
+        The list that holds the messages when the block has ended.
     """
-    messages: list[str] = []
-    token = _held.set(messages)
+    messages, events = list[str](), current().so_far()
+    before = len(events)
     try:
-        yield messages
+        with writing(replace(current(), events=events, quiet=True)):
+            yield messages
     except BaseException:
-        _held.reset(token)
-        for message in messages:
+        for message in [event for event in events[before:] if isinstance(event, str)]:
             caution(message)
         raise
-    _held.reset(token)
+    messages += [event for event in events[before:] if isinstance(event, str)]
+    events[before:] = [event for event in events[before:] if not isinstance(event, str)]
 
 
 def some(names: Sequence[str], most: int = 8) -> str:

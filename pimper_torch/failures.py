@@ -7,7 +7,7 @@ and end the run.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
+from dataclasses import replace
 from itertools import groupby
 from traceback import clear_frames
 from typing import Literal, TypeVar
@@ -22,15 +22,13 @@ from pimper_torch.errors import (
     ReconstructionError,
     caution,
 )
-from pimper_torch.ledger import Entry, collected
-from pimper_torch.records.failure import Failure
+from pimper_torch.journal import current, writing
+from pimper_torch.records.failure import Failure, LeftOut
 from pimper_torch.records.record import Record
 
 OnFailure = Literal["skip", "fail"]
 Result = TypeVar("Result")
 AnyRecord = TypeVar("AnyRecord", bound=Record)
-
-_on_failure: ContextVar[OnFailure] = ContextVar("on_failure", default="skip")
 
 # What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
@@ -44,29 +42,29 @@ _LISTED = 5
 
 @contextmanager
 def collecting(
-    on_failure: OnFailure = "skip", entries: list[Entry] | None = None
-) -> Iterator[list[Entry]]:
-    """Collect what is skipped or left out inside the ``with`` block, in threads of it, too.
+    on_failure: OnFailure = "skip", events: list[object] | None = None
+) -> Iterator[list[object]]:
+    """Collect what is told inside the ``with`` block: what is skipped, left out, and so on.
 
     Where the block ends in an error, what was skipped before is told first.
 
     Args:
         on_failure: ``"fail"`` refuses instead of skipping.
-        entries: Those so far, which more are added to.
+        events: Those so far, which more are added to.
 
     Yields:
-        The entries so far, for :func:`warn_of` at the end.
+        The events so far, for :func:`warn_of` at the end.
 
     Raises:
         OutOfMemoryError: In place of an error of memory.
     """
-    entries = [] if entries is None else entries
-    policy, token = _on_failure.set(on_failure), collected.set(entries)
+    outer, events = current(), [] if events is None else events
+    before, fail = len(events), on_failure == "fail"
     try:
-        yield entries
+        with writing(replace(outer, events=events, collects=True, fail=fail)):
+            yield events
     except BaseException as error:
-        collected.set(None)
-        warn_of(entries)
+        warn_of(events)
         if out_of_memory(error):
             raise OutOfMemoryError(
                 f"Memory did not suffice, for the smallest parts either: {reason_of(error)}. "
@@ -74,9 +72,9 @@ def collecting(
                 "(`decompose.samples_per_pixel`), or close other programs."
             ) from error
         raise
-    finally:
-        _on_failure.reset(policy)
-        collected.reset(token)
+    for event in events[before:]:
+        if not isinstance(event, Failure | LeftOut):
+            outer.tell(event)
 
 
 def skipped(*failures: Failure, error: BaseException | None = None) -> None:
@@ -85,25 +83,26 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
     Raises:
         ReconstructionError: Failures are to end the run.
     """
-    if failures and _on_failure.get() == "fail":
+    journal = current()
+    if failures and journal.fail:
         first = failures[0]
         raise ReconstructionError(
             f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures are to end "
             f"the run (`on_failure` is fail); with skip it goes on: {first.done}."
         ) from error
-    entries = collected.get()
-    if entries is None:
+    if not journal.collects:
         warn_of(failures)
-    else:
-        entries.extend(failures)
+        return
+    for failure in failures:
+        journal.tell(failure)
 
 
-def distinct(entries: Sequence[Entry]) -> tuple[Failure, ...]:
+def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:
     """List each failure once, in an order that threads do not change."""
     return tuple(sorted({one for one in entries if isinstance(one, Failure)}, key=_order))
 
 
-def warn_of(entries: Sequence[Entry]) -> None:
+def warn_of(entries: Sequence[object]) -> None:
     """Warn once of each kind of failure, with how many there are and the first of them."""
     for (stage, what, done), some in groupby(distinct(entries), key=_kind):
         kind = list(some)

@@ -4,17 +4,16 @@ Entries of a call of a chain are in :attr:`~pimper_torch.records.Reconstruction.
 order they were made: a guard that acts in several passes has one of each.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import some
-from pimper_torch.records.failure import Failure, LeftOut, What
+from pimper_torch.journal import Journal, current, writing
+from pimper_torch.records.failure import LeftOut, What
 
 GUARDS: dict[str, tuple[What, str]] = {
     "sfm.quarter_turns": ("doubt", "turned as the sensor lay"),
@@ -78,13 +77,9 @@ GUARDS: dict[str, tuple[What, str]] = {
 }
 """All guards, in the order of the chain: what each leaves out or raises, and why."""
 
-Entry = Failure | LeftOut
 Places = Float[Tensor, "place 3"] | tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 Listener = Callable[[LeftOut, Tensor | None, Tensor | None], None]
 """Takes an entry, the mask of what was left out, and where in the world each element is."""
-
-collected: ContextVar[list[Entry] | None] = ContextVar("collected", default=None)
-_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 # Fraction up to which the closing message is silent: a choice. It says nothing of pixels, as most
 # views see most facets from behind, and nothing of doubts, which are warned of.
@@ -109,8 +104,8 @@ def leave_out(
         names: Of photographs: of all with a mask, else of those left out.
         at: Where each element of the mask is, world: points, or vertices and faces.
     """
-    entries, listener = collected.get(), _listener.get()
-    if entries is None and listener is None:
+    journal = current()
+    if not journal.collects and journal.masks is None:
         return
     mask = taken if isinstance(taken, Tensor) else None
     if mask is not None:
@@ -122,50 +117,30 @@ def leave_out(
     entry = LeftOut(
         guard=guard, what=what, count=count, total=total, reason=reason, names=tuple(names)
     )
-    if entries is not None:
-        entries.append(entry)
-    if listener is not None:
-        listener(entry, mask, at[0][at[1]].mean(dim=1) if isinstance(at, tuple) else at)
+    if journal.collects:
+        journal.tell(entry)
+    if journal.masks is not None:
+        journal.masks(entry, mask, at[0][at[1]].mean(dim=1) if isinstance(at, tuple) else at)
 
 
-@contextmanager
-def listening(listener: Listener) -> Iterator[None]:
+def listening(listener: Listener) -> AbstractContextManager[Journal]:
     """Hand every entry of the ``with`` block, with masks and places, to a listener, in threads too.
 
     What an earlier run kept (:mod:`pimper_torch.store`) has no masks any more: it is not heard.
     """
-    token = _listener.set(listener)
-    try:
-        yield
-    finally:
-        _listener.reset(token)
-
-
-@contextmanager
-def noted_entries() -> Iterator[list[Entry]]:
-    """Note what enters inside the ``with`` block; it is collected all the same.
-
-    Yields:
-        The list that holds it when the block has ended; empty where nothing is collected.
-    """
-    entries, noted = collected.get(), list[Entry]()
-    before = 0 if entries is None else len(entries)
-    yield noted
-    if entries is not None:
-        noted += entries[before:]
+    return writing(replace(current(), masks=listener))
 
 
 @contextmanager
 def added_up() -> Iterator[None]:
     """Add up what each guard enters inside the ``with`` block, as threads work on parts."""
-    entries = collected.get()
-    before = 0 if entries is None else len(entries)
+    events = current().so_far()
+    before = len(events)
     yield
-    if entries is not None:
-        entries[before:] = _sums(entries[before:])
+    events[before:] = _sums(events[before:])
 
 
-def _sums(entries: Sequence[Entry]) -> list[Entry]:
+def _sums(entries: Sequence[object]) -> list[object]:
     """Add up entries of the same guard, in an order that threads do not change."""
     sums: dict[tuple[str, str, str], LeftOut] = {}
     for entry in left_out_of(entries):
@@ -174,26 +149,13 @@ def _sums(entries: Sequence[Entry]) -> list[Entry]:
             count, total = sums[key].count + entry.count, sums[key].total + entry.total
             entry = entry.replace(count=count, total=total, names=sums[key].names + entry.names)
         sums[key] = entry
-    return [entry for entry in entries if isinstance(entry, Failure)] + [
-        sums[key] for key in sorted(sums)
-    ]
+    others = [entry for entry in entries if not isinstance(entry, LeftOut)]
+    return [*others, *(sums[key] for key in sorted(sums))]
 
 
-def left_out_of(entries: Sequence[Entry]) -> tuple[LeftOut, ...]:
+def left_out_of(entries: Sequence[object]) -> tuple[LeftOut, ...]:
     """List the entries of guards, in order."""
     return tuple(entry for entry in entries if isinstance(entry, LeftOut))
-
-
-def kept_entries(entries: Sequence[Entry]) -> list[dict[str, object]]:
-    """Turn the entries of guards into what JSON keeps."""
-    return [asdict(entry) for entry in left_out_of(entries)]
-
-
-def repeat_entries(kept: Sequence[Mapping[str, Any]]) -> None:
-    """Enter again what an earlier run kept."""
-    entries = collected.get()
-    if entries is not None:
-        entries.extend(LeftOut(**{**entry, "names": tuple(entry["names"])}) for entry in kept)
 
 
 def closing_line(left_out: Sequence[LeftOut]) -> str:

@@ -5,19 +5,19 @@ bar listens with :func:`listening`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from typing import TypeVar
+
+from pimper_torch.journal import Journal, current, writing
 
 Item = TypeVar("Item")
 Listener = Callable[[int, int], None]
 
-_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
-
 
 def report(done: int, total: int) -> None:
     """Report the listener, if any, that ``done`` of ``total`` steps are behind us."""
-    listener = _listener.get()
+    listener = current().progress
     if listener is not None:
         listener(done, total)
 
@@ -29,14 +29,9 @@ def track(items: Sequence[Item]) -> Iterator[Item]:
         report(done, len(items))
 
 
-@contextmanager
-def listening(listener: Listener | None) -> Iterator[None]:
+def listening(listener: Listener | None) -> AbstractContextManager[Journal]:
     """Send reports to ``listener(done, total)`` inside the ``with`` block, or to nobody."""
-    token = _listener.set(listener)
-    try:
-        yield
-    finally:
-        _listener.reset(token)
+    return writing(replace(current(), progress=listener))
 
 
 @contextmanager
@@ -48,7 +43,7 @@ def part(place: int, count: int) -> Iterator[None]:
     Args:
         place: Of the part, from 0.
     """
-    whole = _listener.get()
+    whole = current().progress
 
     def inside(done: int, total: int) -> None:
         if whole is not None:

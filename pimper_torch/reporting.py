@@ -3,19 +3,18 @@
 import math
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import singledispatch
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from pimper_torch.geometry.topology import boundary_loops
+from pimper_torch.journal import HASH, KEEP, Journal, current, writing
 from pimper_torch.patches.warp import missing_fraction
-from pimper_torch.progress import listening
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
@@ -30,6 +29,8 @@ from pimper_torch.records import (
     SweptPatches,
 )
 from pimper_torch.silhouettes.contours import Contours
+
+R = TypeVar("R")
 
 
 @runtime_checkable
@@ -59,37 +60,9 @@ class Silent:
         """Do nothing."""
 
 
-# Lines of a run's table for what no stage does: hashes of what stages are called with, records
-# written and read, and the rest.
-ASIDE = HASH, KEEP, BETWEEN = "hash", "keep", "between stages"
-
-
-@dataclass(frozen=True, slots=True)
-class _Recording:
-    """The reports of a call, and who hears of them.
-
-    Attributes:
-        open: When the stages began that are under way.
-        aside: Seconds by line of what no stage does.
-    """
-
-    observer: Observer
-    began: float
-    reports: list[StageReport] = field(default_factory=list)
-    open: dict[str, float] = field(default_factory=dict)
-    aside: dict[str, float] = field(default_factory=dict)
-
-    def finish(self, name: str, began: float, told: dict[str, int | float]) -> None:
-        """Report that a stage ended."""
-        report = reported(name, time.perf_counter() - began, told)
-        self.reports.append(report)
-        self.observer.finished(report)
-
-    def lines(self) -> list[StageReport]:
-        """Return the reports, and lines of what no stage did: they make up the call's seconds."""
-        lines = [*self.reports, *(reported(name, took) for name, took in self.aside.items())]
-        rest = time.perf_counter() - self.began - seconds_of(lines)
-        return [*lines, reported(BETWEEN, rest)]
+# What neither stages nor other lines of a run's table do.
+BETWEEN = "between stages"
+ASIDE = HASH, KEEP, BETWEEN
 
 
 def reported(
@@ -113,52 +86,48 @@ def gathered(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
     return (*(one for one in reports if one.name not in ASIDE), *lines)
 
 
-# Of the call that this thread is in. Hooks belong to a module, which threads share.
-_recording: ContextVar[_Recording | None] = ContextVar("recording", default=None)
-
-
 @contextmanager
-def recorded(chain: nn.Module, observer: Observer) -> Iterator[list[StageReport]]:
-    """Time the direct submodules of ``chain`` while the ``with`` block calls them.
+def recorded(observer: Observer) -> Iterator[list[StageReport]]:
+    """Report the stages of the ``with`` block; see :func:`stage`.
 
-    Threads that share ``chain`` have reports of their own. A block inside another one that is in no
-    stage is part of it.
+    A block inside another one that is in no stage is part of it.
 
     Yields:
-        The list that a report is appended to whenever a submodule has run, and at the end one of
-        each line of what no submodule did.
+        The list that holds the reports when the block has ended, and one of each line of what no
+        stage did.
     """
-    recording, outer = _Recording(observer, time.perf_counter()), _recording.get()
-    hooks = []
-    for name, module in chain.named_children():
-
-        def before(_: nn.Module, __: tuple[object, ...], name: str = name) -> None:
-            if _recording.get() is recording:
-                recording.open[name] = time.perf_counter()
-                observer.started(name)
-
-        def after(_: nn.Module, __: tuple[object, ...], output: object, name: str = name) -> None:
-            if _recording.get() is recording:
-                recording.finish(name, recording.open.pop(name), figures(output))
-
-        hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
-    token = _recording.set(recording)
-    try:
-        with listening(observer.progressed):
-            yield recording.reports
-        recording.reports[:] = recording.lines()
-        if outer is not None and not outer.open:
-            outer.reports.extend(recording.reports)
-    finally:
-        _recording.reset(token)
-        for hook in hooks:
-            hook.remove()
+    events, reports = current().so_far(), list[StageReport]()
+    before = len(events)
+    journal = replace(
+        current(),
+        events=events,
+        observer=observer,
+        progress=observer.progressed,
+        began=time.perf_counter(),
+        aside={},
+    )
+    with writing(journal):
+        yield reports
+    own = _reports(events[before:])
+    reports += _lines(journal, own)
+    events += reports[len(own) :]
 
 
 def accounted() -> tuple[StageReport, ...]:
     """Return all lines of the call so far, which make up its seconds."""
-    recording = _recording.get()
-    return () if recording is None else gathered(recording.lines())
+    journal = current()
+    return () if journal.observer is None else gathered(_lines(journal, journal.so_far()))
+
+
+def _reports(events: Iterable[object]) -> list[StageReport]:
+    return [event for event in events if isinstance(event, StageReport)]
+
+
+def _lines(journal: Journal, events: Iterable[object]) -> list[StageReport]:
+    """Return the reports, and lines of what no stage did: they make up the call's seconds."""
+    lines = [*_reports(events), *(reported(name, took) for name, took in journal.aside.items())]
+    rest = time.perf_counter() - journal.began - seconds_of(lines)
+    return [*lines, reported(BETWEEN, rest)]
 
 
 @contextmanager
@@ -169,54 +138,27 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
         The figures to be told, empty at first.
     """
     told: dict[str, int | float] = {}
-    recording = _recording.get()
-    if recording is None:
+    journal, began = current(), time.perf_counter()
+    if journal.observer is None:
         yield told
         return
-    began = time.perf_counter()
-    recording.observer.started(name)
-    token = _recording.set(None)
-    try:
+    events = journal.so_far()
+    before = len(events)
+    journal.observer.started(name)
+    with writing(replace(journal, observer=None)):
         yield told
-    finally:
-        _recording.reset(token)
-    recording.finish(name, began, told)
+    report = reported(name, time.perf_counter() - began, told)
+    events[before:] = [one for one in events[before:] if not isinstance(one, StageReport)]
+    events.append(report)
+    journal.observer.finished(report)
 
 
-@contextmanager
-def aside(line: str) -> Iterator[None]:
-    """Count what the ``with`` block takes to a line of its own, unless a stage is under way."""
-    recording, began = _recording.get(), time.perf_counter()
-    yield
-    if recording is not None and not recording.open:
-        took = time.perf_counter() - began
-        recording.aside[line] = recording.aside.get(line, 0.0) + took
-
-
-@contextmanager
-def noted() -> Iterator[list[StageReport]]:
-    """Note the reports of the stages that run inside the block; they are made all the same.
-
-    Yields:
-        The list that holds them when the block has ended.
-    """
-    recording, reports = _recording.get(), list[StageReport]()
-    before = 0 if recording is None else len(recording.reports)
-    yield reports
-    if recording is not None:
-        reports += recording.reports[before:]
-
-
-def repeat(reports: Sequence[StageReport]) -> None:
-    """Report stages again whose records an earlier run found."""
-    recording = _recording.get()
-    if recording is None:
-        return
-    for report in reports:
-        again = report.replace(kept=True)
-        recording.observer.started(again.name)
-        recording.reports.append(again)
-        recording.observer.finished(again)
+def called(name: str, call: Callable[..., R], *inputs: object) -> R:
+    """Call a stage, and report it with the figures of its record."""
+    with stage(name) as told:
+        record = call(*inputs)
+        told |= figures(record)
+    return record
 
 
 def peak_memory_mb() -> float:

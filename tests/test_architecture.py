@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 # (the command line names its verbs there, and imports one when it is called). viz stands above io,
 # which draws the contact sheet of a result with it.
 ROOMS = [
+    "journal",
     "errors",
     "mapped",
     "config",

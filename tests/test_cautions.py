@@ -32,7 +32,7 @@ def iterations(messages):
     scene, _ = small_scene()
     chain.silhouettes = Given(Silhouettes.everything(scene.views))
     chain.factorize = Stub(factorize)
-    return list(chain.passes(scene, None, None))
+    return list(chain.passes(chain.running(), scene, None, None))
 
 
 def test_the_last_rounds_figures_are_said_once():

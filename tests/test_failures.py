@@ -347,7 +347,8 @@ def given():
 def streamed(given):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)  # of patches under too little light
-        return photometry_and_heights(Warp(), Factorize(), Sweep(), *given)
+        sources = Warp().prepare(given[0]).hidden_by(given[2].coarse.mesh)
+        return photometry_and_heights(Warp(), Factorize(), Sweep(), *given, sources)
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,8 @@ from pimper_torch.store import digest
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 
 # Of two passes over given facets, in order.
-STAGES = ["silhouettes", "photometry_and_heights", "fuse", "remesh"]
-STAGES += ["photometry_and_heights", "fuse", "extract"]
+STAGES = ["silhouettes", "sweep", "fuse", "remesh"]
+STAGES += ["sweep", "fuse", "extract"]
 
 
 class Listener(Silent):
@@ -88,7 +88,7 @@ def test_a_run_goes_on_after_any_stage_to_the_same_bits(given, whole, tmp_path, 
             (tmp_path / file.name).write_bytes(file.read_bytes())
     result, listener = run(given, tmp_path)
     assert bits(result) == bits(expected)
-    names = [name.replace("photometry_and_heights", "photometry") for name in STAGES]
+    names = [name.replace("sweep", "photometry") for name in STAGES]
     assert listener.kept == names[:done]
     assert [name for name in listener.done if name in names] == names[done:]
 
@@ -146,11 +146,11 @@ def test_a_stage_of_ones_own_is_called_every_time(given, whole):
 def test_what_asks_for_gradients_is_not_kept(given, tmp_path):
     scene, _ = given
     chain, _ = chain_of(given, tmp_path)
-    chain.kept(chain.silhouettes, scene)
+    chain.running()(chain.silhouettes, scene)
     kept = sorted(tmp_path.iterdir())
     assert len(kept) == 2
     images = scene.views.images.clone().requires_grad_()
-    chain.kept(chain.silhouettes, scene.replace(views=scene.views.replace(images=images)))
+    chain.running()(chain.silhouettes, scene.replace(views=scene.views.replace(images=images)))
     assert sorted(tmp_path.iterdir()) == kept
 
 

@@ -1,6 +1,5 @@
 """What guards leave out is counted, by whom and why, and nothing else changes."""
 
-import json
 import re
 from pathlib import Path
 
@@ -9,15 +8,13 @@ import torch
 
 import pimper_torch
 from pimper_torch.failures import collecting, distinct, skipped
+from pimper_torch.journal import noted
 from pimper_torch.ledger import (
     GUARDS,
     closing_line,
-    kept_entries,
     leave_out,
     left_out_of,
     listening,
-    noted_entries,
-    repeat_entries,
 )
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Failure, LeftOut
@@ -45,9 +42,8 @@ def test_a_mask_is_counted_and_names_are_those_of_its_photographs():
 
 
 def test_outside_of_a_run_nothing_is_noted():
-    with noted_entries() as entries:
+    with noted() as entries:
         leave_out("extract.borders", torch.ones(3, dtype=torch.bool))
-        repeat_entries(kept_entries([entry("extract.borders", 3, 3)]))
     assert entries == []
 
 
@@ -69,13 +65,6 @@ def test_what_threads_leave_out_is_added_up_for_each_guard_and_call(threads, mon
     passes = (entry("photometry.robust", 15, 60), entry("warp", 15, 60))
     assert left_out_of(entries) == (entry("warp", 5, 10), *passes, *passes)
     assert distinct(entries) == (FAILED,)
-
-
-def test_entries_are_repeated_from_json_as_they_were():
-    before = [entry("sfm.missing", 2, 8, ("a", "b")), entry("extract.borders", 1, 4)]
-    with collecting() as entries, noted_entries() as noted:
-        repeat_entries(json.loads(json.dumps(kept_entries([FAILED, *before]))))
-    assert entries == noted == before
 
 
 def test_a_listener_hears_masks_and_places_in_threads_too():

@@ -5,42 +5,31 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
-from pimper_torch import reporting
+from pimper_torch import journal, reporting
+from pimper_torch.journal import aside, current
 from pimper_torch.progress import report
 from pimper_torch.records import Mesh, StageReport
 from pimper_torch.reporting import (
     Silent,
     accounted,
-    aside,
+    called,
     figures,
     gathered,
     recorded,
-    repeat,
     seconds_of,
     stage,
 )
 
 
-class Tetrahedron(nn.Module):
-    def forward(self) -> Mesh:
-        report(1, 1)
-        faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-        return Mesh(vertices_world=torch.eye(4)[:, :3].contiguous(), faces=faces)
+def tetrahedron() -> Mesh:
+    report(1, 1)
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    return Mesh(vertices_world=torch.eye(4)[:, :3].contiguous(), faces=faces)
 
 
-class Broken(nn.Module):
-    def forward(self) -> Mesh:
-        raise ValueError("broken on purpose")
-
-
-class Chain(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.first = Tetrahedron()
-        self.second = Tetrahedron()
-        self.broken = Broken()
+def broken() -> Mesh:
+    raise ValueError("broken on purpose")
 
 
 class Listener(Silent):
@@ -58,44 +47,45 @@ class Listener(Silent):
 
 
 def test_stages_are_reported_in_the_order_they_run_with_their_figures():
-    chain, listener = Chain(), Listener()
-    with recorded(chain, listener) as reports:
-        chain.second()
-        chain.first()
+    listener = Listener()
+    with recorded(listener) as reports:
+        called("second", tetrahedron)
+        called("first", tetrahedron)
     assert [entry.name for entry in reports] == ["second", "first", "between stages"]
     assert reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
     assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
 
 
-def test_threads_that_share_a_chain_have_reports_of_their_own():
-    chain, told = Chain(), {}
+def test_a_stage_that_fails_does_not_finish_and_those_inside_another_are_part_of_it():
+    listener = Listener()
+    with recorded(listener):
+        with pytest.raises(ValueError, match="on purpose"):
+            called("broken", broken)
+        called("outer", lambda: called("inner", tetrahedron))
+    assert listener.heard == ["started broken", "started outer", "1/1", "finished outer"]
+
+
+def test_threads_have_reports_of_their_own():
+    told = {}
     inside = threading.Barrier(2, timeout=60)
     listeners = {"first": Listener(), "second": Listener()}
 
     def call(stage):
-        with recorded(chain, listeners[stage]) as reports:
-            inside.wait()  # both have their hooks on the chain
-            getattr(chain, stage)()
+        with recorded(listeners[stage]) as reports:
             inside.wait()
-            told[stage] = [entry.name for entry in reports]
+            called(stage, tetrahedron)
+            inside.wait()
+        told[stage] = [entry.name for entry in reports]
 
     threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert told == {"first": ["first"], "second": ["second"]}
+    assert told == {name: [name, "between stages"] for name in listeners}
     for name, listener in listeners.items():
         assert listener.heard == [f"started {name}", "1/1", f"finished {name}"]
-
-
-def test_no_hook_stays_behind_even_after_a_failure():
-    chain, listener = Chain(), Listener()
-    with pytest.raises(ValueError, match="on purpose"), recorded(chain, listener):
-        chain.broken()
-    chain.first()
-    assert listener.heard == ["started broken"]
 
 
 class Clock:
@@ -109,18 +99,19 @@ class Clock:
 
 
 def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
-    chain, clock = Chain(), Clock()
-    monkeypatch.setattr(reporting, "time", clock)
-    kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={})
-    with recorded(nn.Module(), Silent()) as reports:
+    clock = Clock()
+    for module in (journal, reporting):
+        monkeypatch.setattr(module, "time", clock)
+    kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={}, kept=True)
+    with recorded(Silent()) as reports:
         with stage("read"), aside("keep"):  # a stage's own, whatever it does
             clock.sleep(1)
         for _ in range(2):
-            with recorded(chain, Silent()):
+            with recorded(Silent()):
                 with aside("keep"):
                     clock.sleep(2)
-                chain.first()
-                repeat([kept])
+                called("first", tetrahedron)
+                current().tell(kept)
                 clock.sleep(4)
         so_far = accounted()
         clock.sleep(8)

@@ -3,11 +3,11 @@ import torch
 from probes import small_scene
 from torch import nn
 from torch.testing import assert_close
+from twins import using
 
 import pimper_torch as pt
 from pimper_torch.chains.streaming import photometry_and_heights
 from pimper_torch.errors import ConfigError
-from pimper_torch.kernels.switch import using
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
@@ -31,7 +31,9 @@ def given():
 
 
 def streamed(given, factorize: nn.Module | None = None):
-    return photometry_and_heights(Warp(), factorize or Factorize(), Sweep(), *given)
+    views, _, patches = given
+    sources = Warp().prepare(views).hidden_by(patches.coarse.mesh)
+    return photometry_and_heights(Warp(), factorize or Factorize(), Sweep(), *given, sources)
 
 
 def values(swept):

@@ -159,12 +159,17 @@ def test_gradients_reach_cameras_far_from_the_origin(given):
     assert torch.equal(poses.grad[:, :3, 3], torch.ones_like(poses[:, :3, 3]))
 
 
+def placed(scene):
+    chain = pt.load_chain("fast")
+    return chain.placed(chain.running(), scene, None)
+
+
 @pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 def test_a_chain_triangulates_points_for_poses_that_come_without():
     cameras = cameras_on_an_arc()
     views = photographs(cameras, lit=False)
     made = pt.scene_of(views.images.float(), cameras.intrinsics, cameras.cam_from_world)
-    found = pt.load_chain("fast").placed(made, None)
+    found = placed(made)
     assert len(found.points_world) > 100
     assert float((found.points_world.norm(dim=1) - 1).abs().median()) < 0.003
     assert torch.equal(found.cameras.cam_from_world, made.cameras.cam_from_world)
@@ -177,7 +182,7 @@ def test_a_chain_refuses_poses_of_another_convention():
     poses = cameras.cam_from_world.inverse()
     made = pt.scene_of(views.images.float(), cameras.intrinsics, poses)
     with pytest.raises(pt.InputError, match=r"The scene: these cameras.*invert them"):
-        pt.load_chain("fast").placed(made, None)
+        placed(made)
 
 
 @pytest.mark.parametrize("preset", ["default", "fast"])

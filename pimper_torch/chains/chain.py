@@ -1,23 +1,22 @@
 """What both chains have in common: a run is a sequence of steps, and the last one's mesh."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar
 
 from torch import nn
 
-from pimper_torch.chains.kept import kept_call
+from pimper_torch.chains.running import Running
 from pimper_torch.coarse.depth_points import depth_points
 from pimper_torch.coarse.given_mesh import prepared
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
-from pimper_torch.kernels.compile import all_compiled, compile_ahead, load
-from pimper_torch.kernels.switch import Kernels, using
-from pimper_torch.ledger import Entry, left_out_of
+from pimper_torch.kernels.compile import compile_ahead
+from pimper_torch.ledger import left_out_of
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -44,8 +43,6 @@ from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.sfm.undistort_priors import with_undistorted_priors
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
-
-R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -107,6 +104,8 @@ class Chain(Stage):
     held out.
     """
 
+    put_off: ClassVar[tuple[str, ...]] = ()
+    """Stages that work when another one asks for their records, see :class:`Running`."""
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
     silhouettes: Callable[[SparseScene], Silhouettes]
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
@@ -114,14 +113,12 @@ class Chain(Stage):
 
     def __init__(
         self,
-        kernels: Kernels,
         observer: Observer | None,
         store: Store | None = None,
         on_failure: OnFailure = "skip",
     ) -> None:
         super().__init__()
         self.on_failure: OnFailure = on_failure
-        self.kernels: Kernels = kernels
         self.observer = observer or Silent()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
@@ -130,9 +127,22 @@ class Chain(Stage):
 
     @abstractmethod
     def passes(
-        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
     ) -> Iterator[Step]:
-        """Run the stages up to the surface; give each pass's records, without reports."""
+        """Run the stages up to the surface; yield each pass's records, without reports.
+
+        Args:
+            run: Calls the stages.
+        """
+
+    def running(self) -> Running:
+        """Return how stages are called in a run."""
+        names = {module: name for name, module in self.named_children()}
+        return Running(names=names, store=self.store, put_off=self.put_off)
 
     def references(self) -> Iterator[str]:
         """List the photographs that stages were asked to take for the reference view."""
@@ -141,25 +151,9 @@ class Chain(Stage):
             if isinstance(named, str) and named:
                 yield named
 
-    def kept(self, call: Callable[..., R], *inputs: object, **derived: object) -> R:
-        """Call a stage, or give the record that an earlier run kept.
-
-        Args:
-            call: A stage of the chain, or a function.
-            derived: What it is called with by name, which follows from the inputs.
-        """
-        names = [name for name, module in self.named_children() if module is call]
-        name = names[0] if names else getattr(call, "__name__", type(call).__name__)
-        return kept_call(self.store, name, call, inputs, derived, self.kernels)
-
-    def need(self, kernels: Sequence[str]) -> None:
-        """Wait for kernels, in an installation's first run."""
-        if self.kernels == "numba" and not all_compiled():
-            with stage("compile"):
-                load(kernels)
-
     def placed(
         self,
+        run: Running,
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None = None,
@@ -173,7 +167,7 @@ class Chain(Stage):
             InputError: Cameras come twice.
         """
         if isinstance(views, Views):
-            views = self.reconstruct(views, sparse_model)
+            views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
             raise InputError(
                 f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
@@ -181,16 +175,11 @@ class Chain(Stage):
             )
         elif mesh is None and isinstance(self.reconstruct, Reconstruct):
             views = self.reconstruct.with_points(views)
-        scene = with_poses(sound(self._with_points(views, mesh)))
+        few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
+        scene = with_poses(sound(run(depth_points, views) if few else views))
         scene = with_undistorted_priors(scene)
         self._watched(scene)
         return scene
-
-    def _with_points(self, scene: SparseScene, mesh: Mesh | None) -> SparseScene:
-        """Take points of depth maps where features gave hardly any, unless a mesh is given."""
-        if mesh is not None or scene.cameras.num_views < 3 or not lacks_points(scene, FEW_OBSERVED):
-            return scene
-        return self.kept(depth_points, scene)
 
     def _watched(self, found: "SparseScene | Step") -> None:
         """Call ``watch``, if it is set."""
@@ -244,16 +233,11 @@ class Chain(Stage):
         names = (views if isinstance(views, Views) else views.views).names
         for named in self.references():
             view_named(named, names)  # not first after structure from motion
-        passes = self.passes(views, sparse_model, mesh)
-        if self.kernels == "numba":
-            compile_ahead()
-        entries: list[Entry] = []
+        passes = self.passes(self.running(), views, sparse_model, mesh)
+        compile_ahead()
+        entries: list[object] = []
         while True:
-            with (
-                using(self.kernels),
-                collecting(self.on_failure, entries),
-                recorded(self, self.observer) as reports,
-            ):
+            with collecting(self.on_failure, entries), recorded(self.observer) as reports:
                 step = next(passes, None)
                 if step is not None:
                     self._watched(step)
@@ -292,12 +276,8 @@ class Chain(Stage):
             del step  # the next pass needs its memory
             step = next(steps)
             reports += step.reports
-        with (
-            using(self.kernels),
-            collecting(self.on_failure) as entries,
-            recorded(self, self.observer) as last,
-        ):
-            found = self.kept(self.extract, step.surface)
+        with collecting(self.on_failure) as entries, recorded(self.observer) as last:
+            found = self.running()(self.extract, step.surface)
             warn_of(entries)
         return Reconstruction(
             mesh=found,

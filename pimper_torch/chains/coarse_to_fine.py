@@ -10,22 +10,14 @@ from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.hold_out import held_apart
-from pimper_torch.chains.streaming import (
-    Factorizing,
-    Prepared,
-    Sweeping,
-    Warping,
-    photometry_and_heights,
-)
+from pimper_torch.chains.running import Running
+from pimper_torch.chains.streaming import Factorizing, Sweeping, Warping
 from pimper_torch.coarse.remesh import Remesh, RemeshConfig
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.errors import caution, held
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.kernels.compile import COARSE, PHOTOMETRY, SURFACE, SWEEP
-from pimper_torch.kernels.switch import Kernels
-from pimper_torch.memory import bytes_of, largest_problem, release_memory
+from pimper_torch.memory import bytes_of, largest_problem
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
@@ -37,6 +29,7 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Mesh,
+    PatchSet,
     Silhouettes,
     SparseScene,
     Surface,
@@ -60,9 +53,6 @@ class CoarseToFineConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
-            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
             the first pass.
@@ -72,7 +62,6 @@ class CoarseToFineConfig:
     """
 
     chain: ClassVar[str] = "coarse-to-fine"
-    kernels: Kernels = "numba"
     on_failure: OnFailure = "skip"
     max_memory: str = ""
     hold_out: Annotated[int, Range(least=0, most=1_000_000)] = 0
@@ -105,6 +94,8 @@ class CoarseToFine(Chain):
     (:class:`~pimper_torch.chains.streaming.InParts`), and all at once to others.
     """
 
+    put_off = ("warp", "factorize")
+
     def __init__(
         self,
         config: CoarseToFineConfig | None = None,
@@ -114,7 +105,7 @@ class CoarseToFine(Chain):
     ) -> None:
         self.config = config = config or CoarseToFineConfig()
         store = opened(cache)
-        super().__init__(config.kernels, observer, store, config.on_failure)
+        super().__init__(observer, store, config.on_failure)
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
@@ -132,67 +123,53 @@ class CoarseToFine(Chain):
         self._swap(stages)
 
     def passes(
-        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
     ) -> Iterator[Step]:
         """Run the stages behind the coarse mesh once a scale."""
-        every = self.placed(views, sparse_model, mesh)
+        every = self.placed(run, views, sparse_model, mesh)
         needed = (*self.references(), *self.needed)
         placed, held_out = held_apart(every, self.config.hold_out, needed)
-        self.need(COARSE)
         few = one_view_a_pose(placed, needed)
-        outlines = self.kept(self.silhouettes, few.scene)
+        outlines = run(self.silhouettes, few.scene)
         mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
         scene = settled(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)
-        contours = self.contours(outlines, shown.cameras)
-        coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+        contours = run(self.contours, outlines, shown.cameras)
+        coarse = run(self.coarse_surface, shown, contours, mesh)
         if shown is not scene:
             coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
-        cameras = scene.cameras
         self.show(scene, coarse)
-        self.need((*PHOTOMETRY, *SWEEP))
-        sources = Prepared(self.warp, scene.views)
-        heights: SweptPatches | None = None
+        cameras = scene.cameras
         surface: Surface | None = None
         by_blocks: tuple[float, ...] = ()
-        first, last = self.config.scales[0], len(self.config.scales)
-        for number, scale in enumerate(self.config.scales, start=1):
-            with held() as cautions:
-                if heights is not None and surface is not None:
-                    coarse = self.kept(self.remesh, heights, surface, contours)
-                patches = self.decompose(coarse, cameras, surface, scale)
-                if number == 1:
-                    limit = bytes_of(self.config.max_memory)
-                    most = largest_problem(limit, patches, first, self.config.scales[-1])
-                    by_blocks = () if math.isinf(most) else (most,)
-                heights = self.kept(
-                    photometry_and_heights,
-                    self.warp,
-                    self.factorize,
-                    self.sweep,
-                    scene.views,
-                    cameras,
-                    patches,
-                    sources=sources,
-                )
-                if number == last:
-                    sources.release()  # as much memory as the photographs themselves
-                release_memory()
-                if number == 1:
-                    self.need(SURFACE)
-                surface = self.repair(
-                    self.kept(self.fuse, heights, contours, number == last, *by_blocks)
-                )
-            if number == last:  # what earlier passes would warn of as well
-                for message in cautions:
-                    caution(message, stacklevel=3)
+        for scale, last in run.passes(self.config.scales):
+            patches = run(self.decompose, coarse, cameras, surface, scale)
+            if surface is None:
+                by_blocks = self._by_blocks(patches)
+            seen = run(self.warp, scene.views, cameras, patches)  # samples J
+            photometric = run(self.factorize, seen)  # J = L N: lights, albedo and normals
+            heights = run(self.sweep, scene.views, cameras, seen, photometric)
+            surface = run(self.fuse, heights, contours, last, *by_blocks)
+            surface = run(self.repair, surface)
             yield Step(
                 scale=scale,
-                last=number == last,
+                last=last,
                 scene=scene,
                 held_out=held_out,
                 silhouettes=silhouettes,
                 heights=heights,
                 surface=surface,
             )
+            if not last:
+                coarse = run(self.remesh, heights, surface, contours)
+
+    def _by_blocks(self, patches: PatchSet) -> tuple[float, ...]:
+        """Return how many vertices the fusion may solve for at once, if memory limits it."""
+        limit, scales = bytes_of(self.config.max_memory), self.config.scales
+        most = largest_problem(limit, patches, scales[0], scales[-1])
+        return () if math.isinf(most) else (most,)

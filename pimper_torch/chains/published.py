@@ -8,11 +8,10 @@ from typing import ClassVar
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.running import Running
 from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
-from pimper_torch.kernels.compile import PHOTOMETRY
-from pimper_torch.kernels.switch import Kernels
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate
@@ -24,12 +23,9 @@ from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
-    Cameras,
     CoarseMesh,
     DepthPatches,
     Mesh,
-    PatchSet,
-    PatchViews,
     PhotometricPatches,
     SparseScene,
     Surface,
@@ -51,15 +47,11 @@ class PublishedConfig:
 
     Attributes:
         chain: Which chain these are the settings of.
-        kernels: Compiled kernels on the CPU where no gradients are asked for (numba), or only for
-            what is constant to autograd: structure from motion, the coarse surface, hierarchies of
-            multigrid (torch).
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         photographs: What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.
     """
 
     chain: ClassVar[str] = "published"
-    kernels: Kernels = "numba"
     on_failure: OnFailure = "skip"
     photographs: Encoding = field(default_factory=Encoding)
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
@@ -81,6 +73,8 @@ class Published(Chain):
     multi-view and multi-illumination images, 2015.
     """
 
+    put_off = ("warp",)
+
     def __init__(
         self,
         config: PublishedConfig | None = None,
@@ -90,7 +84,7 @@ class Published(Chain):
     ) -> None:
         self.config = config = config or PublishedConfig()
         store = opened(cache)
-        super().__init__(config.kernels, observer, store, config.on_failure)
+        super().__init__(observer, store, config.on_failure)
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
@@ -98,8 +92,8 @@ class Published(Chain):
             config.coarse_surface
         )
         self.decompose = Decompose(config.decompose)
-        self.warp: Callable[[Views, Cameras, PatchSet], PatchViews] = Warp(config.warp)
-        self.factorize: Callable[[PatchViews], PhotometricPatches] = Factorize(config.factorize)
+        self.warp: Warping = Warp(config.warp)
+        self.factorize: Factorizing = Factorize(config.factorize)
         self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
         self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
         self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
@@ -107,31 +101,33 @@ class Published(Chain):
         self._swap(stages)
 
     def passes(
-        self, views: Views | SparseScene, sparse_model: Path | str | None, mesh: Mesh | None
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
     ) -> Iterator[Step]:
         """Run once through the stages."""
-        placed = self.placed(views, sparse_model, mesh)
+        placed = self.placed(run, views, sparse_model, mesh)
         few = one_view_a_pose(placed, tuple(self.references()))
-        outlines = self.kept(self.silhouettes, few.scene)
+        outlines = run(self.silhouettes, few.scene)
         mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
         scene = settled(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)
         if mesh is None:
-            coarse = self.kept(self.triangulate, shown)
+            coarse = run(self.triangulate, shown)
         else:
             contours = Contours.none(outlines, shown.cameras)
-            coarse = self.kept(self.coarse_surface, shown, contours, mesh)
+            coarse = run(self.coarse_surface, shown, contours, mesh)
         if shown is not scene:
             coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         self.show(scene, coarse)
-        patches = self.decompose(coarse, scene.cameras, None, 1.0)
-        self.need(PHOTOMETRY)
-        photometric = self.kept(
-            photometry, self.warp, self.factorize, scene.views, scene.cameras, patches
-        )
-        heights = self.kept(self.align, self.kept(self.integrate, photometric))
-        surface = self.kept(self.refine, heights)
+        patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
+        seen = run(self.warp, scene.views, scene.cameras, patches)
+        photometric = run(self.factorize, seen)
+        heights = run(self.align, run(self.integrate, photometric))
+        surface = run(self.refine, heights)
         yield Step(
             scale=1.0,
             last=True,
@@ -140,10 +136,3 @@ class Published(Chain):
             heights=heights,
             surface=surface,
         )
-
-
-def photometry(
-    warp: Warping, factorize: Factorizing, views: Views, cameras: Cameras, patches: PatchSet
-) -> PhotometricPatches:
-    """Return normals, albedo and light of all patches."""
-    return factorize(warp(views, cameras, patches, None))

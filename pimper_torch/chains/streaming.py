@@ -29,7 +29,7 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
-from pimper_torch.reporting import figures, stage
+from pimper_torch.reporting import called, figures, stage
 
 # Priors that are so many times further off than claimed are warned of.
 _DOUBTED = 3.0
@@ -57,29 +57,31 @@ class Prepares(Protocol):
         """Prepare them."""
 
 
-@dataclass(slots=True)
-class Prepared:
-    """Photographs as a warp prepares them, when they are first needed; not at all by some."""
-
-    warp: "Warping"
-    views: Views
-    _sources: Sources | None = None
-
-    def hidden_by(self, patches: PatchSet) -> Sources | None:
-        """Return the views with the surface that occludes: the one before, or the facets."""
-        if not isinstance(self.warp, Prepares):
-            return None
-        self._sources = self._sources or self.warp.prepare(self.views)
-        return self._sources.hidden_by(patches.surface or patches.coarse.mesh)
-
-    def release(self) -> None:
-        """Return their memory."""
-        self._sources = None
-
-
 Factorizing = Callable[[PatchViews], PhotometricPatches]
-Warping = Callable[[Views, Cameras, PatchSet, Sources | None], PatchViews]
-Sweeping = Callable[[Views, Cameras, PatchViews, PhotometricPatches, Sources | None], SweptPatches]
+
+
+class Warping(Protocol):
+    """A stage that resamples all views on all templates."""
+
+    def __call__(
+        self, views: Views, cameras: Cameras, patches: PatchSet, sources: Sources | None = None, /
+    ) -> PatchViews:
+        """Return the samples J of every patch, and which of them are missing."""
+
+
+class Sweeping(Protocol):
+    """A stage that finds heights under the fitted light."""
+
+    def __call__(
+        self,
+        views: Views,
+        cameras: Cameras,
+        seen: PatchViews,
+        photometric: PhotometricPatches,
+        sources: Sources | None = None,
+        /,
+    ) -> SweptPatches:
+        """Return the heights of every patch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -99,7 +101,7 @@ def photometry_and_heights(
     views: Views,
     cameras: Cameras,
     patches: PatchSet,
-    sources: Prepared | None = None,
+    sources: Sources | None = None,
 ) -> SweptPatches:
     """Return normals, albedo, light and swept heights of all patches.
 
@@ -110,28 +112,26 @@ def photometry_and_heights(
         warp: Resamples views on some buckets.
         factorize: Separates albedo, normals and light.
         sweep: Finds heights under that light.
-        sources: The photographs as the warp prepares them; prepared for this call alone if not
-            given.
+        sources: The photographs as the warp prepares them, and the surface that occludes.
 
     Differentiable as the stages are.
     """
-    occluded = (sources or Prepared(warp, views)).hidden_by(patches)
     if not isinstance(factorize, InParts):
-        seen = warp(views, cameras, patches, occluded)
-        photometric: PhotometricPatches = factorize(seen)
-        return sweep(views, cameras, seen, photometric, occluded)
+        seen = called("warp", warp, views, cameras, patches, sources)
+        photometric = called("factorize", factorize, seen)
+        return called("sweep", sweep, views, cameras, seen, photometric, sources)
     with stage("photometry") as told:
         clock = _Clock()
-        light = factorize.light(warp(views, cameras, thinned(patches), occluded))
+        light = factorize.light(warp(views, cameras, thinned(patches), sources))
 
         def one(templates: Templates) -> _Bucket:
             part = patches.replace(buckets=(templates,))
             with clock("warp"):
-                seen = warp(views, cameras, part, occluded)
+                seen = warp(views, cameras, part, sources)
             with clock("factorize"):
                 solved = factorize.solve(seen, light)
             with clock("sweep"):
-                swept = sweep(views, cameras, seen, solved, occluded)
+                swept = sweep(views, cameras, seen, solved, sources)
             return _Bucket(
                 photometry=solved.buckets[0],
                 heights=swept.buckets[0],

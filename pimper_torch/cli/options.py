@@ -153,7 +153,7 @@ class Job:
 
 # What few people need: `--help-all` tells of it.
 _RARE = (
-    *("--kernels", "--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
+    *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
     *("--silhouettes", "--object-at"),
 )

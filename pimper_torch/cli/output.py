@@ -104,7 +104,6 @@ class Output:
             Who hears of them.
         """
         from rich.console import Console
-        from torch.nn import Module
 
         from pimper_torch.cli.bars import Bars
         from pimper_torch.cli.events import Events
@@ -118,7 +117,7 @@ class Output:
         elif self.shows("info"):
             figures = None if self.shows("debug") else 3
             shown = Bars(Console(stderr=True), forecast, figures)
-        with shown as observer, recorded(Module(), observer):
+        with shown as observer, recorded(observer):
             yield observer
 
 

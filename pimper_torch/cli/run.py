@@ -18,7 +18,7 @@ from pimper_torch.cli.view import tell_place
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.examine import examine_views
 from pimper_torch.doctor.forecast import Forecast
-from pimper_torch.errors import ConfigError, caution, overheard
+from pimper_torch.errors import ConfigError, caution, cautioned
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
@@ -55,7 +55,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = reported("import", time.perf_counter() - output.began)
     held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
-    with held, output.observer(forecast) as observer, overheard() as messages:
+    with held, output.observer(forecast) as observer:
         with stage("read") as told:
             views = _read(job)
             told["photographs"] = views.num_views
@@ -75,7 +75,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             result, scale = sized(job, bars, result)
             if scale is not None:
                 told["scale"] = scale.factor
-            _write(job, result, scale, messages)
+            _write(job, result, scale)
         result = result.replace(report=(imports, *accounted()))
     if scale is not None:
         output.remark(told_size(scale))
@@ -151,7 +151,7 @@ def _examine(job: Job, views: Views) -> None:
             caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequence[str]) -> None:
+def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
     about: dict[str, object] = {
         "photographs": str(job.photos.absolute()),
         "masks": _text(job.inputs.masks),
@@ -167,7 +167,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, messages: Sequ
         "device": job.common.device,
         "torch": str(torch.__version__),
         "scale": None if scale is None else scale.report(),
-        "warnings": list(dict.fromkeys(messages)),
+        "warnings": list(dict.fromkeys(cautioned())),
     }
     write_result(
         result,

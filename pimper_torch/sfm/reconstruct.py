@@ -1,7 +1,6 @@
 """Structure from motion: photographs to cameras and a sparse cloud."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +8,11 @@ import torch
 
 from pimper_torch.errors import (
     InputError,
-    OutputError,
     ReconstructionError,
     caution,
-    overheard,
     some,
 )
-from pimper_torch.ledger import kept_entries, leave_out, noted_entries, repeat_entries
+from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
@@ -37,7 +34,7 @@ from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
-from pimper_torch.store import Store, digest, opened, settled
+from pimper_torch.store import Store, digest, kept, opened
 from pimper_torch.store.code import code
 
 # Fraction of the photographs that the largest component must hold when the model splits.
@@ -115,9 +112,10 @@ class Reconstruct(Stage):
         """Take points that were kept, or triangulate them and keep them."""
         alone = replace(self.config, threads=0)
         hashed = digest(code(), views, *ways, alone) if self.store else None
-        found, _ = kept_model(
+        found, _ = kept(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
+            SparseModel,
             lambda: triangulate(views, ways.plain, self.config, where, ways.cropped, ways.changed),
         )
         return found
@@ -155,31 +153,7 @@ def find_model(
     """
     hashed = digest(code(), views, replace(config, threads=0)) if store else None
     key = f"reconstruct-{hashed}" if hashed else None
-    return kept_model(store, key, lambda: structure_from_motion(views, config))
-
-
-def kept_model(
-    store: Store | None, key: str | None, find: Callable[[], SparseModel]
-) -> tuple[SparseModel, float]:
-    """Take a model that was kept, or find one and keep it; its warnings are repeated."""
-    kept = store.find(key, SparseModel) if store and key else None
-    if kept is not None:
-        model, told = kept
-        repeat_entries(told["left_out"])
-        for message in told["cautions"]:
-            caution(message, stacklevel=3)
-        return model, float(told["seconds"])
-    began = time.perf_counter()
-    with overheard() as cautions, noted_entries() as entries:
-        model = settled(find())
-    seconds = time.perf_counter() - began
-    if store and key:
-        try:
-            about = {"seconds": seconds, "cautions": cautions, "left_out": kept_entries(entries)}
-            store.keep(key, model, about)
-        except OutputError as error:
-            caution(str(error), stacklevel=3)
-    return model, seconds
+    return kept(store, key, SparseModel, lambda: structure_from_motion(views, config))
 
 
 def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:

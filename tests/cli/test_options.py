@@ -28,7 +28,7 @@ from tests.video.clips import written
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
-        "--faces all --max-memory 20GB --scales (0.5,) --kernels torch --on-failure fail "
+        "--faces all --max-memory 20GB --scales (0.5,) --on-failure fail "
         "--hold-out 2 --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
@@ -47,7 +47,7 @@ RUNS = {
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
-        "--max-kept 1.5GB --kernels numba --max-memory 20GB --on-failure skip --view "
+        "--max-kept 1.5GB --max-memory 20GB --on-failure skip --view "
         "--hold-out 0",
     ],
     "render": [

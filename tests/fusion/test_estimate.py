@@ -2,11 +2,11 @@ import pytest
 import torch
 from derivatives import check_derivatives
 from torch.testing import assert_close
+from twins import using
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
-from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.singular import SingularSystemError
 

@@ -1,10 +1,10 @@
 import pytest
 import torch
 from torch.testing import assert_close
+from twins import using
 
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import _evaluated
-from pimper_torch.kernels.switch import using
 from pimper_torch.linalg.equations import compressed_equations, normal_equations
 
 

@@ -1,15 +1,12 @@
 import torch
 
-from pimper_torch.kernels.switch import compiled_for, using
+from pimper_torch.kernels.switch import compiled_for
 
 
-def test_kernels_stand_in_only_without_gradients_and_where_chosen():
+def test_kernels_stand_in_only_without_gradients_and_on_the_cpu():
     values, asked = torch.ones(2), torch.ones(2, requires_grad=True)
     assert compiled_for(values)
     assert not compiled_for(values, asked)
     with torch.no_grad():
         assert compiled_for(values, asked)
-    with using("torch"):
-        assert not compiled_for(values)
-    assert compiled_for(values)
     assert not compiled_for(torch.ones(2, device="meta"))

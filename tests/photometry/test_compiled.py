@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
+from twins import using
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.kernels.switch import using
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.lights import fit_light_field, thinned
 from pimper_torch.photometry.robust import Cauchy, Squares

@@ -36,7 +36,7 @@ def test_chains_hand_on_normals_in_our_axes_and_undistorted(chain, rendered):
     )
     stages = {"silhouettes": pt.Given(rendered.silhouettes)}
     stages["coarse_surface" if chain == "default" else "triangulate"] = Catching()
-    config = pt.load_config(chain).__class__(kernels="torch")
+    config = pt.load_config(chain).__class__()
     made = (pt.CoarseToFine if chain == "default" else pt.Published)(config, **stages)
     with pytest.warns(PimperWarning, match="in axes of DSINE"), pytest.raises(Caught) as caught:
         made(given)

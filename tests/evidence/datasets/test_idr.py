@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_idr, write_idr
-from pimper_torch.evidence.datasets.idr import read_idr, unit_sphere, write_idr
+from pimper_torch.evidence.datasets.idr import unit_sphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.frames import transform
 

@@ -1,0 +1,20 @@
+"""Functions in torch that compiled kernels stand in for."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Literal
+from unittest.mock import patch
+
+_MODULES = (
+    *("patches.warp", "photometry.light_fit", "photometry.variable_projection"),
+    *("sweep.sweep", "fusion.estimate"),
+)
+
+
+@contextmanager
+def using(kernels: Literal["numba", "torch"]) -> Iterator[None]:
+    """Choose inside the ``with`` block whether kernels stand in for torch."""
+    with ExitStack() as stack:
+        for module in _MODULES if kernels == "torch" else ():
+            stack.enter_context(patch(f"pimper_torch.{module}.compiled_for", lambda *_: False))
+        yield

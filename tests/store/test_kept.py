@@ -1,0 +1,65 @@
+"""What was told when a record was made is told again when it is found."""
+
+import pytest
+import torch
+
+from pimper_torch.errors import PimperWarning, caution
+from pimper_torch.failures import collecting, skipped
+from pimper_torch.ledger import leave_out
+from pimper_torch.records import Cameras, Failure, StageReport
+from pimper_torch.reporting import Silent, called, recorded
+from pimper_torch.store import Store, digest, kept
+
+
+def cameras():
+    return Cameras(
+        intrinsics=torch.eye(3).repeat(2, 1, 1),
+        cam_from_world=torch.eye(4).repeat(2, 1, 1),
+        sizes_px=torch.tensor([[80, 60]] * 2),
+    )
+
+
+def failure(what):
+    return Failure(stage="warp", what=what, name="3", reason="numbers", done="Left out")
+
+
+def found(store, what="patch"):
+    """Return the record, what was told, and whether it was made."""
+    made = []
+
+    def make():
+        made.append(1)
+        caution("doubtful")
+        skipped(failure(what))
+        leave_out("silhouettes.empty", torch.tensor([True, False]), names=("a", "b"))
+        return cameras()
+
+    with (
+        pytest.warns(PimperWarning, match="doubtful"),
+        collecting() as events,
+        recorded(Silent()),
+    ):
+        record, _ = kept(store, "key", Cameras, lambda: called("stage", make))
+    told = [event for event in events if not isinstance(event, StageReport)]
+    reports = [event.replace(kept=False) for event in events if event not in told]
+    names = [event.name for event in events if event not in told and event.kept]
+    return record, told, [(one.name, one.figures) for one in reports], bool(made), names
+
+
+def test_cautions_failures_guards_and_reports_are_told_again(tmp_path):
+    first, second = (found(Store(folder=tmp_path)) for _ in range(2))
+    assert digest(first[0]) == digest(second[0])
+    assert first[1] == second[1]
+    assert len(first[1]) == 3
+    assert ("stage", {}) in first[2]
+    assert ("stage", {}) in second[2]
+    assert (first[3], second[3]) == (True, False)
+    assert (first[4], second[4]) == ([], ["stage"])
+
+
+def test_what_was_found_in_smaller_batches_and_what_has_no_key_is_made_again(tmp_path):
+    store = Store(folder=tmp_path)
+    assert all(found(store, "memory")[3] for _ in range(2))
+    for _ in range(2):
+        kept(store, None, Cameras, cameras)
+    assert list(tmp_path.iterdir()) == []
