@@ -206,10 +206,8 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
 def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:
     folder.mkdir()
     names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
-    for name, (inside,), (width, height) in zip(
-        names, each(silhouettes.inside), sizes, strict=True
-    ):
-        drawn = (inside[:height, :width] > 0.5).to(torch.uint8) * 255
+    for name, (shown,), (width, height) in zip(names, each(silhouettes.shown), sizes, strict=True):
+        drawn = shown[:height, :width].to(torch.uint8) * 255
         path = mask_path(folder, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(drawn.numpy()).save(path)

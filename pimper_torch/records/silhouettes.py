@@ -22,19 +22,21 @@ class Silhouettes(Record):
     """The object's silhouette in every view.
 
     Attributes:
-        inside: Probability that the pixel shows the object; 0 in the padding.
+        inside: Probability that the pixel's ray meets the object; 0 in the padding.
         reliable: True for views whose silhouette agrees with the hull of the others.
         source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
             view constrains the object.
         planes_world: The object is where each has a positive product with ``(x, y, z, 1)``: above
             the plane that it stands on, one for each series between which it was moved. None
             where silhouettes tell, or no plane is known.
+        hidden: Pixels inside that show something before the object; ``None`` where none do.
     """
 
     inside: Float[Tensor, "view height width"]
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
     planes_world: Float[Tensor, "plane 4"] = field(default_factory=no_planes)
+    hidden: Bool[Tensor, "view height width"] | None = None
 
     @classmethod
     def everything(
@@ -52,6 +54,13 @@ class Silhouettes(Record):
             source="everything",
             planes_world=(no_planes() if planes_world is None else planes_world).to(views.images),
         )
+
+    @property
+    def shown(self) -> Bool[Tensor, "view height width"]:
+        """True where the pixel shows the object itself, not what hides it."""
+        if self.hidden is None:
+            return self.masks
+        return by_view(lambda mask, hidden: mask & ~hidden, self.masks, self.hidden)
 
     @property
     def masks(self) -> Bool[Tensor, "view height width"]:

@@ -33,9 +33,11 @@ def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) ->
         planes = torch.cat([one.planes_world for one in found])
         return Silhouettes.everything(scene.views, planes)
     order = torch.cat(views).argsort()
+    hidden = [one.inside < 0 if one.hidden is None else one.hidden for one in found]
     return found[0].replace(
         inside=torch.cat([one.inside for one in found])[order],
         reliable=torch.cat([one.reliable for one in found])[order],
+        hidden=torch.cat(hidden)[order] if any(map(torch.any, hidden)) else None,
     )
 
 

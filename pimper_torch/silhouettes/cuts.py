@@ -19,12 +19,13 @@ from pimper_torch.silhouettes.opencv import (
     signed_distance,
     without_specks,
 )
-from pimper_torch.silhouettes.parallax import DISPUTED
 from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.seeds import (
+    DISPUTED,
     exposed_fraction,
     filled,
     held_fraction,
+    in_front,
     is_deep,
     labels_from_hull,
     labels_from_points,
@@ -56,6 +57,7 @@ class Cuts(Record):
         exposed: Fraction of each cut that shows a background for certain.
         held: Fraction of the object's points that each cut holds.
         doubted: Views whose soft mask was not used.
+        hidden: Pixels of the cuts that show something before the object; ``None`` where none do.
     """
 
     masks: Bool[Tensor, "view height width"]
@@ -64,6 +66,7 @@ class Cuts(Record):
     held: Float[Tensor, " view"]
     on_plane: bool
     doubted: Bool[Tensor, " view"]
+    hidden: Bool[Tensor, "view height width"] | None = None
 
 
 def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
@@ -82,16 +85,23 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     for _ in range(details.iterations):
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
+        abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
         likely = by_view(torch.bitwise_or, masks, _likely(cues))
-        seen = _voted(cues, likely, details, unknown, voting)
+        seen = _voted(cues, likely, details, abstain, voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
         masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
-    seen = _voted(cues, masks, details)
-    return None if seen is None else cuts_of(cues.seen_in(seen), masks, seen, doubted)
+    hidden = _in_front(cues, masks)
+    seen = _voted(cues, masks, details, hidden)
+    if seen is None:
+        return None
+    hidden = by_view(lambda at, margin: at & (margin > 0), hidden, seen)
+    masks = by_view(torch.bitwise_or, masks, hidden)
+    found = cuts_of(cues.seen_in(seen), masks, seen, doubted)
+    return found.replace(hidden=hidden) if bool(hidden.any()) else found
 
 
 def cuts_of(
@@ -124,6 +134,16 @@ def _filled(
     if agreement is None:
         return masks
     return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
+
+
+def _in_front(
+    cues: Cues, masks: Bool[Tensor, "view height width"]
+) -> Bool[Tensor, "view height width"]:
+    """Find what may hide the object in each view, so that its cut says nothing there."""
+    agreement = cues.agreement
+    if agreement is None:
+        return torch.zeros_like(masks)
+    return of_views(lambda view: in_front(masks[view], agreement[view]), len(masks))
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:

@@ -157,11 +157,15 @@ class FindSilhouettes(Stage):
 def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     """Return the scene with silhouettes that were found for masks, a little wider where unsure.
 
+    What hides the object is left out.
+
     Args:
         silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
             that were not believed.
     """
     used = by_view(lambda inside: inside > _USED, silhouettes.inside)
+    if silhouettes.hidden is not None:
+        used = by_view(lambda one, hidden: one & ~hidden, used, silhouettes.hidden)
     given = scene.views.masks
     if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene

@@ -20,13 +20,13 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
 from pimper_torch.silhouettes.opencv import warped, window_means
 from pimper_torch.silhouettes.pictures import Pictures, of_views
+from pimper_torch.silhouettes.seeds import DISPUTED
 
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
 _SHADING = 1 / 25  # what is smoother than this is light, not texture
 # Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
 _FLAT = 0.008
-DISPUTED = 0.5
 _REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each side
 _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 # The same for brightness, where there is no texture.

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.mapped import zeros
+from pimper_torch.mapped import by_view, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.silhouettes.agreement import agreement_of, repaired
@@ -23,7 +23,13 @@ def silhouettes_of(cuts: Cuts, views: Views, details: SilhouetteDetails) -> Silh
     cuts = repaired(cuts)
     found = _at_full_size(cuts, views)
     reliable = agreement_of(cuts).reliable(details).to(found.device)
-    return Silhouettes(inside=found, reliable=reliable, source="found")
+    hidden = None
+    if cuts.hidden is not None:
+        size = views.images.shape[-2:]
+        hidden = by_view(
+            lambda one: interpolate(one[None, None].float(), size)[0, 0] > 0, cuts.hidden
+        )
+    return Silhouettes(inside=found, reliable=reliable, source="found", hidden=hidden)
 
 
 def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"]:

@@ -41,6 +41,7 @@ MIN_POINTS = 12
 _OFF_PLANE = 0.4
 _NOT_PLANE = 0.6
 _ON_PLANE = 0.75
+DISPUTED = 0.5  # where views do not agree on what the background looks like
 _THROUGH = 0.2  # of a hole: its border agrees with nothing
 
 
@@ -115,6 +116,19 @@ def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height 
     """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
     found = _grainless(agreement < _NOT_PLANE)
     return filled(closed(found, round(_GAPS * max(agreement.shape))), agreement)
+
+
+def in_front(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find what stands before the plane and is not the object, as a person who may hide some of it.
+
+    Windows that hold some of the object do not agree with the plane either: what is as narrow as
+    these is left out.
+    """
+    longer = max(cut.shape)
+    other = closed(agreement < _OFF_PLANE, round(_GRAIN * longer)) & ~cut
+    return opened(other, round(_DEEP * longer))
 
 
 def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

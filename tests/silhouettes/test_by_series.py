@@ -27,13 +27,15 @@ def test_silhouettes_of_each_series_come_back_in_the_order_of_the_views(staged, 
     def find(part):
         assert len(part.series) == 0
         asked.append(numbers(part))
-        return numbered(part, numbers(part))
+        found = numbered(part, numbers(part))
+        return found.replace(hidden=found.inside > 0) if 0 in numbers(part) else found
 
     found = by_series(scene.replace(series=series), find)
     assert asked == [list(range(0, count, 2)), list(range(1, count, 2))]
     assert found.inside[:, 0, 0].tolist() == list(range(count))
     assert found.reliable.tolist() == [view > 2 for view in range(count)]
     assert found.source == "found"
+    assert found.hidden[:, 0, 0].tolist() == [view > 0 and view % 2 == 0 for view in range(count)]
 
 
 def test_without_series_all_views_are_looked_at_together(staged, numbers):

@@ -6,7 +6,8 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.supporting_plane import Plane, fixation
 from pimper_torch.records import Silhouettes, Views
-from pimper_torch.silhouettes import find
+from pimper_torch.silhouettes import cuts, find
+from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import Cuts, cuts_of
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.opencv import signed_distance
@@ -57,6 +58,45 @@ def test_what_stands_before_the_dark_beyond_a_table_is_found(staged):
     scene = staged.scene.replace(views=staged.scene.views.replace(images=images))
     silhouettes = FindSilhouettes(*SMALL)(without_points_of_the_ball(scene))
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
+
+
+def test_what_hides_the_object_is_of_its_silhouette_and_is_not_used(staged):
+    hidden = torch.zeros_like(staged.truth)
+    hidden[3, 80:100, 110:130] = True
+    silhouettes = Silhouettes(
+        inside=staged.truth.float(),
+        reliable=torch.ones(12, dtype=torch.bool),
+        source="found",
+        hidden=hidden & staged.truth,
+    )
+    used = masked(staged.scene, silhouettes).views.masks
+    assert torch.equal(silhouettes.masks, staged.truth)
+    assert torch.equal(silhouettes.shown, staged.truth & ~hidden)
+    assert torch.equal(used, silhouettes.shown)
+    assert (staged.truth & ~used).sum() > 100
+
+
+@pytest.mark.parametrize("seen_in", [1, 12])
+def test_a_view_abstains_where_something_stands_before_the_object(staged, monkeypatch, seen_in):
+    """What a view's cut lacks carves the hull, unless something else stands there."""
+    cues = cues_of(staged.scene, *SMALL)
+    agreement = torch.where(staged.truth, -0.2, 0.95)
+    person = torch.zeros_like(staged.truth)
+    for view in range(0, 12, 4)[:seen_in]:
+        column = int(staged.truth[view].any(dim=0).nonzero().double().mean())
+        person[view, :, column : column + 60] = True
+    cut = staged.truth & ~person
+    monkeypatch.setattr(cuts, "_first", lambda cues: cut)
+    monkeypatch.setattr(cuts, "_again", lambda cues, masks, seen, unknown: cut)
+    monkeypatch.setattr(Cues, "relearned", lambda cues, masks: cues)
+    known = cues.replace(agreement=agreement.where(~person, -0.2))
+    carved = cues.replace(agreement=agreement.where(~person, torch.nan))
+    found, plain = (cuts.cut_in_iterations(one, SMALL[1]) for one in (known, carved))
+    assert overlap(found.masks, staged.truth).min() > 0.93
+    assert torch.equal(found.masks & ~found.hidden, cut)
+    assert (found.hidden & ~person).sum() == 0
+    assert plain.hidden is None
+    assert overlap(plain.margins_px > 0, staged.truth).min() < 0.8
 
 
 def with_masks(scene, masks):

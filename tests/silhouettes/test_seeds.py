@@ -14,6 +14,7 @@ from pimper_torch.silhouettes.seeds import (
     exposed_fraction,
     filled,
     held_fraction,
+    in_front,
     labels_from_hull,
     labels_from_points,
     not_seen_through,
@@ -93,6 +94,18 @@ def test_what_does_not_show_the_plane_is_off_it_and_grains_are_not(thing):
     assert found[130, 150]
     assert not found[20:22, 20:22].any()
     assert not off_plane(torch.full((HEIGHT, WIDTH), torch.nan)).any()
+
+
+def test_what_is_wide_and_off_the_plane_but_not_the_object_stands_before_it(thing):
+    person, halo = square(200, 40, 240, 240), square(95, 75, 205, 185)
+    agreement = agreeing(thing | person | halo)
+    agreement[100:140, 210:214] = 0.9  # a grain
+    found = in_front(thing, agreement)
+    assert found[60:230, 205:235].all()
+    assert not (found & thing).any()
+    assert not found[:, :195].any()
+    assert not in_front(thing, agreeing(thing | halo)).any()
+    assert not in_front(thing, torch.full((HEIGHT, WIDTH), torch.nan)).any()
 
 
 def test_only_what_no_light_makes_of_the_plane_is_off_its_level(thing):
