@@ -1,4 +1,3 @@
-import pytest
 import torch
 from surfaces import surface_of
 from torch.nn.functional import normalize
@@ -9,11 +8,6 @@ from pimper_torch.coarse.splitting import split_edges
 from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Mesh
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(29)
 
 
 def square():

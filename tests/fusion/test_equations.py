@@ -41,11 +41,6 @@ def equations_of(contacts, known, surface):
 
 
 @pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(71)
-
-
-@pytest.fixture
 def subdivision():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])

@@ -9,12 +9,11 @@ from pimper_torch.records import Convergence, Surface
 def surface_of(vertices, faces, **known):
     """Return a converged surface: white, one facet, normals of its faces, unless more is known."""
     one = torch.ones_like(vertices[:, 0])
+    if "normals_world" not in known:
+        known["normals_world"] = vertex_normals(vertices, faces)
     fields = {
         "facet": torch.zeros(len(vertices), dtype=torch.long),
         "barycentric": torch.full_like(vertices, 1 / 3),
-        "normals_world": known["normals_world"]
-        if "normals_world" in known
-        else vertex_normals(vertices, faces),
         "albedo": torch.ones_like(vertices),
         "information": one,
         "height_information": torch.zeros_like(one),

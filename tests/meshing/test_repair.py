@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 import torch
 import trimesh
 from closedness import closedness
@@ -22,11 +21,6 @@ from pimper_torch.meshing.repair import Repair, RepairConfig, repair, surroundin
 from pimper_torch.records import Mesh
 
 OLD = ExtractConfig(overturned="all")
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5)
 
 
 def supported(vertices, faces, facet=None):

@@ -8,11 +8,6 @@ VIEWS = 8
 
 
 @pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(61)
-
-
-@pytest.fixture
 def shading(generator):
     return 0.3 + torch.rand(5, VIEWS, generator=generator, dtype=torch.float64)
 

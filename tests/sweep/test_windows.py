@@ -5,11 +5,6 @@ from torch.testing import assert_close
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(62)
-
-
 @pytest.mark.parametrize("radius", [1.5, 2.5])
 def test_noise_falls_by_the_size_of_the_window(generator, radius):
     noise = torch.randn(40, 1, 64, 64, generator=generator, dtype=torch.float64)
