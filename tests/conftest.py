@@ -30,6 +30,12 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 
 
 @pytest.fixture
+def generator() -> torch.Generator:
+    """Random numbers, the same in every test."""
+    return torch.Generator().manual_seed(59)
+
+
+@pytest.fixture
 def shapes_checked(pytestconfig: pytest.Config) -> None:
     """Skip where annotations are not checked when functions are called."""
     if not pytestconfig.getoption("jaxtyping_packages"):

@@ -24,11 +24,6 @@ def tiny():
     return small_scene(num_views=5, width=40, num_points=10)
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(17)
-
-
 def chain_of(preset, **changes):
     return pt.load_chain(preset, changes)
 

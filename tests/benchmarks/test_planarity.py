@@ -15,11 +15,6 @@ SIZE = (1.0, 1.5, 3.0)
 QUADS = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(3)
-
-
 def box(generator, noise=0.0, lean_deg=0.0, spacing=0.03):
     """A closed box of SIZE, one pair of sides leaning, with noise on its vertices."""
     corners = torch.tensor([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).double()

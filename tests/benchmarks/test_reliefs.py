@@ -1,14 +1,8 @@
-import pytest
 import torch
 from reliefs import ball, bumps, bumps_in_perspective, regions
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.render_in_memory import photograph, point_lights
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5)
 
 
 def test_normals_face_the_viewer_and_bulge_where_the_ball_does():

@@ -1,5 +1,5 @@
-import pytest
 import torch
+from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -7,12 +7,7 @@ from pimper_torch.coarse.inherit import fitted_normals
 from pimper_torch.coarse.splitting import split_edges
 from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.records import Convergence, Mesh, Surface
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(29)
+from pimper_torch.records import Mesh
 
 
 def square():
@@ -31,18 +26,13 @@ def on_facets(vertices, faces, count, generator, normal):
     barycentric = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     barycentric = barycentric / barycentric.sum(dim=1, keepdim=True)
     points = (barycentric[:, None] @ vertices[faces[facet]])[:, 0]
-    return Surface(
-        vertices_world=points,
-        faces=torch.zeros(0, 3, dtype=torch.long),
+    return surface_of(
+        points,
+        torch.zeros(0, 3, dtype=torch.long),
         facet=facet,
         barycentric=barycentric,
         normals_world=normal(points),
-        albedo=torch.ones_like(points),
         information=100 * torch.rand(count, generator=generator, dtype=torch.float64),
-        height_information=torch.zeros(count, dtype=torch.float64),
-        convergence=Convergence(
-            iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
-        ),
     )
 
 

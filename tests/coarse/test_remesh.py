@@ -1,5 +1,6 @@
 import pytest
 import torch
+from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -10,7 +11,7 @@ from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.paper.cloud_filters import delaunay
-from pimper_torch.records import CoarseMesh, Convergence, FacetPoints, Mesh, Surface
+from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
 from pimper_torch.silhouettes.hull import Hull
 
 SPACING = 0.02
@@ -45,20 +46,14 @@ def surface_on(coarse, place, spacing=SPACING, normals=None, information=None):
     count = len(mesh.faces)
     subdivision = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
     points = place(subdivision.points)
-    found = vertex_normals(points, subdivision.faces) if normals is None else normals(points)
     certain = 1e6 * torch.ones_like(points[:, 0])
-    return Surface(
-        vertices_world=points,
-        faces=subdivision.faces,
+    return surface_of(
+        points,
+        subdivision.faces,
         facet=subdivision.facet,
         barycentric=subdivision.barycentric,
-        normals_world=found,
-        albedo=torch.ones_like(points),
         information=certain if information is None else information(subdivision),
-        height_information=torch.zeros_like(certain),
-        convergence=Convergence(
-            iterations=torch.ones(1).long(), residual=torch.zeros(1), cause=torch.zeros(1).long()
-        ),
+        **({} if normals is None else {"normals_world": normals(points)}),
     )
 
 

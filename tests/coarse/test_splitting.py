@@ -31,11 +31,6 @@ def halved(vertices, faces, marked):
     return split, torch.cat([vertices, vertices[edges[split.halved]].mean(dim=1)])
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(23)
-
-
 @pytest.mark.parametrize("fraction", [0.1, 1.0])
 def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(generator, fraction):
     vertices, faces = icosphere(2)

@@ -21,15 +21,23 @@ from pimper_torch.records import ContourPoints, FacetPoints
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
+def base(subdivision, heights, directions=UP, points=None, reach=1.0, finest=1e-9):
+    """Return the subdivided mesh as a surface of heights along directions."""
+    return BaseSurface(
+        points=subdivision.points if points is None else points,
+        faces=subdivision.faces,
+        facet=subdivision.facet,
+        heights=heights,
+        directions=directions.expand(len(heights), 3),
+        reach=reach,
+        finest=finest,
+    )
+
+
 def equations_of(contacts, known, surface):
     """Return the equations of points of a surface."""
     caster = RayCaster(surface.points, surface.faces)
     return passing(contacts(known, surface), surface, caster)
-
-
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(71)
 
 
 @pytest.fixture
@@ -144,7 +152,6 @@ def test_heights_that_err_alike_know_no_more_together_than_their_common_error_le
 
 def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivision, generator):
     along = normalize(UP + 0.1 * (subdivision.points - 0.5), dim=1)  # directions fan out
-    transferred = torch.zeros(len(along), dtype=torch.float64)
     xy = 0.1 + 0.8 * torch.rand(40, 2, generator=generator, dtype=torch.float64)
     lift = 0.05 * (torch.rand(40, 1, generator=generator, dtype=torch.float64) - 0.5)
     points = torch.cat([xy, lift], dim=1)
@@ -152,15 +159,7 @@ def test_points_of_the_cloud_are_on_the_surface_that_passes_through_them(subdivi
     cloud = FacetPoints(
         points_world=points, covariance_world=covariance, facet=torch.zeros(40, dtype=torch.long)
     )
-    surface = BaseSurface(
-        points=subdivision.points,
-        faces=subdivision.faces,
-        facet=subdivision.facet,
-        heights=transferred,
-        directions=along,
-        reach=1.0,
-        finest=1e-9,
-    )
+    surface = base(subdivision, torch.zeros_like(along[:, 0]), along)
     found = equations_of(cloud_points, cloud, surface)
     assert len(found.targets) == 40
     assert found.unknowns.shape == (40, 1)
@@ -190,16 +189,8 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
     slope = 0.3
     tilted = subdivision.points + (slope * subdivision.points[:, :1]) * UP
     normal = normalize(torch.tensor([-slope, 0.0, 1.0]).double(), dim=0)
-    along = normalize(torch.tensor([0.2, 0.1, 1.0]).double(), dim=0).expand_as(tilted)
-    surface = BaseSurface(
-        points=tilted,
-        faces=subdivision.faces,
-        facet=subdivision.facet,
-        heights=torch.zeros(len(tilted), dtype=torch.float64),
-        directions=along,
-        reach=1.0,
-        finest=1e-9,
-    )
+    along = normalize(torch.tensor([0.2, 0.1, 1.0]).double(), dim=0)
+    surface = base(subdivision, torch.zeros_like(tilted[:, 0]), along, tilted)
     centre = torch.tensor([0.5, 0.5, 0.15]).double()
     ray = torch.linalg.cross(normal, normalize(torch.randn(3, generator=generator).double(), dim=0))
     # Where on its ray the place is taken does not matter: 0.04 above the plane, all along.
@@ -213,7 +204,7 @@ def test_contours_are_planes_that_touch_the_surface(subdivision, generator):
         ray=torch.arange(30),
     )
     found = equations_of(contour_tangents, contours, surface)
-    facing = float(along[0] @ normal)
+    facing = float(along @ normal)
     assert_close(found.targets, torch.full((30,), 0.04 / facing).double())
     assert_close(1 / found.information, torch.full((30,), 1e-4 / facing**2).double())
     # What a direction runs along cannot be reached by heights: nothing is said.
@@ -270,7 +261,6 @@ def test_terms_agree_with_finite_differences(subdivision, generator, kind):
 
 def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivision, generator):
     height = 0.1 * torch.rand(len(subdivision.points), generator=generator, dtype=torch.float64)
-    along = UP.expand(len(height), 3)
     points_world = subdivision.points[5:-5:7] * 0.9 + torch.tensor([0.03, 0.04, 0.2]).double()
     cloud = FacetPoints(
         points_world=points_world,
@@ -281,17 +271,9 @@ def test_a_point_of_the_cloud_stays_where_it_is_as_the_surface_is_raised(subdivi
     def target(x):
         raised = x["heights"] + x["all"]
         points = cloud.replace(points_world=x["points"])
-        surface = BaseSurface(
-            points=subdivision.points + raised[:, None] * along,
-            faces=subdivision.faces,
-            facet=subdivision.facet,
-            heights=raised,
-            directions=along,
-            reach=9.0,
-            finest=1e-3,
-        )
-        found = equations_of(cloud_points, points, surface)
-        return {"target": found.targets}
+        lifted = subdivision.points + raised[:, None] * UP
+        surface = base(subdivision, raised, UP, lifted, reach=9.0, finest=1e-3)
+        return {"target": equations_of(cloud_points, points, surface).targets}
 
     inputs = {"heights": height, "points": points_world, "all": torch.zeros(()).double()}
     checks = check_derivatives(target, inputs, generator)
@@ -319,15 +301,8 @@ def test_a_contour_stays_where_it_is_as_the_surface_is_raised(subdivision, gener
     def term(x):
         along = normalize(x["directions"], dim=1)
         raised = x["heights"] + x["all"]
-        surface = BaseSurface(
-            points=subdivision.points + raised[:, None] * UP,
-            faces=subdivision.faces,
-            facet=subdivision.facet,
-            heights=raised,
-            directions=along,
-            reach=9.0,
-            finest=1e-3,
-        )
+        lifted = subdivision.points + raised[:, None] * UP
+        surface = base(subdivision, raised, along, lifted, reach=9.0, finest=1e-3)
         found = equations_of(contour_tangents, contours, surface)
         return {"target": found.targets, "information": found.information}
 

@@ -13,11 +13,6 @@ from pimper_torch.linalg.singular import SingularSystemError
 COUNT = 900
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(72)
-
-
 def smooth() -> torch.Tensor:
     x = torch.linspace(0, 12, COUNT, dtype=torch.float64)
     return x.sin() + 0.3 * (3 * x).cos()

@@ -14,11 +14,6 @@ from pimper_torch.geometry.topology import face_edges
 DRAWS, CLOSE = 300, 0.13
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(92)
-
-
 @pytest.fixture(scope="module")
 def square():
     """A square of 32 facets, subdivided; four regions that err alike."""

@@ -14,11 +14,6 @@ from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(6229)
-
-
 def random(generator, *shape):
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 

@@ -1,14 +1,8 @@
-import pytest
 import torch
 from scipy.spatial.transform import RigidTransform, Rotation
 from torch.testing import assert_close
 
 from pimper_torch.geometry.frames import invert_rigid, rigid, rotate, transform
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(111)
 
 
 def random_rigid(generator, *batch):

@@ -1,14 +1,8 @@
-import pytest
 import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(3107)
 
 
 def raster(spacing, half_width=1.0):

@@ -9,11 +9,6 @@ from pimper_torch.records import Mesh
 
 
 @pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(83)
-
-
-@pytest.fixture
 def square():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
     return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))

@@ -1,14 +1,8 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.supporting_plane import PlaneSearch, fixation, supporting_plane
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(91)
 
 
 def cameras(elevation_deg=40.0):

@@ -17,11 +17,6 @@ from pimper_torch.geometry.surfaces import (
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(131)
-
-
 def as_tensors(mesh):
     return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces)
 

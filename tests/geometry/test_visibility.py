@@ -1,4 +1,3 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
@@ -7,11 +6,6 @@ from pimper_torch.evidence.scenes.render_in_memory import Sphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.visibility import RayCaster, cast_view
 from pimper_torch.records import Mesh
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(141)
 
 
 def brute_force(origin, directions, vertices, faces):

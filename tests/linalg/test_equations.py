@@ -1,13 +1,7 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
 from pimper_torch.linalg.equations import normal_equations
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(6343)
 
 
 def random(generator, *shape):

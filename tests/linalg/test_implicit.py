@@ -1,13 +1,7 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-
-
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(73)
 
 
 def coupled(x, theta):

@@ -15,11 +15,6 @@ from pimper_torch.linalg.systems import prepare
 CPU = torch.device("cpu")
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(6451)
-
-
 def random(generator, *shape):
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 

@@ -9,11 +9,6 @@ from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(4127)
-
-
 def edges_of_a_path_with_shortcuts(size):
     first = torch.arange(size - 1)
     start = torch.cat([first, torch.arange(0, size - 5, 3)])

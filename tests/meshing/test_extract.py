@@ -1,12 +1,12 @@
 import pytest
 import torch
 import trimesh
+from surfaces import surface_of
 from torch.testing import assert_close
 
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.groups import diagonal
-from pimper_torch.records import Convergence, Surface
 from tests.meshing.sheets import sheet_of
 
 SIDE = 21
@@ -17,20 +17,13 @@ def sheet(side=SIDE, information=None):
     vertices, faces = sheet_of(side, 0.01)
     x = vertices[:, 0]
     normals = torch.stack([0.02 * x, 0 * x, -torch.ones_like(x)], dim=1)
-    return Surface(
-        vertices_world=vertices,
-        faces=faces,
+    return surface_of(
+        vertices,
+        faces,
         facet=torch.arange(len(x)),
-        barycentric=torch.full_like(vertices, 1 / 3),
         normals_world=torch.nn.functional.normalize(normals, dim=-1),
         albedo=vertices / side,
         information=torch.ones_like(x) if information is None else information,
-        height_information=torch.zeros_like(x),
-        convergence=Convergence(
-            iterations=torch.ones(1, dtype=torch.long),
-            residual=torch.zeros(1, dtype=torch.float64),
-            cause=torch.zeros(1, dtype=torch.long),
-        ),
     )
 
 

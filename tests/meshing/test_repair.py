@@ -1,8 +1,8 @@
 import numpy as np
-import pytest
 import torch
 import trimesh
 from closedness import closedness
+from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -18,35 +18,17 @@ from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.faults import faults
 from pimper_torch.meshing.plates import least_bent
 from pimper_torch.meshing.repair import Repair, RepairConfig, repair, surroundings
-from pimper_torch.records import Convergence, Mesh, Surface
+from pimper_torch.records import Mesh
 
 OLD = ExtractConfig(overturned="all")
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5)
-
-
-def surface_of(vertices, faces, facet=None):
+def supported(vertices, faces, facet=None):
     """A surface with support everywhere; facets are octants unless they are given."""
     if facet is None:
         facet = ((vertices > 0).long() * torch.tensor([1, 2, 4])).sum(dim=1)
-    return Surface(
-        vertices_world=vertices,
-        faces=faces,
-        facet=facet,
-        barycentric=torch.full_like(vertices, 1 / 3),
-        normals_world=vertex_normals(vertices, faces),
-        albedo=vertices.abs(),
-        information=torch.full_like(vertices[:, 0], 1e30),
-        height_information=torch.zeros_like(vertices[:, 0]),
-        convergence=Convergence(
-            iterations=torch.ones(1, dtype=torch.long),
-            residual=torch.zeros(1, dtype=torch.float64),
-            cause=torch.zeros(1, dtype=torch.long),
-        ),
-    )
+    certain = torch.full_like(vertices[:, 0], 1e30)
+    return surface_of(vertices, faces, facet=facet, albedo=vertices.abs(), information=certain)
 
 
 def folded_sphere(subdivisions=4):
@@ -59,7 +41,7 @@ def folded_sphere(subdivisions=4):
         near = (vertices @ centre).topk(3).indices
         along = torch.linalg.cross(centre, centre.new_tensor([0.0, 0.6, 0.8]))
         dragged[near] = 0.95 * vertices[near] + step * normalize(along, dim=0)
-    return vertices, surface_of(dragged, faces, surface_of(vertices, faces).facet)
+    return vertices, supported(dragged, faces, supported(vertices, faces).facet)
 
 
 def overturned(mesh, facet):
@@ -182,10 +164,10 @@ def test_a_spike_is_drawn_in():
     vertices, faces = icosphere(4)
     spiked = vertices.clone()
     spiked[100] *= 3
-    mesh = Extract()(Repair()(surface_of(spiked, faces)))
+    mesh = Extract()(Repair()(supported(spiked, faces)))
     assert closedness(mesh).closed
     assert_close(mesh.vertices_world[100].norm(), torch.ones(()).double(), rtol=0, atol=0.01)
-    assert not closedness(Extract(OLD)(surface_of(spiked, faces))).closed
+    assert not closedness(Extract(OLD)(supported(spiked, faces))).closed
 
 
 def test_a_facet_that_bends_far_has_no_fold():
@@ -193,7 +175,7 @@ def test_a_facet_that_bends_far_has_no_fold():
     vertices, faces = icosphere(3)
     bulge = vertices.clone()
     bulge[:, 2] = torch.where(bulge[:, 2] > 0, 4 * bulge[:, 2], bulge[:, 2])
-    surface = surface_of(bulge, faces, torch.zeros(len(bulge), dtype=torch.long))
+    surface = supported(bulge, faces, torch.zeros(len(bulge), dtype=torch.long))
     surface = surface.replace(faces=faces[(bulge[faces][..., 2] > -0.8).all(dim=1)])
     assert overturned(surface, surface.facet).any()
     mesh = Extract()(Repair()(surface))

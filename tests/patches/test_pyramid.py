@@ -6,11 +6,6 @@ from torch.testing import assert_close
 from pimper_torch.patches.pyramid import halve, look_up
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(65)
-
-
 @pytest.mark.parametrize("size", [(12, 20), (13, 7)])
 def test_halving_is_the_gaussian_pyramids(generator, size):
     images = torch.rand(2, 3, *size, generator=generator, dtype=torch.float64)

@@ -42,11 +42,6 @@ def weights(mesh: Mesh, cameras: Cameras, hiding: Mesh | None = None) -> torch.T
     )
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
 @pytest.fixture(scope="module")
 def ball() -> tuple[Mesh, Cameras]:
     """A ball, and 90 cameras at three heights round about."""

@@ -17,6 +17,19 @@ def drawn(generator):
     return ImageSamples(radiance=radiance, seen=seen), random(40, 7) - 0.3, random(40, 7)
 
 
+def test_albedo_is_that_of_weighted_least_squares(drawn):
+    samples, shading, weight = drawn
+    weight = weight * samples.seen
+    found = samples.albedo_under(shading, weight)
+    root = weight.sqrt()
+    expected = torch.linalg.lstsq(
+        (root * shading)[..., None], (root * samples.radiance)[..., None]
+    ).solution[:, 0, 0]
+    some = torch.arange(40) != 3
+    assert_close(found[some], expected[some])
+    assert found[3].isnan()
+
+
 def test_weights_are_those_that_the_loss_descends_with(drawn):
     samples, shading, _ = drawn
     albedo = torch.full((40,), 0.4, dtype=torch.float64)
@@ -37,3 +50,17 @@ def test_residuals_without_noise_have_a_scale_above_zero(drawn):
     scale = samples.scale(torch.zeros_like(samples.radiance))
     mean = samples.radiance.sum(dim=0) / samples.seen.sum(dim=0)
     assert_close(scale, CAUCHY_TUNING * 1e-4 * mean)
+
+
+def test_brightness_of_a_product_gives_its_factors(generator):
+    gain = torch.tensor([0.2, 1.0, 2.0, 0.0]).double()
+    albedo = 0.1 + torch.rand(31, generator=generator, dtype=torch.float64)
+    seen = torch.ones(31, 4, dtype=torch.bool)
+    seen[5] = False
+    radiance = torch.where(seen, albedo[:, None] * gain, 0)
+    found, relative = ImageSamples(radiance=radiance, seen=seen).brightness()
+    kept = torch.arange(31) != 5
+    middle = albedo[kept].kthvalue(15).values  # the lower median, as torch takes it, of 30
+    assert_close(found, gain * middle)
+    assert_close(relative[kept], albedo[kept] / middle)
+    assert relative[5] == 0

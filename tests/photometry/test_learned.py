@@ -17,11 +17,6 @@ from pimper_torch.photometry.priors import PatchSamples
 
 
 @pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5)
-
-
-@pytest.fixture
 def prior():
     torch.manual_seed(2)
     return LearnedPrior().double()

@@ -48,8 +48,7 @@ def settle(scene, prior, silhouettes=None):
     return found
 
 
-@pytest.mark.parametrize("outlines", [False, True])
-@pytest.mark.parametrize("degrees", [0.0, 20.0])
+@pytest.mark.parametrize(("degrees", "outlines"), [(0.0, False), (20.0, True)])
 @pytest.mark.parametrize("axes", [*AXES, "world"])
 def test_axes_that_are_left_open_are_found_and_told(rendered, axes, degrees, outlines):
     scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None

@@ -14,11 +14,6 @@ def tally(levels, full):
     return counts.sum(dim=0), (counts >= 8).long().sum(dim=0)
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5)
-
-
 @pytest.mark.parametrize(
     ("full", "white"), [(65535, 15000), (65535, 4095), (65535, 65535), (255, 255), (255, 235)]
 )

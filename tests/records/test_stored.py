@@ -118,11 +118,6 @@ def odds():
 
 
 @pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(3)
-
-
-@pytest.fixture
 def path(tmp_path):
     return tmp_path / "odds.safetensors"
 

@@ -1,6 +1,5 @@
 from itertools import combinations
 
-import pytest
 import torch
 
 from pimper_torch.sfm.moved_object import clusters, find_moved_object, object_votes, series_of
@@ -8,11 +7,6 @@ from tests.sfm.moved import photographed
 
 SIZE = torch.tensor([320.0, 240.0])
 SERIES = (0,) * 6 + (1,) * 6
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(46)
 
 
 def matched(series, num_object, num_points, same_side=2):

@@ -16,11 +16,6 @@ from tests.sfm.moved import K, bodies, poses
 LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(46)
-
-
 def model_of(counts, generator, *, moved=True):
     """Give a model in the table's frame; points are seen by views within 50 degrees."""
     own, table = bodies(generator, num_object=400, num_table=400)

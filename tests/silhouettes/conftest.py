@@ -14,11 +14,6 @@ from tests.silhouettes.shapes import all_round
 CENTER, RADIUS = torch.tensor([0.0, 0.0, 0.5]), 0.5
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(23)
-
-
 @dataclass(frozen=True)
 class Staged:
     """A ball on a table, and which pixels show it."""

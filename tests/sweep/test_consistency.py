@@ -8,24 +8,12 @@ VIEWS = 8
 
 
 @pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(61)
-
-
-@pytest.fixture
 def shading(generator):
     return 0.3 + torch.rand(5, VIEWS, generator=generator, dtype=torch.float64)
 
 
 def all_seen() -> torch.Tensor:
     return torch.ones(5, VIEWS, dtype=torch.bool)
-
-
-def test_views_that_show_albedo_times_shading_cost_nothing(generator, shading):
-    albedo = 0.1 + torch.rand(5, 1, 3, generator=generator, dtype=torch.float64)
-    scale = torch.full((5,), 0.01, dtype=torch.float64)
-    cost = inconsistency(albedo * shading[..., None], shading, all_seen(), scale)
-    assert_close(cost, torch.zeros(5, 3, dtype=torch.float64))
 
 
 def test_without_robustness_the_albedo_is_the_best_there_is(generator, shading):
@@ -35,19 +23,6 @@ def test_without_robustness_the_albedo_is_the_best_there_is(generator, shading):
     albedo = torch.linspace(0, 3, 3001, dtype=torch.float64)
     apart = radiance[..., None] - albedo * shading[:, :, None, None]
     assert_close(cost, apart.square().sum(dim=1).amin(dim=-1), rtol=1e-4, atol=1e-4)
-
-
-def test_what_is_not_seen_does_not_matter(generator, shading):
-    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
-    scale = torch.full((5,), 0.1, dtype=torch.float64)
-    seen = all_seen()
-    seen[:, 3] = False
-    changed = radiance.clone()
-    changed[:, 3] = 7.0
-    here = inconsistency(radiance, shading, seen, scale)
-    assert_close(here, inconsistency(changed, shading, seen, scale))
-    kept = [view for view in range(VIEWS) if view != 3]
-    assert_close(here, inconsistency(radiance[:, kept], shading[:, kept], seen[:, kept], scale))
 
 
 def test_one_view_in_shadow_hardly_shifts_the_others_cost(shading):
@@ -71,14 +46,6 @@ def test_views_that_disagree_are_outvoted_whatever_their_number_under_a_half(sha
     assert_close(cost, right, rtol=0.02, atol=0)
 
 
-def test_costs_can_be_differentiated(generator, shading):
-    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64).requires_grad_()
-    scale = torch.full((5,), 0.2, dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda x: inconsistency(x, shading, all_seen(), scale, iterations=200), radiance
-    )
-
-
 def test_every_sample_has_a_cost_of_its_own_scale(generator, shading):
     """Against the formula, at the albedo that minimizes it on a grid; the median starts there."""
     albedo = 0.3 + torch.rand(5, 1, 1, generator=generator, dtype=torch.float64)
@@ -90,12 +57,3 @@ def test_every_sample_has_a_cost_of_its_own_scale(generator, shading):
     residual = radiance[..., None] - grid * shading[:, :, None, None]
     squares = (residual / scale[:, None, None, None]).square()
     assert_close(cost, 0.5 * torch.log1p(squares).sum(dim=1).amin(dim=-1), rtol=0, atol=1e-4)
-
-
-def test_radiance_and_scale_in_other_units_cost_the_same(generator, shading):
-    radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
-    scale = torch.tensor([0.02, 0.05, 0.1, 0.2, 0.4], dtype=torch.float64)
-    unit = torch.tensor([1.0, 10.0, 0.1, 3.0, 0.3], dtype=torch.float64)
-    here = inconsistency(radiance, shading, all_seen(), scale)
-    there = inconsistency(unit[:, None, None] * radiance, shading, all_seen(), unit * scale)
-    assert_close(here, there)

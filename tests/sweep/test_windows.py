@@ -5,28 +5,6 @@ from torch.testing import assert_close
 from pimper_torch.sweep.windows import level_weight, window_mean, window_size
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(62)
-
-
-def test_the_mean_of_a_constant_is_the_constant_up_to_the_border(generator):
-    weight = (torch.rand(2, 9, 11, generator=generator) > 0.4).float()
-    mean = window_mean(torch.full((2, 3, 9, 11), 7.0), weight, 1.5)
-    reached = mean != 0
-    assert_close(mean[reached], torch.full_like(mean[reached], 7.0))
-    assert reached[weight[:, None].expand_as(mean) > 0].all()
-
-
-def test_samples_without_weight_stay_out(generator):
-    values = torch.rand(1, 1, 12, 12, generator=generator)
-    weight = torch.ones(1, 12, 12)
-    weight[:, :, 6:] = 0
-    changed = values.clone()
-    changed[..., 6:] = 1e6
-    assert_close(window_mean(values, weight, 2.0), window_mean(changed, weight, 2.0))
-
-
 @pytest.mark.parametrize("radius", [1.5, 2.5])
 def test_noise_falls_by_the_size_of_the_window(generator, radius):
     noise = torch.randn(40, 1, 64, 64, generator=generator, dtype=torch.float64)

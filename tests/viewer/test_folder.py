@@ -9,6 +9,7 @@ from urllib.request import urlopen
 
 import pytest
 import torch
+from surfaces import surface_of
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.cli.main import main
@@ -16,7 +17,7 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io import results
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Convergence, Mesh, StageReport, Surface
+from pimper_torch.records import Mesh, StageReport
 from pimper_torch.store import Store
 from pimper_torch.viewer.folder import add_folder, passes_kept
 from pimper_torch.viewer.show import show
@@ -31,21 +32,12 @@ def report(name, seconds):
 def surface(reconstruction, shift):
     """The result's mesh as the surface of a pass, moved by a shift."""
     mesh = reconstruction.mesh
-    count = len(mesh.vertices_world)
-    return Surface(
-        vertices_world=mesh.vertices_world + shift,
-        faces=mesh.faces,
-        facet=torch.zeros(count, dtype=torch.long),
-        barycentric=torch.ones(count, 3) / 3,
+    return surface_of(
+        mesh.vertices_world + shift,
+        mesh.faces,
         normals_world=mesh.normals_world,
         albedo=mesh.albedo,
-        information=torch.ones(count),
-        height_information=torch.ones(count),
-        convergence=Convergence(
-            iterations=torch.ones(1, dtype=torch.long),
-            residual=torch.zeros(1),
-            cause=torch.zeros(1, dtype=torch.long),
-        ),
+        height_information=torch.ones(len(mesh.vertices_world)),
     )
 
 
