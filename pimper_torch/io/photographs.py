@@ -23,7 +23,7 @@ from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
-from pimper_torch.sfm.conventions.turned_masks import drawn_as_stored
+from pimper_torch.sfm.conventions.masks import drawn_as_stored, object_is_dark
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
@@ -31,8 +31,6 @@ _BLACK = 1e-3
 _LIT_FRACTION = 1e-3  # more than hot pixels
 # Less of the object than this is left of a photograph that is mostly saturated.
 _MIN_USABLE = 0.1
-# Masks are turned round where more than the rest of it is bright at the border, and less inside.
-_TELLING = 0.25
 # Levels below which masks hold labels, and from which on edges are soft: a choice. Masks stored as
 # 0 and 1 are labels, too.
 _MOST_LABELS = 32
@@ -121,7 +119,9 @@ def load_views(
     if mask_paths is not None:
         ways = _read_masks(mask_paths, paths, headers)
         opacities = _laid(ways, images, sizes, Path(str(masks)))
-        dark = _is_dark(opacities, mask_object, Path(str(masks)))
+        dark = mask_object == "dark"
+        if mask_object == "auto":
+            dark = object_is_dark(opacities, str(masks))
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if opacities:
             opacity = 1 - opacities[index] if dark else opacities[index]
@@ -393,35 +393,6 @@ def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
     stem, folder = name.rpartition(".")[0], name.rpartition("/")[0]
     names = (stem, name, f"{stem}_mask", folder)
     return next((by_stem[one] for one in names if one in by_stem), None)
-
-
-def _is_dark(
-    opacities: Sequence[Float[Tensor, "_ _"]],
-    mask_object: Literal["auto", "bright", "dark"],
-    folder: Path,
-) -> bool:
-    """Return whether masks show the object dark, by all of them together."""
-    if mask_object != "auto":
-        return mask_object == "dark"
-    border, centre = [], []
-    for (opacity,) in each(opacities):
-        high, wide = opacity.shape
-        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
-        border.append(opacity[:, -1].mean())
-        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
-        centre.append(inner.mean())
-    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
-    # An object that fills its photographs is bright in the centre, too.
-    dark = fractions[0] > 1 - _TELLING and fractions[1] < 1 - _TELLING
-    if dark:
-        warnings.warn(
-            f"{folder}: the masks are bright along {fractions[0]:.0%} of the border and "
-            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
-            "`--mask-object bright` says that it is not.",
-            PimperWarning,
-            stacklevel=3,
-        )
-    return dark
 
 
 def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
