@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning, caution, some
+from pimper_torch.errors import InputError, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, decode, read_header, rotated
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
@@ -316,11 +315,10 @@ def _tell_alpha(
 ) -> None:
     """State that transparency is taken for masks."""
     drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
-    warnings.warn(
+    caution(
         f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
         f"({some(drawn)}), which are taken for masks: opaque is the object. If that is wrong, save "
         "them without transparency, or give masks by `--masks`.",
-        PimperWarning,
         stacklevel=3,
     )
 
@@ -521,9 +519,8 @@ def _judge_saturation(
         if fraction < _MIN_USABLE
     ]
     if scant:
-        warnings.warn(
+        caution(
             f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
-            PimperWarning,
             stacklevel=3,
         )
 
