@@ -100,7 +100,7 @@ class Reconstruct(Stage):
         if not lacks_points(model) or not scene.lenses:
             return scene
         bare = scene.views.replace(priors=())
-        found = self._triangulated(bare, Ways([model], [], []), "The scene")
+        found = self._triangulated(bare, Ways([model]), "The scene")
         return scene if found is model else with_model_points(scene, found)
 
     def _given(self, views: Views, path: Path) -> SparseModel:
@@ -118,7 +118,7 @@ class Reconstruct(Stage):
         found, _ = kept_model(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
-            lambda: triangulate(views, ways.plain, self.config, where, ways.cropped, ways.changed),
+            lambda: triangulate(views, ways, self.config, where),
         )
         return found
 
