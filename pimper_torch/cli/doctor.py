@@ -10,7 +10,7 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doctor.examine import examine_folder
+from pimper_torch.doctor.checks import examine_folder
 from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.machine import machine
 from pimper_torch.errors import InputError

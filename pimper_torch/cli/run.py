@@ -15,8 +15,8 @@ from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.size import bars_in_files, in_files, sized, told_size
 from pimper_torch.cli.view import tell_place
+from pimper_torch.doctor.checks import examine_views
 from pimper_torch.doctor.cost import planned
-from pimper_torch.doctor.examine import examine_views
 from pimper_torch.doctor.forecast import Forecast
 from pimper_torch.errors import ConfigError, caution, cautioned
 from pimper_torch.io.meshes import read_mesh

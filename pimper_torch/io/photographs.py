@@ -2,7 +2,6 @@
 
 import os
 import re
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError, PimperWarning, caution, some
+from pimper_torch.errors import InputError, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, decode, read_header, rotated
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
@@ -23,7 +22,7 @@ from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
-from pimper_torch.sfm.conventions.turned_masks import drawn_as_stored
+from pimper_torch.sfm.conventions.masks import drawn_as_stored, object_is_dark
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
@@ -31,8 +30,6 @@ _BLACK = 1e-3
 _LIT_FRACTION = 1e-3  # more than hot pixels
 # Less of the object than this is left of a photograph that is mostly saturated.
 _MIN_USABLE = 0.1
-# Masks are turned round where more than the rest of it is bright at the border, and less inside.
-_TELLING = 0.25
 # Levels below which masks hold labels, and from which on edges are soft: a choice. Masks stored as
 # 0 and 1 are labels, too.
 _MOST_LABELS = 32
@@ -121,7 +118,9 @@ def load_views(
     if mask_paths is not None:
         ways = _read_masks(mask_paths, paths, headers)
         opacities = _laid(ways, images, sizes, Path(str(masks)))
-        dark = _is_dark(opacities, mask_object, Path(str(masks)))
+        dark = mask_object == "dark"
+        if mask_object == "auto":
+            dark = object_is_dark(opacities, str(masks))
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if opacities:
             opacity = 1 - opacities[index] if dark else opacities[index]
@@ -316,11 +315,10 @@ def _tell_alpha(
 ) -> None:
     """State that transparency is taken for masks."""
     drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
-    warnings.warn(
+    caution(
         f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
         f"({some(drawn)}), which are taken for masks: opaque is the object. If that is wrong, save "
         "them without transparency, or give masks by `--masks`.",
-        PimperWarning,
         stacklevel=3,
     )
 
@@ -393,35 +391,6 @@ def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
     stem, folder = name.rpartition(".")[0], name.rpartition("/")[0]
     names = (stem, name, f"{stem}_mask", folder)
     return next((by_stem[one] for one in names if one in by_stem), None)
-
-
-def _is_dark(
-    opacities: Sequence[Float[Tensor, "_ _"]],
-    mask_object: Literal["auto", "bright", "dark"],
-    folder: Path,
-) -> bool:
-    """Return whether masks show the object dark, by all of them together."""
-    if mask_object != "auto":
-        return mask_object == "dark"
-    border, centre = [], []
-    for (opacity,) in each(opacities):
-        high, wide = opacity.shape
-        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
-        border.append(opacity[:, -1].mean())
-        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
-        centre.append(inner.mean())
-    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
-    # An object that fills its photographs is bright in the centre, too.
-    dark = fractions[0] > 1 - _TELLING and fractions[1] < 1 - _TELLING
-    if dark:
-        warnings.warn(
-            f"{folder}: the masks are bright along {fractions[0]:.0%} of the border and "
-            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
-            "`--mask-object bright` says that it is not.",
-            PimperWarning,
-            stacklevel=3,
-        )
-    return dark
 
 
 def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
@@ -550,9 +519,8 @@ def _judge_saturation(
         if fraction < _MIN_USABLE
     ]
     if scant:
-        warnings.warn(
+        caution(
             f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
-            PimperWarning,
             stacklevel=3,
         )
 

@@ -8,7 +8,7 @@ import torch
 
 from pimper_torch.errors import InputError
 from pimper_torch.prior_files.folder import read_maps, single
-from pimper_torch.priors.from_maps import Maps, stacked
+from pimper_torch.priors.from_maps import silhouettes_from, stacked
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.size.given import Mark, number_of, require_inside
 
@@ -34,7 +34,9 @@ def read_silhouettes(
     Raises:
         InputError: A file or its name, shape or values cannot be used: says which.
     """
-    return _prior(read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted)
+    return silhouettes_from(
+        read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted
+    )
 
 
 def _chance(path: Path, values: np.ndarray) -> np.ndarray:
@@ -74,13 +76,4 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
         row = min(int(pointer.y * height / full[1]), height - 1)
         around = slice(max(0, row - _REACH), row + _REACH + 1)
         inside[around, max(0, column - _REACH) : column + _REACH + 1] = 1
-    return _prior(stacked({views.names[view]: (one, None) for view, one in maps.items()}))
-
-
-def _prior(maps: Maps, *, undistorted: bool = False) -> SilhouettePrior:
-    return SilhouettePrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        inside=maps.values[..., 0].nan_to_num(_UNKNOWN),
-        undistorted=undistorted,
-    )
+    return silhouettes_from(stacked({views.names[view]: (one, None) for view, one in maps.items()}))

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import InputError, some
-from pimper_torch.records import DepthPrior, NormalPrior
+from pimper_torch.records import DepthPrior, NormalPrior, SilhouettePrior
 from pimper_torch.records.priors import AXES, Axes
 
 # Root mean squares that published estimators are off indoors. DSINE (CVPR 2024) has a mean of 16
@@ -22,6 +22,7 @@ NORMALS_ERROR_DEG, DEPTH_ERROR = 25.0, 0.08
 # Lengths of vectors that are normals, blended where maps were resized. Grey, and the colour 0 that
 # marks nothing, are none.
 _SHORTEST, _LONGEST = 0.5, 1.5
+_UNKNOWN = 0.5  # probability of a silhouette where nothing is said
 _RANGE = (0.02, 0.98)  # of the values of a map: its ends may be strays
 
 NormalAxes = Literal["auto", "opencv", "opengl", "lub", "dsine", "world"]
@@ -116,6 +117,16 @@ def depth_from(
         along=along,
         inverse=inverse,
         gauge=gauge,
+    )
+
+
+def silhouettes_from(maps: Maps, *, undistorted: bool = False) -> SilhouettePrior:
+    """Make a prior of silhouettes; NaN says nothing."""
+    return SilhouettePrior(
+        names=maps.names,
+        sizes_px=maps.sizes_px,
+        undistorted=undistorted,
+        inside=maps.values[..., 0].nan_to_num(_UNKNOWN),
     )
 
 

@@ -13,16 +13,16 @@ from torch.nn.functional import interpolate
 from pimper_torch.config import require
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.parallel import side_by_side
-from pimper_torch.priors.from_maps import Maps, depth_from, normals_from, stacked, variance_of
-from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import (
-    AlbedoPrior,
-    InlierPrior,
-    Prior,
-    SilhouettePrior,
-    SparseScene,
-    Views,
+from pimper_torch.priors.from_maps import (
+    Maps,
+    depth_from,
+    normals_from,
+    silhouettes_from,
+    stacked,
+    variance_of,
 )
+from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.records import AlbedoPrior, InlierPrior, Prior, SparseScene, Views
 
 Picture = Float[Tensor, "1 channel height width"]
 Network = Callable[[Picture], Any]
@@ -111,6 +111,8 @@ def _prior(maps: Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -
         return normals_from(maps, **meaning, undistorted=undistorted)
     if kind == "depth":
         return depth_from(maps, **meaning, undistorted=undistorted)
+    if kind == "silhouettes":
+        return silhouettes_from(maps, **meaning, undistorted=undistorted)
     known = maps.values.isfinite().all(dim=-1)
     values = torch.where(known[..., None], maps.values, 0)
     about: dict[str, Any] = {"names": maps.names, "sizes_px": maps.sizes_px}
@@ -121,9 +123,7 @@ def _prior(maps: Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -
         require(told, "error", error, "above 0, where the network returns no variance")
         variance = variance_of(maps, known, error**2)
         return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **about, **meaning)
-    if kind == "inliers":
-        return InlierPrior(probability=values[..., 0], **about, **meaning)
-    return SilhouettePrior(inside=values[..., 0], **about, **meaning)
+    return InlierPrior(probability=values[..., 0], **about, **meaning)
 
 
 def _loaded(path: Path) -> Network:

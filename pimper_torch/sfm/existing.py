@@ -47,9 +47,9 @@ class Ways(NamedTuple):
         changed: Numbers of the photographs of another size.
     """
 
-    plain: list[SparseModel]
-    cropped: list[SparseModel]
-    changed: list[int]
+    plain: Sequence[SparseModel]
+    cropped: Sequence[SparseModel] = ()
+    changed: Sequence[int] = ()
 
 
 def existing_ways(views: Views, path: Path) -> Ways:
@@ -97,11 +97,11 @@ def existing_ways(views: Views, path: Path) -> Ways:
             return Ways([one for _, one in plain], [one for _, one in cropped], changed)
         told = cropped[scores.index(max(scores))][0]
     if not len(model.points_world):
-        return Ways([one for _, one in plain], [], [])
+        return Ways([one for _, one in plain])
     placed = follow_pictures(told, shown, find_turns(told, shown, where))
     if told is not model:
         tell_crop(where, placed, changed, "what they show round its points")
-    return Ways([placed], [], [])
+    return Ways([placed])
 
 
 def _largest(views: Views, folder: Path) -> Path:

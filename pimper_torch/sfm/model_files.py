@@ -52,8 +52,7 @@ class FileImage:
 
     Attributes:
         quaternion: Of ``cam_from_world``, real part first.
-        pixels: Of its features, ``feature 2``.
-        points: The point that each sees; negative where none.
+        pixels: Of its features, ``feature 2``. Which points they see, tracks tell.
     """
 
     image: int
@@ -62,7 +61,6 @@ class FileImage:
     camera: int
     name: str
     pixels: np.ndarray
-    points: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,7 +213,6 @@ def _binary_images(data: bytes) -> tuple[FileImage, ...]:
                 camera=int(camera),
                 name=name,
                 pixels=np.stack([features["x"], features["y"]], axis=1),
-                points=features["point"].astype(np.int64),
             )
         )
     return tuple(images)
@@ -310,7 +307,6 @@ def _text_images(data: bytes) -> tuple[FileImage, ...]:
                 f"has in line {below} {len(columns)} numbers; needed: three for each feature"
             )
         xy = np.array(_numbers(columns, float, below), dtype=np.float64).reshape(-1, 3)
-        points = [_whole(word, below) for word in columns[2::3]]
         images.append(
             FileImage(
                 image=_whole(words[0], number),
@@ -319,7 +315,6 @@ def _text_images(data: bytes) -> tuple[FileImage, ...]:
                 camera=_whole(words[8], number),
                 name=words[9],
                 pixels=xy[:, :2].copy(),
-                points=np.array(points, dtype=np.int64),
             )
         )
     return tuple(images)

@@ -97,7 +97,7 @@ class Reconstruct(Stage):
         if not lacks_points(model) or not scene.lenses:
             return scene
         bare = scene.views.replace(priors=())
-        found = self._triangulated(bare, Ways([model], [], []), "The scene")
+        found = self._triangulated(bare, Ways([model]), "The scene")
         return scene if found is model else with_model_points(scene, found)
 
     def _given(self, views: Views, path: Path) -> SparseModel:
@@ -116,7 +116,7 @@ class Reconstruct(Stage):
             self.store,
             f"triangulate-{hashed}" if hashed else None,
             SparseModel,
-            lambda: triangulate(views, ways.plain, self.config, where, ways.cropped, ways.changed),
+            lambda: triangulate(views, ways, self.config, where),
         )
         return found
 

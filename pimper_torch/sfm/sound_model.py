@@ -27,7 +27,7 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     Broken are cameras whose parameters are not finite or whose focal length is not above 0; images
     of these, with a pose that is not finite or a quaternion that is none, or that stand twice;
     points that are not finite; and observations that name an image or a feature that is not
-    there, or not each other.
+    there.
 
     Raises:
         InputError: More than half of the images or points are broken: says why.
@@ -135,32 +135,19 @@ def _observations(
     Observations of what was dropped are not counted.
     """
     track = files.points
-    ids = np.array([image.image for image in kept], dtype=np.int64)
-    order = np.argsort(ids)
-    at = np.searchsorted(ids[order], track.track_image) if len(ids) else None
-    view = np.full(len(track.track_image), -1)
-    if at is not None:
-        at = np.minimum(at, len(ids) - 1)
-        found = ids[order][at] == track.track_image
-        view[found] = order[at[found]]
+    view_of = {image.image: view for view, image in enumerate(kept)}
+    dropped = [image.image for image in files.images if image.image not in view_of]
+    view = np.array([view_of.get(image, -1) for image in track.track_image.tolist()], np.int64)
     starts = np.cumsum([0, *(len(image.pixels) for image in kept)])
     pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in kept)])
-    names = np.concatenate([np.zeros(0, np.int64), *(image.points for image in kept)])
-    counts = np.diff(starts)
     point = new_point[track.track_point]
-    known = {image.image for image in files.images} - set(ids.tolist())
-    foreign = (view < 0) & ~np.isin(track.track_image, list(known))
-    seen = (view >= 0) & (point >= 0)
-    there = seen.copy()
-    there[seen] = (track.track_feature[seen] >= 0) & (
-        track.track_feature[seen] < counts[view[seen]]
-    )
-    feature = np.zeros(len(view), np.int64)
-    feature[there] = starts[view[there]] + track.track_feature[there]
-    sound = there.copy()
-    sound[there] = names[feature[there]] == track.points[track.track_point[there]]
-    sound[sound] = (np.abs(pixels[feature[sound]]) < _MAX_COORDINATE).all(axis=1)
-    lost = int((seen & ~sound).sum() + (foreign & (point >= 0)).sum())
-    by_point = np.flatnonzero(sound)
-    by_point = by_point[np.argsort(point[by_point], kind="stable")]
-    return (point[by_point], view[by_point], pixels[feature[by_point]]), lost
+    seen = (point >= 0) & ~np.isin(track.track_image, dropped)
+    there = (view >= 0) & (track.track_feature >= 0)
+    there &= track.track_feature < np.append(np.diff(starts), 0)[view]
+    feature = starts[view[there]] + track.track_feature[there]
+    sound = seen & there
+    sound[there] &= (np.abs(pixels[feature]) < _MAX_COORDINATE).all(axis=1)
+    chosen = np.flatnonzero(sound)
+    chosen = chosen[np.argsort(point[chosen], kind="stable")]
+    found = pixels[starts[view[chosen]] + track.track_feature[chosen]]
+    return (point[chosen], view[chosen], found), int((seen & ~sound).sum())

@@ -27,6 +27,7 @@ from pimper_torch.sfm.conventions.by_matches import (
     find_crop,
     require_agreement,
 )
+from pimper_torch.sfm.existing import Ways
 from pimper_torch.sfm.features import find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -59,14 +60,7 @@ def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED
     return float(seen.double().median()) < fewest
 
 
-def triangulate(
-    views: Views,
-    models: Sequence[SparseModel],
-    settings: ReconstructConfig,
-    where: str,
-    crops: Sequence[SparseModel] = (),
-    changed: Sequence[int] = (),
-) -> SparseModel:
+def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: str) -> SparseModel:
     """Triangulate what photographs show, with cameras held fixed.
 
     Features are found and matched as in structure from motion. What an epipolar geometry of its own
@@ -75,10 +69,8 @@ def triangulate(
     patches. On one thread where the order of sums tells, so that bits repeat.
 
     Args:
-        models: Of them, in their order: cameras in the ways in which they may be meant; the one
-            that fits best is taken. Points that it has are replaced where more are found.
-        crops: Cameras of photographs that may have been cropped.
-        changed: Numbers of these.
+        ways: Cameras of the photographs, in their order; those that fit best are taken. Points that
+            they have are replaced where more are found.
 
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
@@ -87,9 +79,9 @@ def triangulate(
     Raises:
         InputError: Cameras and photographs do not belong together.
     """
-    if too_small(views) and models:
+    if too_small(views) and ways.plain:
         _tell_nothing(0, where)
-        return models[0]
+        return ways.plain[0]
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
     with workspace(views, settings.num_threads) as space:
         counts = find_features(space, settings, [None] * views.num_views, lenses)
@@ -99,12 +91,16 @@ def triangulate(
             enter_room(leave_out_room(space.database, settings))
         verified = verified_pairs(space)
         limit = settings.max_error_px
-        given = choose_turns(models, verified, limit, where) if models else None
-        crop = find_crop(given, crops, changed, verified, limit, where) if crops else None
+        given = choose_turns(ways.plain, verified, limit, where) if ways.plain else None
+        crop = (
+            find_crop(given, ways.cropped, ways.changed, verified, limit, where)
+            if ways.cropped
+            else None
+        )
         given = given if crop is None else crop
         assert given is not None, "a crop is found, or refused, where no resize is possible"
         require_agreement(given, verified, limit, where)
-        if crops and not lacks_points(given):
+        if ways.cropped and not lacks_points(given):
             return given
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))

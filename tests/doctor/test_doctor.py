@@ -8,12 +8,18 @@ from PIL import Image, ImageCms
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from pimper_torch.cli.main import main
+from pimper_torch.doctor.checks import (
+    blur,
+    examine_folder,
+    examine_views,
+    exposure,
+    lenses,
+    number,
+    saturation,
+)
 from pimper_torch.doctor.cost import cost, estimate
-from pimper_torch.doctor.each import blur, exposure, lenses, number, saturation
-from pimper_torch.doctor.examine import examine_folder, examine_views
-from pimper_torch.doctor.light import light, light_variation
 from pimper_torch.doctor.machine import available_gb, machine, total_gb
-from pimper_torch.doctor.overlap import match_copies, overlap
+from pimper_torch.doctor.pairs import light, light_variation, match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, of_views, summarize
 from pimper_torch.doctor.sharpness import edge_blur_px
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere

@@ -9,7 +9,6 @@ import math
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,21 +33,10 @@ _MATRIX, _COMPRESSED, _COMPLEX = 14, 15, 0x0800
 MAX_BYTES = 2**29
 
 
-@dataclass(frozen=True, slots=True)
-class Variable:
-    """An array of a file; ``None`` where it holds anything but real numbers."""
-
-    name: str
-    array: np.ndarray | None
-
-
 def read_variables(
     path: Path | str, wanted: Callable[[str], bool] = lambda name: True
-) -> list[Variable]:
-    """Read the arrays of numbers; other variables are named only.
-
-    Args:
-        wanted: Tells the names of the arrays to read; others are named only.
+) -> dict[str, np.ndarray | None]:
+    """Read the arrays of real numbers whose names are wanted; ``None`` for other variables.
 
     Raises:
         ValueError: It is no such file, is cut short, or unpacks to more than 512 MB: says which.
@@ -59,7 +47,8 @@ def read_variables(
     order = "<" if data[126:128] == b"IM" else ">"
     if struct.unpack_from(f"{order}H", data, 124)[0] != 0x0100:
         raise ValueError("its version is 7.3 or unknown")
-    found, at, room = [], 128, MAX_BYTES
+    found: dict[str, np.ndarray | None] = {}
+    at, room = 128, MAX_BYTES
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}2I", data, at)
         body = data[at + 8 : at + 8 + size]
@@ -72,7 +61,8 @@ def read_variables(
             kind, size = struct.unpack_from(f"{order}2I", body) if len(body) >= 8 else (0, 0)
             body = body[8 : 8 + size]
         if kind == _MATRIX:
-            found.append(_variable(body, order, wanted))
+            name, array = _variable(body, order, wanted)
+            found[name] = array
     return found
 
 
@@ -87,7 +77,9 @@ def _unpacked(body: bytes, room: int) -> bytes:
     return unpacked
 
 
-def _variable(body: bytes, order: str, wanted: Callable[[str], bool]) -> Variable:
+def _variable(
+    body: bytes, order: str, wanted: Callable[[str], bool]
+) -> tuple[str, np.ndarray | None]:
     _, flags, at = _element(body, 0, order)
     if len(flags) < 8:
         raise ValueError("a variable has no class")
@@ -97,7 +89,7 @@ def _variable(body: bytes, order: str, wanted: Callable[[str], bool]) -> Variabl
     _, name, at = _element(body, at, order)
     text = name.decode("latin-1")
     if flag & 0xFF not in _CLASSES or flag & _COMPLEX or not wanted(text):
-        return Variable(text, None)
+        return text, None
     kind, values, _ = _element(body, at, order)
     if kind not in _KINDS or not 2 <= len(shape) <= 8 or any(side < 0 for side in shape):
         raise ValueError(f"{text[:40]!r} has no type or shape")
@@ -107,7 +99,7 @@ def _variable(body: bytes, order: str, wanted: Callable[[str], bool]) -> Variabl
             f"{text[:40]!r} says that its shape is {shape}, and has {len(values)} bytes"
         )
     array = np.frombuffer(values, packed).astype(_CLASSES[flag & 0xFF])
-    return Variable(text, array.reshape(shape, order="F"))
+    return text, array.reshape(shape, order="F")
 
 
 def _element(body: bytes, at: int, order: str) -> tuple[int, bytes, int]:

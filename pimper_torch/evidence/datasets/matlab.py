@@ -36,8 +36,7 @@ def read_matlab(file: DataSetPath, names: Sequence[str]) -> dict[str, np.ndarray
 
 def _variables(file: DataSetPath, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
     """Read arrays of these names, and name the other variables."""
-    read = file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
-    return {one.name: one.array for one in read}
+    return file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
 
 
 def read_toolbox_projections(

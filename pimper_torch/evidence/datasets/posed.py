@@ -18,6 +18,7 @@ from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
+from pimper_torch.sfm.conventions.pictures import resize_fits
 from pimper_torch.sfm.undistort import pinhole_for, undistort
 
 
@@ -126,7 +127,7 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
     lenses = []
     for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
         lens = one.lens
-        if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
+        if not resize_fits((lens.width, lens.height), width, height):
             raise InputError(
                 f"{one.image}: has the shape {width} x {height}, but its camera is for "
                 f"{lens.width} x {lens.height}. Needed: the photograph that the camera belongs to, "

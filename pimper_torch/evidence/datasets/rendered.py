@@ -10,6 +10,7 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.evidence.datasets.raster import read_photographs
 from pimper_torch.evidence.scenes.rendered_folder import (
     FORMAT,
     FORMAT_VERSION,
@@ -17,16 +18,16 @@ from pimper_torch.evidence.scenes.rendered_folder import (
     unpack_maps,
 )
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
-from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.numpy_files import read_npz
 from pimper_torch.progress import track
-from pimper_torch.radiometry import Linear, Srgb
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Capture, Truth, Views
 from pimper_torch.sfm.agreement import pinholes_of
 from pimper_torch.sfm.colmap import read_model
 
 _KIND = "a rendered scene (`pimper render`)"
+_PICTURES = ("photos", "masks")
 
 
 def read_rendered(
@@ -120,35 +121,21 @@ def _read_views(
     photographs: bool,
 ) -> Views:
     width, height = settings.width, settings.height
-    response = Srgb() if settings.encoding == "srgb" else Linear()
-    images = torch.zeros(1).expand(len(names), 3, height, width)
-    masks = None
-    if photographs:
-        images = torch.zeros(len(names), 3, height, width)
-        masks = torch.zeros(len(names), height, width, dtype=torch.bool)
-        for row in track(range(len(names))):
-            samples = _read_picture(root.inner("photos"), names[row], width, height)
-            images[row] = response.linear_from_encoded(samples).expand(3, -1, -1)
-            mask = _read_picture(root.inner("masks"), names[row], width, height)
-            masks[row] = mask.amax(dim=0) > 0
-    return Views(
-        images=images,
-        sizes_px=cameras.sizes_px,
-        names=tuple(names),
-        masks=masks,
-        focals_px=torch.full((len(names),), torch.nan),
-    )
-
-
-def _read_picture(
-    folder: DataSetPath, name: str, width: int, height: int
-) -> Float[Tensor, "channel {height} {width}"]:
-    file = folder._replace(path=folder.inside(name))
-    samples = file.read(decode, "a picture").samples
-    needed = f"{width} x {height} pixels as scene.json says"
-    found = f"{samples.shape[2]} x {samples.shape[1]}"
-    file.expect(samples.shape[1:] == (height, width), needed, found)
-    return samples
+    if not photographs:
+        return Views(
+            images=torch.zeros(1).expand(len(names), 3, height, width),
+            sizes_px=cameras.sizes_px,
+            names=tuple(names),
+            focals_px=torch.full((len(names),), torch.nan),
+        )
+    paths, masks = ([root.inner(kind).inside(name) for name in names] for kind in _PICTURES)
+    encoding = Encoding(response=settings.encoding, saturation=1.0)
+    views = read_photographs(paths, names, encoding=encoding, masks=masks)
+    for name, size in zip(names, views.sizes_px.tolist(), strict=True):
+        needed = f"{width} x {height} pixels as scene.json says"
+        ok = size == [width, height]
+        root.expect(ok, f"{name} of {needed}", f"{size[0]} x {size[1]}")
+    return views.replace(images=views.images.expand(-1, 3, -1, -1))
 
 
 def _read_maps(

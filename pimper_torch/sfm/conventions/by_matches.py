@@ -22,7 +22,7 @@ from pimper_torch.sfm.agreement import (
     undistorted_pairs,
 )
 from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.conventions.camera_mistakes import camera_mistakes
+from pimper_torch.sfm.conventions.camera_mistakes import camera_readings
 from pimper_torch.sfm.conventions.choice import far_better, surely_better
 from pimper_torch.sfm.conventions.pictures import (
     around,
@@ -178,8 +178,8 @@ def require_agreement(
     given = _fraction(pairs, cameras, max_error_px)
     if total < _FEWEST or given > _RIGHT:
         return
-    mistakes = camera_mistakes(cameras)
-    scores = [_fraction(pairs, one.undo(cameras), max_error_px) for one in mistakes]
+    readings = camera_readings(cameras)
+    scores = [_fraction(pairs, one.cameras, max_error_px) for one in readings]
     best = far_better(given, scores)
     if given >= _MIN_AGREEMENT and best is None:
         return
@@ -190,8 +190,8 @@ def require_agreement(
     )
     if best is not None:
         advice = (
-            f"{scores[best]:.0%} do if {mistakes[best].meaning}. Put them right: "
-            f"{mistakes[best].remedy}. Needed here: cam_from_world, camera axes x right, y down, z "
+            f"{scores[best]:.0%} do if {readings[best].meaning}. Put them right: "
+            f"{readings[best].remedy}. Needed here: cam_from_world, camera axes x right, y down, z "
             "forward."
         )
     raise InputError(

@@ -141,8 +141,8 @@ def test_settings_that_have_gone_are_passed_over(copy):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("photos/view_001.png", r"a file view_001\.png"),
-        ("masks/view_001.png", r"a file view_001\.png"),
+        ("photos/view_001.png", r"photos/view_001\.png: there is no such file"),
+        ("masks/view_001.png", r"masks/view_001\.png: there is no such file"),
         ("truth/maps/view_001.npz", r"a file view_001\.npz"),
         ("truth/lights.json", r"truth: .*a file lights\.json"),
         ("truth/mesh.ply", r"mesh\.ply"),

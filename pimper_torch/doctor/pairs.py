@@ -1,18 +1,29 @@
-"""Variation of light between photographs, where both see the same points."""
+"""What photographs show in common, by features of small copies: overlap, and how light varies."""
 
 from collections.abc import Iterator, Sequence
 from statistics import median
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.doctor.photograph import Photograph
+from pimper_torch.errors import some
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.sfm.matching import VerifiedPair
+from pimper_torch.records import Views
+from pimper_torch.sfm.features import SMALLEST_PX, find_features
+from pimper_torch.sfm.matching import VerifiedPair, all_pairs, match_pairs, verified_pairs
+from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.workspace import workspace
 
+_MAX_PAIRS = 800  # of 40 photographs all; of more those next in the order of their names
+# Verified matches of a pair: fewer come about by chance.
+_LINKED = 12
 _WINDOW = 5  # pixels of the small copy round a feature, as blobs are
 _NEIGHBOURS = 9  # features whose median tells shading, which is smooth, from noise, which is not
 _MIN_MATCHES = 30
@@ -22,6 +33,62 @@ _DARK = 0.004  # of saturation: below, a level of 8 bits is a fifth of the value
 # camera.
 _CONSTANT = 0.04
 _GAUSSIAN = 1.4826  # standard deviations in a median absolute deviation
+
+
+def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[VerifiedPair]:
+    """Match small copies with one another; pairs that have nothing in common are left out."""
+    large = [index for index, copy in enumerate(copies) if min(copy.shape) >= SMALLEST_PX]
+    if len(large) < 2:
+        return []
+    height, width = (max(copies[index].shape[axis] for index in large) for axis in (0, 1))
+    padded = [
+        pad(copies[index], (0, width - copies[index].shape[1], 0, height - copies[index].shape[0]))
+        for index in large
+    ]
+    views = Views(
+        images=torch.stack(padded)[:, None],
+        sizes_px=torch.tensor([copies[index].shape[::-1] for index in large]),
+        names=tuple(map(str, large)),
+        masks=None,
+        focals_px=torch.full((len(large),), torch.nan),
+    )
+    settings = ReconstructConfig(peak_threshold=0.004, max_features=1500, affine_shape=False)
+    # Those next to one another first: round a turntable the last is by the first.
+    count = len(large)
+    pairs = sorted(
+        all_pairs(count), key=lambda pair: min(pair[1] - pair[0], count - pair[1] + pair[0])
+    )
+    with workspace(views, settings.num_threads) as space:
+        find_features(space, settings, [None] * count, range(count))
+        match_pairs(space, pairs[:_MAX_PAIRS], settings, _LINKED)
+        return [
+            pair.replace(views=(large[pair.views[0]], large[pair.views[1]]))
+            for pair in verified_pairs(space)
+        ]
+
+
+def overlap(names: Sequence[str], matches: Sequence[VerifiedPair]) -> Iterator[Finding]:
+    """Return whether matches connect all photographs."""
+    count = len(names)
+    if count < 2:
+        return
+    links = np.array([pair.views for pair in matches], dtype=np.int64).reshape(-1, 2)
+    usual = sorted(np.bincount(links.flatten(), minlength=count))[count // 2]
+    graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count))
+    group = connected_components(graph, directed=False)[1]
+    largest = np.bincount(group).argmax()
+    apart = [name for name, one in zip(names, group, strict=True) if one != largest]
+    found = f"each photograph matches {usual} others in the median"
+    if not apart:
+        yield ok("overlap", f"{found}, all of them connected")
+        return
+    yield warned(
+        "overlap",
+        f"{found}; {len(apart)} of {count} are not connected with the rest: {some(apart, 4)}",
+        "two neighbours each, and one connected group",
+        "Take photographs in between, 10 to 15 degrees apart. This is a quick look at small "
+        "copies: a run may still connect them.",
+    )
 
 
 def light_variation(

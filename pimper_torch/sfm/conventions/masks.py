@@ -1,4 +1,4 @@
-"""Masks drawn on the pixels that files store, beside photographs that EXIF turns.
+"""Masks that show the object dark, and those drawn on the pixels that files store.
 
 A program that does not know EXIF shows, and draws on, the pixels as the file has them. Sizes tell
 that of a quarter turn; of a half turn, and of square photographs, outlines do: a mask that lies
@@ -13,9 +13,34 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from pimper_torch.errors import caution
+from pimper_torch.mapped import each
 from pimper_torch.sfm.conventions.choice import ERRORS
 
 _APART = 8  # pixels along an outline that are told apart: a choice
+# Masks are turned round where more than the rest of it is bright at the border, and less inside.
+_TELLING = 0.25
+
+
+def object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: str) -> bool:
+    """Return whether masks show the object dark, by all of them together; a warning says so."""
+    border, centre = [], []
+    for (opacity,) in each(opacities):
+        high, wide = opacity.shape
+        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
+        border.append(opacity[:, -1].mean())
+        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
+        centre.append(inner.mean())
+    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    # An object that fills its photographs is bright in the centre, too.
+    dark = fractions[0] > 1 - _TELLING and fractions[1] < 1 - _TELLING
+    if dark:
+        caution(
+            f"{where}: the masks are bright along {fractions[0]:.0%} of the border and "
+            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
+            "`--mask-object bright` says that it is not.",
+            stacklevel=4,
+        )
+    return dark
 
 
 def drawn_as_stored(

@@ -1,14 +1,23 @@
-"""Checks of photographs one by one: number, size, blur, exposure, lens."""
+"""Checks of photographs before a run: of each alone, and of what all show in common."""
 
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from statistics import median
 
+from pimper_torch.doctor.cost import cost
 from pimper_torch.doctor.findings import Finding, ok, warned
-from pimper_torch.doctor.photograph import Photograph
-from pimper_torch.errors import some
-from pimper_torch.io.photographs import MIN_PHOTOGRAPHS
+from pimper_torch.doctor.machine import available_gb
+from pimper_torch.doctor.pairs import light, match_copies, overlap, variations
+from pimper_torch.doctor.photograph import Photograph, of_views, read_all
+from pimper_torch.errors import InputError, some
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.file_cautions import find_cautions, responses_told
+from pimper_torch.io.header import Header
+from pimper_torch.io.photographs import MIN_PHOTOGRAPHS, list_images
+from pimper_torch.radiometry import FROM_FILES, Encoding
+from pimper_torch.records import Views
 from pimper_torch.sfm.lenses import group_lenses
 
 # Choices, all of them; 24 photographs of the demo and rendered scenes are within.
@@ -19,6 +28,46 @@ _SATURATED = 0.05
 _DARK = 0.05  # of saturation: in 8 bits of sRGB 63 levels are left
 _FEW_OF_A_LENS = 3  # with fewer, its focal length is hardly told from its distance
 _NAMED = 4  # photographs in a sentence
+
+
+def examine_folder(
+    folder: Path | str, encoding: Encoding = FROM_FILES, max_size_px: int = 0
+) -> list[Finding]:
+    """Examine the photographs of a folder, in seconds.
+
+    Args:
+        encoding: As of :func:`pimper_torch.io.photographs.load_views`.
+
+    Returns:
+        In the order of the checks: files, samples, number, blur, saturation, exposure, lenses,
+        overlap, light, cost.
+
+    Raises:
+        InputError: No such folder, or no images in it.
+    """
+    paths = list_images(folder)
+    read = read_all(paths, encoding, max_size_px)
+    photographs = [one for one in read if isinstance(one, Photograph)]
+    findings = [
+        Finding(check="files", severity="error", found=str(error).rstrip("."))
+        for error in read
+        if isinstance(error, InputError)
+    ]
+    matches = match_copies([one.small for one in photographs])
+    return [
+        *findings,
+        *samples(paths, encoding),
+        *each_alone(photographs),
+        *overlap([one.name for one in photographs], matches),
+        *light(variations(photographs, matches)),
+        *cost(photographs, available_gb()),
+    ]
+
+
+def examine_views(views: Views) -> list[Finding]:
+    """Examine photographs that were read, without comparing what they show."""
+    photographs = of_views(views)
+    return [*each_alone(photographs), *cost(photographs, available_gb())]
 
 
 def each_alone(photographs: Sequence[Photograph]) -> list[Finding]:
@@ -136,3 +185,32 @@ def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
         yield warned("lenses", f"{what}: {told}", "EXIF with the focal length", advice, "note")
     else:
         yield Finding(check="lenses", severity="note" if several else "ok", found=f"{what}: {told}")
+
+
+def samples(paths: Sequence[Path | str], encoding: Encoding) -> Iterator[Finding]:
+    """Report the response of the files that can be read, and warn of what is not followed."""
+    read = [(path, header) for path in paths if (header := _header(path)) is not None]
+    if not read:
+        return
+    named, headers = zip(*read, strict=True)
+    cautions = find_cautions(named, headers, encoding)
+    for sentence, names in cautions.items():
+        yield Finding(
+            check="samples",
+            severity="warning",
+            found=f"{len(names)} of {len(headers)} photographs ({some(names, 4)}): {sentence}",
+        )
+    if not cautions:
+        given = encoding.response
+        taken = f"{given}, as given"
+        if given == "auto":
+            counts = responses_told(headers)
+            taken = "; ".join(f"{what} ({count})" for what, count in counts.items())
+        yield ok("samples", f"response {taken}")
+
+
+def _header(path: Path | str) -> Header | None:
+    try:
+        return read_header(path)
+    except InputError:
+        return None
