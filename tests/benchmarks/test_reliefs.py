@@ -1,9 +1,8 @@
 import pytest
 import torch
+from one_view import photograph, point_lights
 from reliefs import ball, bumps, bumps_in_perspective, regions
 from torch.testing import assert_close
-
-from pimper_torch.evidence.scenes.render_in_memory import photograph, point_lights
 
 
 @pytest.fixture
