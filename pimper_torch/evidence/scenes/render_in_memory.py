@@ -117,6 +117,9 @@ class RenderedScene(Record):
     mesh: Mesh | None = None
 
 
+_MAPS = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
+
+
 def render_shape(
     shape: Shape, cameras: Cameras, lights_world: Float[Tensor, "view 4"], texture: Texture
 ) -> RenderedScene:
@@ -181,12 +184,7 @@ def render_objects(
         views=_views(torch.stack([frame.image for frame in frames]), cameras),
         cameras=cameras,
         lights_world=lights.harmonics_world(cameras.centers_world),
-        depth=torch.stack([frame.depth for frame in frames]),
-        normals_world=torch.stack([frame.normals_world for frame in frames]),
-        albedo=torch.stack([frame.albedo for frame in frames]),
-        foreground=torch.stack([frame.foreground for frame in frames]),
-        lit=torch.stack([frame.lit for frame in frames]),
-        highlight=torch.stack([frame.highlight for frame in frames]),
+        **{name: torch.stack([getattr(frame, name) for frame in frames]) for name in _MAPS},
         mesh=stage.mesh,
     )
 

@@ -161,20 +161,12 @@ def distance_to_fit(
 def aim_to_fit(
     toward_world: Float[Tensor, "view 3"],
     points_world: Float[Tensor, "point 3"],
-    *,
-    focal_px: float,
-    width: float,
-    height: float,
-    fill: float,
+    **picture: float,
 ) -> tuple[Float[Tensor, " 3"], float]:
     """Find what cameras look at, and from how far, to show all points as large as can be.
 
     Args:
-        toward_world: Unit, from the target to the cameras.
-        fill: Fraction of the picture, along its tighter side, that the points may take.
-
-    Returns:
-        The target, and the distance of :func:`distance_to_fit`.
+        picture: As of :func:`distance_to_fit`.
     """
     hull = points_world[torch.from_numpy(ConvexHull(points_world.numpy()).vertices).long()]
 
@@ -182,15 +174,7 @@ def aim_to_fit(
     mean_toward = toward_world.mean(dim=0)
 
     def distance(target: Float[Tensor, " 3"]) -> float:
-        return distance_to_fit(
-            toward_world,
-            hull,
-            target,
-            focal_px=focal_px,
-            width=width,
-            height=height,
-            fill=fill,
-        )
+        return distance_to_fit(toward_world, hull, target, **picture)
 
     def farness(values: np.ndarray) -> float:
         # How far the cameras are from the object's centre: their distance from the target

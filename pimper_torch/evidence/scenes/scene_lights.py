@@ -194,14 +194,7 @@ def wandering_lights(
     across = rotation.cos()[:, None] * aside[0] + rotation.sin()[:, None] * aside[1]
     direction = cosine[:, None] * axis + sine[:, None] * across
     target_world = torch.tensor(target, dtype=torch.float64)
-    return Lights(
-        positions_world=target_world
-        + (distance * _about_one(num_views, generator))[:, None] * direction,
-        irradiance=irradiance * _about_one(num_views, generator),
-        ambient=ambient * _about_one(num_views, generator),
-        target_world=target_world,
-        flash=torch.full((num_views,), flash, dtype=torch.float64),
-    )
+    return _placed(direction, target_world, generator, distance, (irradiance, ambient, flash))
 
 
 def lights_round(
@@ -237,9 +230,24 @@ def lights_round(
     sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     cosine = (1 - sine**2).sqrt()
     direction = torch.stack([cosine * rotation.sin(), -cosine * rotation.cos(), sine], dim=-1)
+    strengths = irradiance, ambient, flash
+    return _placed(direction, target, generator, distance, strengths, _FAR if far else 1.0)
+
+
+def _placed(
+    direction: Float[Tensor, "view 3"],
+    target: Float[Tensor, " 3"],
+    generator: torch.Generator,
+    distance: float,
+    strengths: tuple[float, float, float],
+    farther: float = 1.0,
+) -> Lights:
+    """Draw distances and strengths of point lights, up to a quarter less or more."""
+    count = len(direction)
     away = distance * _about_one(count, generator)
+    irradiance, ambient, flash = strengths
     return Lights(
-        positions_world=target + (_FAR if far else 1) * away[:, None] * direction,
+        positions_world=target + farther * away[:, None] * direction,
         irradiance=irradiance * _about_one(count, generator),
         ambient=ambient * _about_one(count, generator),
         target_world=target,
