@@ -121,9 +121,8 @@ class Stage:
         """Return the radiance that reaches the eye.
 
         Args:
-            eye: Where it is, or where each ray comes from.
-            flash: Where the flash is, and casts shadows from; by default at the eye, which sees
-                none of them.
+            eye: Its position, or the origin of each ray.
+            flash: Position of the flash, which then casts shadows; by default the eye.
             bounces: Of conductors that mirror one another.
         """
         specular, roughness = (
@@ -223,16 +222,15 @@ _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Frame(Record):
-    """A photograph that no camera took, and what the rays through its pixels' centres meet.
+    """A photograph, and the intersections of the rays through its pixels' centres.
 
     Attributes:
         depth: Along the camera's z; infinite where the ray meets nothing.
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
         lit: True where the point light reaches the surface.
-        highlight: True where a highlight adds noticeably to the matte part: a hundredth of
-            saturation or more, and a twentieth of the matte part. So does all that a conductor
-            mirrors.
+        highlight: True where the mirrored part is a hundredth of saturation or more, and a
+            twentieth of the matte part.
     """
 
     image: Float[Tensor, "channel height width"]

@@ -88,21 +88,13 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RenderedScene(Record):
-    """Photographs that no camera took, and everything they were computed from.
-
-    Per-view maps hold what the ray through each pixel's centre meets first.
+    """Photographs in memory, and their truth; maps are as of :class:`.Frame`, one a view.
 
     Attributes:
-        lights_world: First-order light ``l`` at the object: radiance is
-            albedo * l . (1, n). Exact for closed-form scenes; for ray-traced ones the
-            light at the target, without fall-off, shadows and highlights.
-        depth: Along the camera's z; infinite where the ray meets nothing.
-        normals_world: Unit, outward; zero where the ray meets nothing.
-        albedo: Linear; zero where the ray meets nothing.
-        foreground: True on the object, false on the table and the background.
-        lit: True where the point light reaches the surface.
-        highlight: True where a highlight adds noticeably to the matte part.
-        mesh: What was ray traced; ``None`` for closed forms.
+        lights_world: First-order light ``l`` at the object: radiance is albedo * l . (1, n). Exact
+            for closed-form scenes; for ray-traced ones the light at the target, without
+            fall-off, shadows and highlights.
+        mesh: The ray-traced one; ``None`` for closed forms.
     """
 
     views: Views
@@ -166,13 +158,9 @@ def render_objects(
     generator: torch.Generator,
     sensor: SensorConfig | None = None,
 ) -> RenderedScene:
-    """Ray trace meshes under point lights, all photographs in memory; float32.
+    """Ray trace meshes under point lights, all photographs in memory, of one size; float32.
 
-    Light falls off with the square of the distance and is stopped by every object; highlights
-    are those of :mod:`pimper_torch.evidence.scenes.scene_object`.
-
-    Args:
-        objects: Those that are no surroundings are the foreground.
+    Light falls off with the square of the distance and is stopped by every object.
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = Stage(objects)
@@ -217,11 +205,11 @@ def potato_on_table(
 ) -> RenderedScene:
     """Photograph a bumpy, textured potato under a point light that moves between photographs.
 
-    The point light is two to three times the potato's length away, so its light falls off over
-    the object, and the potato shadows itself and the table.
+    The point light is two to three times the potato's length away, so that its light falls off over
+    the object.
 
     Args:
-        seed: Decides form, texture, lights and noise.
+        seed: Of form, texture, lights and noise.
         num_views: On an arc at about 35 degrees over the table.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -100,7 +100,7 @@ def render_scene(
     processes: int = 2,
     overwrite: bool = False,
 ) -> Path:
-    """Photograph a scene, and write photographs and truth to a folder.
+    """Photograph a scene, and write photographs and truth to a new or empty folder, and return it.
 
     The folder is written whole or not at all; :mod:`.rendered_folder` lists its contents. The same
     settings give the same files, whatever the number of processes.
@@ -108,12 +108,8 @@ def render_scene(
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file.
-        folder: New or empty; its parents are made.
-        processes: That render at the same time. More than 1 start Python anew, so that a
-            script that calls this must guard its top level by ``__name__ == "__main__"``.
-
-    Returns:
-        The folder.
+        processes: More than 1 start Python anew, so that a script that calls this must guard its
+            top level by ``__name__ == "__main__"``.
 
     Raises:
         InputError: No such scene, or a mesh that cannot be read.

@@ -62,16 +62,15 @@ def arc_cameras(
     front: tuple[float, float, float] = (0.0, 0.0, 1.0),
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Cameras:
-    """Walk round a target on an arc, looking at it; float64.
+    """Place cameras on an arc round a target, looking at it; float64.
 
     The defaults face flat shapes such as :class:`.Plane` from above.
 
     Args:
         span_deg: From the first camera to the last, about ``up``.
         elevation_deg: Mean height of the arc over the plane across ``up``.
-        sway_deg: How far the elevation goes up and down on the way.
+        sway_deg: Amplitude of the elevation along the arc.
         front: Towards the centre of the arc; must be across ``up``.
-        up: Axis of the arc, and up in the photographs.
     """
     toward_world = arc_directions(
         num_views,
@@ -116,13 +115,11 @@ def turntable_directions(num_views: int, *, elevation_deg: float) -> Float[Tenso
 def handheld_directions(
     num_views: int, generator: torch.Generator, *, elevation_deg: float
 ) -> Float[Tensor, "view 3"]:
-    """Walk once round the object for each of three heights, as steadily as a hand is.
+    """Return directions once round the object at each of three heights, as steady as a hand.
 
     Args:
-        num_views: Shared out between the rounds: the first third goes at the middle height,
-            then higher, then lower.
-        elevation_deg: Of the middle round; the others are 18 degrees higher and 14
-            lower, none below 8 and above 75.
+        elevation_deg: Of the first third; then 18 degrees higher, then 14 lower, none below 8 and
+            above 75.
     """
     third = torch.arange(num_views) * 3 // num_views
     within = torch.bincount(third, minlength=3)[third]

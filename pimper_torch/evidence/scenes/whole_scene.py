@@ -141,9 +141,9 @@ class Scene:
     Attributes:
         name: Of the object, or the path of its mesh.
         objects: At rest in the world: the object's first, then its table, if that turns along.
-        fixed: Objects that are at rest while the object turns or is turned over, in the frame of
-            :mod:`pimper_torch.evidence.scenes.whole_scene`.
-        world_from_room: Where that frame is in each photograph.
+        fixed: Objects that are at rest while the object turns or is turned over, in the room's
+            frame: z up from the table's plane, origin on the turntable's axis, camera at -y.
+        world_from_room: Of each photograph.
     """
 
     name: str
@@ -197,8 +197,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
-            file, which is scaled to the size of the others. Its vertex colours are its texture;
-            without any it gets one. Its normals are those of its faces, averaged at the vertices.
+            file, which is scaled to the size of the others. Its vertex colours are its texture.
 
     Raises:
         InputError: No such scene and no such file, or a mesh that has no surface.
