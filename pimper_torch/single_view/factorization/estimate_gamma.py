@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
@@ -172,9 +172,6 @@ _MAX_SAMPLES = 300
 
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
-# Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
-# (Holland & Welsch, 1977).
-_CAUCHY = 2.385
 
 # The estimate is checked without these fractions of the entries, the darkest: a choice.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
@@ -183,9 +180,6 @@ _MIN_FREE = 100
 # Difference from the estimate of the brighter entries, in its standard errors, above which the
 # standard error grows, and above which the brighter entries replace the estimate: choices.
 _SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
-
-# Selections of entries by the fit; the first still starts from a selection by noisy values.
-_CHOICES = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -266,7 +260,7 @@ def estimate_gamma(
         )
     with torch.no_grad():
         problem = _problem(encoded, seen, rank)
-        for _ in range(_CHOICES):
+        for _ in range(2):  # the first still starts from a selection by noisy values
             problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
         return _estimate_of(_consistent_minimum(problem))
 
@@ -357,7 +351,9 @@ def _chosen_by_fit(
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used
     residual = (encoded - predicted)[used]
-    scale = _CAUCHY * float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
+    scale = CAUCHY_TUNING * float(
+        robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool))
+    )
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
@@ -412,17 +408,11 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
     for position, estimate in enumerate(found):
-        subsets = [brighter for brighter in found[position + 1 :] if brighter.inner]
-        differences = [abs(brighter.gamma - estimate.gamma) for brighter in subsets]
-        consistent = [
-            each <= _MAX_ERRORS * brighter.error + _ROUNDING * estimate.gamma
-            for each, brighter in zip(differences, subsets, strict=True)
-        ]
-        if all(consistent):
-            excess = [
-                each - _SUSPECT_ERRORS * brighter.error
-                for each, brighter in zip(differences, subsets, strict=True)
-            ]
+        brighter = [one for one in found[position + 1 :] if one.inner]
+        apart = [(abs(one.gamma - estimate.gamma), one.error) for one in brighter]
+        rounding = _ROUNDING * estimate.gamma
+        if all(gap <= _MAX_ERRORS * error + rounding for gap, error in apart):
+            excess = [gap - _SUSPECT_ERRORS * error for gap, error in apart]
             return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
     raise AssertionError("nothing contradicts the last estimate")
 
