@@ -16,11 +16,11 @@ import time
 from collections.abc import Callable
 
 import torch
+from one_view import OneView, photograph, point_lights
 from reliefs import align_reliefs, ball, bumps, bumps_in_perspective, regions
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.render_in_memory import OneView, photograph, point_lights
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,

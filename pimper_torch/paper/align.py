@@ -27,17 +27,10 @@ from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Re
 from pimper_torch.stage import Stage
 
 # Height fields this close, in edge lengths, agree.
-SAME_PLACE = 5e-3
+_SAME_PLACE = 5e-3
 
-# A seam that fewer rays than this fraction meet says nothing of its patches.
+# A seam that fewer rays than this fraction meet is ignored.
 _MET_ENOUGH = 0.25
-
-
-def common_distance(
-    distance: Float[Tensor, "*sample"], met: Bool[Tensor, "*sample"]
-) -> Float[Tensor, ""]:
-    """Return the distance that half of all samples stay below, at least ``SAME_PLACE``."""
-    return distance[met].median().clamp_min(SAME_PLACE)
 
 
 def patch_status(
@@ -318,13 +311,11 @@ def _curvature_terms(
 
 
 def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
-    """Estimate by how much one height field is off, from how far two are apart."""
+    """Estimate the error of one height field from the median distance of two."""
     met = pulls.weight > 0
-    return (
-        common_distance(distance, met) / 2**0.5
-        if bool(met.any())
-        else torch.ones_like(distance.sum())
-    )
+    if not bool(met.any()):
+        return torch.ones_like(distance.sum())
+    return distance[met].median().clamp_min(_SAME_PLACE) / 2**0.5
 
 
 def _with_scales_held(pulls: Pulls) -> Pulls:

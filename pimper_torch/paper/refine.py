@@ -24,7 +24,7 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.linalg.sums import average
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.records import Convergence, DepthPatches, Record, StopCause, Surface
+from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.stage import Stage
 
 # Fidelity, as a fraction of the usual, that ties what no patch supports to the flat facets: it
@@ -48,27 +48,16 @@ def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
     return (barycentric - barycentric.roll(1, dims=-1)).abs().sum(dim=-1).sqrt() / 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class System(Record):
-    """Normal equations ``(M + L) S = M (union)``.
-
-    Attributes:
-        rows: Of the entries of ``M + L``; entries named twice add up.
-        values: The entries, float64; symmetric and positive definite.
-    """
-
-    rows: Int[Tensor, " entry"]
-    cols: Int[Tensor, " entry"]
-    values: Float[Tensor, " entry"]
-    mass: Float[Tensor, " vertex"]
-
-
 def assemble(
     subdivision: Subdivision,
     fidelity: Float[Tensor, " facet"],
     supported: Bool[Tensor, " vertex"],
-) -> System:
-    """Assemble the normal equations of the energy; constant to autograd.
+) -> tuple[
+    Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"], Float[Tensor, " vertex"]
+]:
+    """Return the entries of ``M + L``, duplicates included, and the diagonal of ``M``; float64.
+
+    The normal equations of the energy are ``(M + L) S = M (union)``. Constant to autograd.
 
     Args:
         fidelity: Lambda of each facet, 1/length^2.
@@ -81,12 +70,8 @@ def assemble(
     seams = weights[subdivision.faces].mean(dim=1)
     rows, cols, values = cotangent_laplacian(mesh, seams, _MIN_SHAPE)
     diagonal = torch.arange(mesh.count, device=mass.device)
-    return System(
-        rows=torch.cat([rows, diagonal]),
-        cols=torch.cat([cols, diagonal]),
-        values=torch.cat([values, mass]),
-        mass=mass,
-    )
+    rows, cols = torch.cat([rows, diagonal]), torch.cat([cols, diagonal])
+    return rows, cols, torch.cat([values, mass]), mass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,9 +157,9 @@ def smooth_seams(
         radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
     """
     fidelity = (radius * spacing.double()) ** -2
-    system = assemble(subdivision, fidelity, supported)
-    rhs = system.mass[:, None] * points.double()
-    (found,) = solutions(system.rows, system.cols, system.values, rhs, what="the refinement")
+    rows, cols, values, mass = assemble(subdivision, fidelity, supported)
+    rhs = mass[:, None] * points.double()
+    (found,) = solutions(rows, cols, values, rhs, what="the refinement")
     return found
 
 

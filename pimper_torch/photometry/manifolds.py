@@ -39,7 +39,7 @@ class Manifold(Protocol):
         """Map the end of a small step along the tangents back to the manifold."""
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the tangent space at each column: by albedo, then by two rotations of the normal."""
+        """Span the tangent space at each column."""
 
     def curvature(
         self,
@@ -55,16 +55,6 @@ class Manifold(Protocol):
         self, shading: Float[Tensor, "*batch rank"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Return albedo and unit normal of the vectors."""
-
-    def join(
-        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch rank"]:
-        """Return the vectors of albedo and normal."""
-
-    def normal_prior(
-        self, normals: Float[Tensor, "*batch 3 sample"]
-    ) -> Float[Tensor, "*batch packed sample"]:
-        """Return the quadratic penalty on the distance from known normals, packed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,7 @@
 import torch
+from one_view import photograph, point_lights
 from reliefs import ball, bumps, bumps_in_perspective, regions
 from torch.testing import assert_close
-
-from pimper_torch.evidence.scenes.render_in_memory import photograph, point_lights
 
 
 def test_normals_face_the_viewer_and_bulge_where_the_ball_does():

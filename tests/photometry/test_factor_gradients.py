@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.quadratics import outer
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import Free
@@ -24,7 +25,11 @@ def noisy(generator):
 
         normals = normalize(draw(patches, samples, 3), dim=-1)
         albedo = 0.6 + 0.2 * draw(patches, samples).abs()
-        shading = manifold.join(albedo, normals).mT
+        if isinstance(manifold, Free):
+            shading = (albedo[..., None] * normals).mT
+            prior = torch.tensor([1.0, 0, 0, 1, 0, 1]).double()[:, None] - outer(normals.mT)
+        else:
+            shading, prior = manifold.join(albedo, normals).mT, manifold.normal_prior(normals.mT)
         lights = draw(patches, views, manifold.rank)
         weight = (torch.rand(patches, views, samples, generator=generator) > 0.15).double()
         return Bilinear(
@@ -34,7 +39,7 @@ def noisy(generator):
             anchor=lights + 0.05 * draw(*lights.shape),
             shading=shading,
             regularization=torch.full((patches, views), 2.0, dtype=torch.float64),
-            prior=0.5 * manifold.normal_prior(normals.mT),
+            prior=0.5 * prior,
             manifold=manifold,
             loss=loss or Squares(),
         )

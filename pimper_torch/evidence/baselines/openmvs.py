@@ -147,10 +147,8 @@ def _run_all(found: dict[str, Path], folder: Path) -> Mesh:
 def run_program(command: Sequence[Path | str], folder: Path, deadline: float, threads: int) -> str:
     """Run a program in a folder, without a shell, and return its output, which is kept there too.
 
-    The program and its children are stopped at the deadline or when we are interrupted.
-
-    Args:
-        deadline: Of ``time.monotonic()``.
+    The program and its children are stopped at the deadline (of ``time.monotonic()``) or when we
+    are interrupted.
     """
     name = Path(command[0]).name
     with tempfile.NamedTemporaryFile(

@@ -107,7 +107,7 @@ class Inputs(Record):
         scene: Cameras and cloud, found or true, and the photographs.
         coarse: Facets for the baselines that start from some; of the default preset.
         capture: The truth, without photographs and maps.
-        maps: Of the methods' reference view alone, for those of all fill the memory.
+        maps: The truth in the methods' reference view alone; those of all views fill the memory.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
 
@@ -120,11 +120,7 @@ class Inputs(Record):
 
 
 def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
-    """Render a scene, or give the folder that `pimper render` wrote.
-
-    Args:
-        name: Of a rendered scene, or a folder with ``truth`` in it.
-    """
+    """Render a scene, or return the folder that `pimper render` wrote."""
     if (Path(name) / "truth").is_dir():
         return Path(name)
     folder = workspace / Path(name).stem
@@ -135,8 +131,7 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
     """Read a rendered scene and find its cameras, from the files as a user would.
 
     Args:
-        cache: Folder where models are kept; the seconds of one from there are those that it
-            took to find.
+        cache: Folder of models that were found before, with the seconds that they took.
     """
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
     if config.cameras == "true":
@@ -169,9 +164,8 @@ class Outcome(Record):
 
     Attributes:
         seconds: Wall clock without structure from motion.
-        mesh_points: Vertices of the coarse mesh; ``None`` for methods that use none.
         samples: Samples of all templates times views, missing ones included.
-        external: A program of its own did the work, whose memory is not this process's.
+        external: Whether another program did the work, in memory that is not this process's.
     """
 
     estimate: Estimate

@@ -79,12 +79,7 @@ def row_of_failure(scene: str, method: str, error: Exception, **known: int | flo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table(Record):
-    """All rows, and where and how they were measured.
-
-    Attributes:
-        rows: In the order they are shown.
-        settings: Whatever else decides the figures, as JSON can hold it.
-    """
+    """All rows, the machine, and settings that decide the figures."""
 
     rows: tuple[Row, ...]
     machine: Machine
@@ -226,10 +221,7 @@ def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
 
 
 def cell(value: int | float | None, decimals: int) -> str:
-    """Show a figure with so many decimals.
-
-    What is missing is a dash. What would be rounded to nothing but is more is said to be less
-    than the last digit: 0 is only shown for 0.
+    """Format a figure with so many decimals; a figure above 0 is never rounded to 0.
 
     >>> cell(1234.5, 1), cell(0.004, 2), cell(0.0, 2), cell(None, 2)
     ('1,234.5', '<0.01', '0.00', '–')
@@ -273,10 +265,7 @@ def _line(words: Sequence[str], layout: Sequence[tuple[int, bool]]) -> str:
 
 
 def terminal(table: Table) -> Group:
-    """Return tables no wider than the terminal, then why figures are missing.
-
-    A row without any figure of a table's kind is left out of that table.
-    """
+    """Return a table for each kind of figures, then why figures are missing."""
     parts: list[RenderableType] = []
     for title, shown in columns(table.rows).items():
         shown_rows = [row for row in table.rows if any(_is_known(one.value(row)) for one in shown)]

@@ -34,11 +34,7 @@ class Machine(Record):
 
     @property
     def summary(self) -> str:
-        """Return a summary in a line.
-
-        >>> this_machine().summary  # doctest: +SKIP
-        'AMD EPYC 7763, 2 cores, 23 GB; Linux; Python 3.11.7; pimper_torch 0.1.0, torch 2.13.0'
-        """
+        """The machine in a line."""
         cores = f"{self.cores} core{'s' if self.cores != 1 else ''}"
         hardware = [self.cpu, cores, f"{self.memory_gb:.0f} GB", *([self.gpu] if self.gpu else [])]
         return (
@@ -94,13 +90,11 @@ _RESET_PEAK = "5"  # see proc(5), clear_refs
 def peak_memory() -> Iterator[Callable[[], float | None]]:
     """Measure the peak of resident memory within the ``with`` block.
 
-    The operating system's own peak is of the whole life of a process, so that a frugal method
-    would inherit that of the one before. What was in use before counts, what external programs
-    use does not.
+    The operating system's own peak is of the whole life of a process. Memory in use before
+    counts, that of external programs does not.
 
     Yields:
-        A function that gives the peak since then in MB; ``None`` where the system, other than
-        Linux, cannot tell.
+        A function that returns the peak since then in MB; ``None`` on systems other than Linux.
     """
     try:
         (_SELF / "clear_refs").write_text(_RESET_PEAK, encoding="ascii")

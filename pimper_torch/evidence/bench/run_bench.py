@@ -65,6 +65,8 @@ def with_common(
 ) -> list[Row]:
     """Add figures over the pixels that all methods cover to the rows of a scene.
 
+    A method that leaves out difficult parts has small errors on the rest.
+
     Args:
         covered: True where rays of the view meet truth and method; ``None`` for methods
             without a surface, which limit no other.
@@ -115,11 +117,11 @@ ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
 def method_panels(
     mesh: Mesh, met: Meeting | None, inputs: Inputs, scene: str, method: str, heatmap: Path
 ) -> MethodPanels:
-    """Draw the errors of a surface on it, and give its pictures for the sheet.
+    """Draw the errors of a surface on it, and return its pictures for the sheet.
 
     Args:
         mesh: In the frame of the truth.
-        met: Where the rays of the reference view meet it; ``None`` if none does.
+        met: Of the rays of the reference view; ``None`` if none meets it.
     """
     truth = inputs.maps
     if met is None or truth.cameras is None:
@@ -153,9 +155,8 @@ def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> 
 def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
     """Return the distance of a surface from the truth along the rays of a view.
 
-    Returns:
-        Per cent of the diagonal of the true bounding box; infinite on the object where the
-        surface is missed, NaN off the object.
+    Per cent of the diagonal of the true bounding box; infinite on the object where the surface is
+    missed, NaN off the object.
     """
     assert capture.truth.mesh is not None
     error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
@@ -198,7 +199,7 @@ def run_bench(
     """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
 
     ==================  ===========================================================
-    file                what
+    file                content
     ==================  ===========================================================
     `table.md`          the table, beside the published figures
     `table.json`        the same with all digits, and why figures are missing

@@ -27,11 +27,12 @@ from pimper_torch.evidence.metrics.evaluation import (
     evaluate,
 )
 from pimper_torch.evidence.metrics.figure_rows import report, rows
+from pimper_torch.evidence.metrics.surface_distances import true_surface
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.files import file_written_whole, prepare_file
-from pimper_torch.records import Capture, DtuProtocol, Estimate, Mesh, Truth, Views
+from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
 from pimper_torch.report.page import HEAD
 from pimper_torch.viz.calibration import TITLE, draw_calibration
 
@@ -90,8 +91,8 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             "result with `expected_error` at its vertices, as `pimper reconstruct` writes it "
             "unless `fuse.error_draws` is 0."
         )
-    truth = read_truth(job, estimate, config)
-    evaluation = evaluate(estimate, truth.capture, config, maps=truth.maps, dtu=truth.protocol)
+    capture, maps, protocol = read_truth(job, estimate, config)
+    evaluation = evaluate(estimate, capture, config, maps=maps, dtu=protocol)
     relighting = read_relighting(job.result)
     if not output.as_json:
         show(evaluation, Console(), relighting)
@@ -103,7 +104,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         _draw(evaluation, job.calibration)
         output.remark(f"{job.calibration} is drawn.")
     if job.report is not None:
-        _write_page(evaluation, truth.capture.truth, job.result, job.report)
+        _write_page(evaluation, capture, job.result, job.report)
         output.remark(f"{job.report} shows the errors.")
     files = {"figures": job.out, "calibration": job.calibration, "report": job.report}
     paths = {name: path for name, path in files.items() if path is not None}
@@ -120,22 +121,10 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     return job
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TruthRead:
-    """What was read of a truth.
-
-    Attributes:
-        capture: All its views, perhaps without maps.
-        maps: The views to compare in, with maps; ``None`` where ``capture`` has them.
-    """
-
-    capture: Capture
-    maps: Capture | None = None
-    protocol: DtuProtocol | None = None
-
-
-def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRead:
-    """Read what the result is measured against.
+def read_truth(
+    job: Job, estimate: Estimate, config: EvaluateConfig
+) -> tuple[Capture, Capture | None, DtuProtocol | None]:
+    """Read the truth, the maps of the views to compare in, if it has none, and its protocol.
 
     Of a rendered scene no more maps are read than will be compared, so that memory does not
     grow with the number of its views.
@@ -149,21 +138,19 @@ def read_truth(job: Job, estimate: Estimate, config: EvaluateConfig) -> TruthRea
                 "wrote, a mesh file, or the layout of a data set (--truth-layout)."
             )
     if layout == "mesh":
-        return TruthRead(capture=mesh_capture(truth))
+        return mesh_capture(truth), None, None
     if layout == "rendered":
         bare = read_rendered(truth, maps=False, photographs=False)
         chosen = chosen_views(estimate, bare, config)
-        return TruthRead(capture=bare, maps=read_rendered(truth, views=chosen, photographs=False))
+        return bare, read_rendered(truth, views=chosen, photographs=False), None
     if layout == "diligent-mv":
-        return TruthRead(capture=named_as(read_diligent_mv(truth, lights=[1]), estimate))
+        return named_as(read_diligent_mv(truth, lights=[1]), estimate), None, None
     scan = job.scan
     if scan is None:
         raise InputError(f"{truth}: holds many scans; needed: --scan with the number of one.")
     capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
-    return TruthRead(
-        capture=named_as(capture, estimate),
-        protocol=read_dtu_protocol(truth, scan) if (truth / "ObsMask").is_dir() else None,
-    )
+    protocol = read_dtu_protocol(truth, scan) if (truth / "ObsMask").is_dir() else None
+    return named_as(capture, estimate), None, protocol
 
 
 def named_as(capture: Capture, estimate: Estimate) -> Capture:
@@ -174,15 +161,12 @@ def named_as(capture: Capture, estimate: Estimate) -> Capture:
     lights, or not at all, keeps its name.
     """
     positions = [_position_in(name) for name in estimate.names]
-    known = {
+    known: dict[int | None, str] = {
         position: name
         for position, name in zip(positions, estimate.names, strict=True)
         if position is not None and positions.count(position) == 1
     }
-    theirs = [(_position_in(name), name) for name in capture.views.names]
-    names = tuple(
-        name if position is None else known.get(position, name) for position, name in theirs
-    )
+    names = tuple(known.get(_position_in(name), name) for name in capture.views.names)
     return capture.replace(views=capture.views.replace(names=names))
 
 
@@ -283,22 +267,16 @@ def _draw(evaluation: Evaluation, path: Path) -> None:
         )
 
 
-def _write_page(evaluation: Evaluation, truth: Truth, result: Path, path: Path) -> None:
+def _write_page(evaluation: Evaluation, capture: Capture, result: Path, path: Path) -> None:
     """Write the page of a result with its errors, whole or not at all."""
-    mesh = truth.mesh
-    if mesh is None and truth.points_world is not None:
-        mesh = Mesh(vertices_world=truth.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
-    if mesh is None:
-        raise InputError("the truth has no surface, so there are no errors to show.")
+    mesh = true_surface(capture)
     with file_written_whole(path) as fresh:
         write_compared_page(result, mesh, evaluation.alignment.truth_from_world, fresh)
 
 
 def _prepare_files(job: Job) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace."""
-    if job.out is not None:
-        prepare_file(job.out, job.overwrite, f'"format": "{FORMAT}"')
-    if job.calibration is not None:
-        prepare_file(job.calibration, job.overwrite, TITLE)
-    if job.report is not None:
-        prepare_file(job.report, job.overwrite, HEAD)
+    marks = {job.out: f'"format": "{FORMAT}"', job.calibration: TITLE, job.report: HEAD}
+    for path, mark in marks.items():
+        if path is not None:
+            prepare_file(path, job.overwrite, mark)

@@ -15,31 +15,12 @@ from pimper_torch.reporting import stage
 
 _DEFAULT = SceneConfig()
 # Left to --help-all.
-_RARE = tuple(
-    f"--{name}"
-    for name in [
-        *(
-            "processes",
-            "lights-per-pose",
-            "elevation-deg",
-            "sway-deg",
-            "fill",
-            "no-fixed-point-light",
-        ),
-        *("no-fixed-room", "no-fixed-table", "no-constant-light", "no-turned-over"),
-        *("pan-jitter-px", "crop-jitter-px", "point-light-distance", "irradiance"),
-        *(
-            "flash",
-            "window",
-            "lamp-colour",
-            "read-noise",
-            "shot-noise",
-            "supersample",
-            "up",
-            "rotation-deg",
-        ),
-    ]
-)
+_RARE_NAMES = """
+processes lights-per-pose elevation-deg sway-deg fill no-fixed-point-light no-fixed-room
+no-fixed-table no-constant-light no-turned-over pan-jitter-px crop-jitter-px point-light-distance
+irradiance flash window lamp-colour read-noise shot-noise supersample up rotation-deg
+"""
+_RARE = tuple(f"--{name}" for name in _RARE_NAMES.split())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,19 +15,19 @@ from pimper_torch.evidence.metrics.similarity import (
     similarity_between_points,
     split_similarity,
 )
+from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
 from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project, triangulate_rays
-from pimper_torch.records import Cameras, Record
+from pimper_torch.records import Cameras, Mesh, Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFigures(Record):
-    """Angles between the directions of lights, in degrees.
+    """Angles between the directions of lights that both have, in degrees.
 
     Attributes:
         mean_deg: In the frame of the truth, after the estimate was aligned.
         mean_rotated_deg: Up to the one rotation of all lights that brings them nearest.
-        lights: How many have a direction in both.
     """
 
     mean_deg: float
@@ -45,10 +45,9 @@ def compare_lights(
 ) -> LightFigures | None:
     """Compare the directions of first-order lights, as they are and up to a rotation.
 
-    Uncalibrated methods leave a rotation of all lights and normals together open, and normals
-    are often compared after it; both figures are given. The rotation minimises the summed
-    squares of the distances between unit directions. Two lights or fewer, or lights in a
-    plane with the origin, are brought nearer by it than they deserve.
+    Uncalibrated methods leave a rotation of all lights and normals together free. The one here
+    minimises the summed squares of the distances between unit directions; two lights or fewer, or
+    lights in a plane with the origin, are aligned more closely than they deserve.
 
     Args:
         lights: World frame of the estimate; rows that are zero or not finite are unknown.
@@ -81,25 +80,25 @@ def compare_lights(
 # Rays that make a point, and points that make a figure.
 _FEWEST_RAYS, _FEWEST_PLACES = 3, 10
 
+# Points of the true surface, about, whose positions are compared.
+_PLACES = 2000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFigures(Record):
     """Errors of cameras, over the views that have one in both.
 
     Attributes:
-        views: How many photographs there are in the truth.
-        missing: How many of them the estimate has no camera for.
+        views: Photographs in the truth.
+        missing: Photographs without a camera in the estimate.
         mean_center: Distance between the cameras' positions, scene units of the truth.
         mean_center_percent: Of each true camera's distance from the object's centre; NaN
             where the object is unknown.
-        mean_center_percent_of_diagonal: Of the object's bounding box; NaN the same.
-        mean_focal_percent: Of the focal length, absolute; images of unlike size are taken
-            for resized ones.
-        mean_position_percent: How far off the object's points are put when each is where our
-            cameras' rays through its true pixels meet, of the diagonal: no surface made with
-            these cameras is nearer, but by chance. NaN where the object is unknown.
-        mean_bend_percent: The same once the points themselves were brought together: what
-            another alignment cannot repair.
+        mean_focal_percent: Of the focal length, absolute, relative to the image's longer side.
+        mean_position_percent: Distance of the object's points from the intersections of our
+            cameras' rays through their true pixels, of the diagonal: the best that a surface made
+            with these cameras can be. NaN where the object is unknown.
+        mean_bend_percent: The same after the points were aligned by a similarity.
     """
 
     views: int
@@ -121,16 +120,15 @@ def compare_cameras(
     truth_from_world: Float[Tensor, "4 4"],
     *,
     views: int,
-    centre: Float[Tensor, " 3"] | None = None,
-    diagonal: float | None = None,
-    points_true: Float[Tensor, "point 3"] | None = None,
+    surface: Mesh | None = None,
 ) -> CameraFigures:
     """Compare cameras after a similarity carried ours to the frame of the truth.
 
     Args:
         truth: The same views in the same order.
         truth_from_world: Similarity; on these cameras, for the usual figure.
-        views: How many photographs there are in all.
+        views: Number of all photographs.
+        surface: The true one; vertices alone of a cloud.
     """
     truth_from_ours = truth_from_world.double().cpu()
     _, rotation = split_similarity(truth_from_ours)
@@ -140,13 +138,14 @@ def compare_cameras(
     between = truth.cam_from_world[:, :3, :3].double().cpu() @ rotated.mT
     angles = rotation_angles_deg(between)
     offset = (centers - centers_true).norm(dim=1)
-    away = torch.full_like(offset, torch.nan)
-    if centre is not None:
-        away = (centers_true - centre.to(centers_true)).norm(dim=1)
+    away, diagonal = torch.full_like(offset, torch.nan), math.nan
     focal = _focal(ours) / _focal(truth) - 1
     position, bend = math.nan, math.nan
-    if points_true is not None and diagonal:
-        found, right = _positions(ours, truth, points_true.double().cpu())
+    if surface is not None:
+        corners = surface.vertices_world.double().cpu()
+        centre = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
+        away, diagonal = (centers_true - centre).norm(dim=1), bounding_diagonal(surface)
+        found, right = _positions(ours, truth, corners[:: max(1, len(corners) // _PLACES)])
         if len(found) >= _FEWEST_PLACES:
             fitted = similarity_between_points(found, right)
             position, bend = (
@@ -161,7 +160,7 @@ def compare_cameras(
         mean_center=float(offset.mean()),
         median_center=float(offset.median()),
         mean_center_percent=float((100 * offset / away).mean()),
-        mean_center_percent_of_diagonal=float(100 * offset.mean() / (diagonal or torch.nan)),
+        mean_center_percent_of_diagonal=float(100 * offset.mean() / diagonal),
         mean_focal_percent=float(100 * focal.abs().mean()),
         mean_position_percent=position,
         mean_bend_percent=bend,

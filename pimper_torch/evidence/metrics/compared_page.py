@@ -30,7 +30,7 @@ def write_compared_page(
     """Write the page of a result with layers of its errors.
 
     Args:
-        truth: A mesh, or points without faces, which tell no normals.
+        truth: A mesh, or points without faces, which have no normals.
 
     Raises:
         InputError: The folder is no result, or its photographs are gone.

@@ -21,11 +21,7 @@ def thin(
 ) -> Int[Tensor, " kept"]:
     """Visit points in random order; keep each that no kept point is within ``distance`` of.
 
-    Exactly what visiting one by one gives, done in batches: a batch is first cleared of what
-    earlier points forbid, then settled among itself.
-
-    Args:
-        distance: Two kept points are farther apart than this.
+    Done in batches: earlier points remove some of a batch, which is then settled among itself.
 
     Returns:
         Indices of the kept points, in the order they were visited.
@@ -84,10 +80,9 @@ class DtuFigures(Record):
         mean_accuracy: From the result to the scan, inside the observability mask.
         mean_completeness: From the scan above the table to the result.
         points: Of the result after thinning.
-        evaluated: Of these, inside the mask.
+        evaluated: Points of the result inside the mask.
         evaluated_true: Points of the scan above the table.
-        capped_fraction: Fraction of the evaluated points left out of accuracy, 20 mm off or more.
-        capped_fraction_true: Fraction of the scan's left out of completeness.
+        capped_fraction: Fraction of the evaluated points 20 mm off or more, which are left out.
     """
 
     mean_accuracy: float
@@ -108,19 +103,17 @@ def dtu_figures(
     protocol: DtuProtocol,
     generator: torch.Generator,
 ) -> DtuFigures:
-    """Judge a result by the protocol.
+    """Evaluate a result by the protocol.
 
-    The vertices, and points on the faces at about the density that follows, are thinned in
-    random order until no two are within 0.2 mm. Distances are between points. Accuracy is
-    over the result's points whose nearest voxel of the observability mask is set;
-    completeness over the scan's points above the plane of the table, to all of the
-    result's. Distances of 20 mm and more count in neither, and neither do points outside
-    the cells that the code lays on the bounding box.
+    The vertices, and points on the faces, are thinned in random order until no two are within
+    0.2 mm. Distances are between points. Accuracy is over the result's points whose nearest voxel
+    of the observability mask is set; completeness over the scan's points above the plane of the
+    table. Distances of 20 mm and more count in neither, and neither do points outside the cells
+    that the code lays on the bounding box.
 
     Args:
         mesh: In the frame of the set, millimetres.
         scan: The set's own points, thinned already.
-        generator: On the CPU; the published code draws without a seed.
 
     Raises:
         InputError: No point of the result is inside the mask and near the scan, or no point
@@ -170,11 +163,11 @@ def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Te
 
 
 def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
-    """Return the vertices, and a subdivided mesh on each face about ``distance`` apart.
+    """Return the vertices, and the published grid on each face about ``distance`` apart.
 
-    The subdivided mesh is the published one: with edges ``v1, v2`` of twice-area ``A``, it has
-    ``n_i = floor(|v_i| / (distance sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at
-    half steps. A face too small for a step has its vertices only.
+    With edges ``v1, v2`` of twice-area ``A``, it has ``n_i = floor(|v_i| / (distance
+    sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at half steps. A face too small for
+    a step has its vertices only.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()

@@ -30,13 +30,9 @@ from pimper_torch.evidence.metrics.similarity import (
 from pimper_torch.evidence.metrics.surface_distances import (
     SurfaceComparison,
     TrueSurface,
-    bounding_diagonal,
     true_surface,
 )
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
-
-# Points of the true surface, about, that tell where cameras put things.
-_PLACES = 2000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,11 +72,7 @@ class EvaluateConfig:
 class Evaluation(Record):
     """All figures; a part is ``None`` (or empty) where either side lacks what it needs.
 
-    Attributes:
-        alignment: That everything but the cameras was measured after.
-        views: Along the rays of chosen views.
-        cameras: After the similarity on cameras, whatever ``alignment`` is.
-        dtu: By the protocol of the DTU set.
+    Those of the cameras are after the similarity on cameras, all others after ``alignment``.
     """
 
     alignment: Alignment
@@ -100,18 +92,15 @@ def evaluate(
     maps: Capture | None = None,
     dtu: DtuProtocol | None = None,
 ) -> Evaluation:
-    """Measure a result by everything the truth tells.
-
-    Views are paired by name, see :func:`pimper_torch.evidence.metrics.similarity.pair_views`.
+    """Measure a result by everything the truth determines; views are paired by :func:`.pair_views`.
 
     Args:
-        estimate: In a frame of its own.
         capture: The truth; its views may be a part of those the estimate was made from.
         surface: That of ``capture``, where many estimates are measured against it; see
             :func:`prepared_surface`.
         maps: The same data set with the maps of the views to compare in, where ``capture``
             was read without any to save memory.
-        dtu: Where the scan is evaluated, if it is one of the DTU set; needs the scan's points.
+        dtu: Evaluation region of a scan of the DTU set; needs the scan's points.
 
     Raises:
         InputError: The alignment cannot be made, a view that was asked for is unknown, or
@@ -196,19 +185,11 @@ def camera_figures(estimate: Estimate, capture: Capture) -> CameraFigures | None
     if pairs is None or pairs[0].num_views < 2:
         return None
     ours, truth = pairs
-    centre, diagonal, points = None, None, None
-    if capture.truth.mesh is not None or capture.truth.points_world is not None:
-        surface = true_surface(capture)
-        corners = surface.vertices_world.double()
-        centre = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
-        diagonal = bounding_diagonal(surface)
-        points = corners[:: max(1, len(corners) // _PLACES)]
+    known = capture.truth.mesh is not None or capture.truth.points_world is not None
     return compare_cameras(
         ours,
         truth,
         similarity_between_cameras(ours, truth),
         views=capture.views.num_views,
-        centre=centre,
-        diagonal=diagonal,
-        points_true=points,
+        surface=true_surface(capture) if known else None,
     )

@@ -25,17 +25,14 @@ from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
 def pair_views(
     names: Sequence[str], names_true: Sequence[str]
 ) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
-    """Find views of the same name, for results that miss some of the photographs.
+    """Find views of the same name, for results that lack some of the photographs.
 
     Where a name is not among the true ones, the view whose name differs in folder and suffix
     alone is the same: ``raw/07.tif`` and ``07.png``. A stem that two views of a set share
     pairs nothing.
 
     Returns:
-        Indices in ``names`` and in ``names_true``, in the order of the former.
-
-    Raises:
-        InputError: No name is in both.
+        Indices in ``names`` and in ``names_true``, in the order of the former; at least one.
     """
     index_of = {name: index for index, name in enumerate(names_true)}
     by_stem, by_stem_true = _stems(names), _stems(names_true)
@@ -67,10 +64,7 @@ def similarity_between_points(
 ) -> Float[Tensor, "4 4"]:
     """Return the similarity that carries points nearest to true ones, in least squares.
 
-    Solved in float64. Three points not on a line determine it; fewer leave a rotation open.
-
-    Raises:
-        InputError: All points coincide, so that nothing tells the scale.
+    Three points not on a line determine it; fewer leave a rotation free.
 
     Source: Umeyama, PAMI 13(4), 1991.
     """
@@ -79,15 +73,11 @@ def similarity_between_points(
 
 
 def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "4 4"]:
-    """Return the similarity that carries our cameras nearest to the true ones.
+    """Return the similarity that carries our cameras nearest to the true ones, in the same order.
 
     Scale and translation are Umeyama's on the cameras' centres. Centres on a line leave a
-    rotation about it open, and an arc nearly does; so the rotation is fitted to the centres
-    and to the cameras' axes together, each axis drawn as long as the centres' root mean
-    square distance from their mean.
-
-    Raises:
-        InputError: Unequal numbers of cameras, or centres that coincide.
+    rotation about it free, so the rotation is fitted to the centres and to the cameras' axes
+    together, each axis as long as the centres' root mean square distance from their mean.
     """
     if ours.num_views != truth.num_views:
         raise InputError(

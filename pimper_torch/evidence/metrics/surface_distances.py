@@ -20,12 +20,12 @@ from pimper_torch.records import Cameras, Capture, Mesh, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurfaceSamples(Record):
-    """Points on a surface, each standing for the same fraction of it.
+    """Points on a surface, each of the same area.
 
     Attributes:
-        normals: Of the faces they lie in, unit; ``None`` for a point cloud.
-        corners: Vertices that each lies between; the one that it is of a point cloud.
-        fractions: Of these; they add up to 1.
+        normals: Of their faces, unit; ``None`` for a point cloud.
+        corners: Vertices of their faces; the one of a point cloud.
+        fractions: Barycentric coordinates.
     """
 
     points: Float[Tensor, "sample 3"]
@@ -40,14 +40,10 @@ class SurfaceSamples(Record):
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfaceSamples:
-    """Draw points uniformly by area; of a point cloud, points without repetition.
+    """Draw points uniformly by area; of a point cloud, ``count`` points without repetition.
 
-    The draw is stratified: the faces' areas laid end to end are cut in ``count`` equal
-    pieces, and one point is drawn in each, which makes averages less noisy than independent
-    draws do and favours no face.
-
-    Args:
-        mesh: A cloud gives its points, all of them if they are no more than ``count``.
+    Stratified: the faces' areas laid end to end are cut in ``count`` equal pieces, with one point
+    in each.
 
     Raises:
         InputError: The surface has no extent: no vertices, or faces without any area.
@@ -104,16 +100,15 @@ def count_seeing(
 ) -> Int[Tensor, " sample"] | None:
     """Count the positions of the camera that each true point is seen from.
 
-    A view sees a point that lies inside its picture and behind nothing else: by ray casting
-    the true mesh with its surroundings and the face's front towards the camera, or, for a
-    cloud, by the true depth maps. Views taken from one position (``capture.position``) count
-    once, however many lights they were taken under.
+    By ray casting the true mesh with its surroundings and the face's front towards the camera, or,
+    for a cloud, by the true depth maps. Views taken from one position (``capture.position``) count
+    once.
 
     Args:
         diagonal: Of the object's bounding box, scene units.
 
     Returns:
-        ``None`` where nothing tells: no cameras, or neither a mesh nor depth maps.
+        ``None`` without cameras, or with neither a mesh nor depth maps.
     """
     truth, cameras = capture.truth, capture.cameras
     if cameras is None or (truth.mesh is None and truth.depth is None):
@@ -211,15 +206,14 @@ class CalibrationBin(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration(Record):
-    """How expected errors compare with true ones.
+    """Expected errors compared with true ones.
 
     Attributes:
         ratio: Median of true over expected error, over 0.6745: 1 for Gaussian noise of the
-            expected standard deviation, more where the surface is too sure of itself.
-        within_one: Share with a true error up to the expected one; 68 % for Gaussian noise.
-        within_two: Share with one up to twice the expected one; 95 %.
-        rank_correlation: Spearman's, between expected and true errors; NaN if all expected ones
-            are the same.
+            expected standard deviation, more where expected errors are too small.
+        within_one: Fraction with a true error up to the expected one; 68 % for Gaussian noise.
+        within_two: Fraction with one up to twice the expected one; 95 %.
+        rank_correlation: Spearman's; NaN if all expected errors are the same.
         bins: Of equal fractions of the surface, by rising expected error.
     """
 
@@ -234,11 +228,7 @@ class Calibration(Record):
 def calibrate(
     expected: Float[Tensor, " sample"], true: Float[Tensor, " sample"]
 ) -> Calibration | None:
-    """Compare expected with true errors over samples of equal area.
-
-    Args:
-        expected: Standard errors, scene units.
-        true: Distances to the truth, scene units.
+    """Compare standard errors with distances to the truth over samples of equal area.
 
     Returns:
         ``None`` if fewer than ten samples have a finite expected error above 0.
@@ -270,11 +260,10 @@ def calibrate(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceFigures(Record):
-    """Distances of samples of one surface to the other.
+    """Distances of samples of one surface to the other, scene units.
 
     Attributes:
         mean_percent: Of the diagonal of the true object's bounding box.
-        samples: How many; each stands for the same area.
     """
 
     mean: float
@@ -286,11 +275,11 @@ class DistanceFigures(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThresholdFigures(Record):
-    """How much of each surface lies near the other.
+    """Fractions of each surface nearer to the other than a threshold.
 
     Attributes:
-        precision: Fraction of the estimate nearer to the truth than the threshold.
-        recall: Fraction of the truth nearer to the estimate than the threshold.
+        precision: Of the estimate.
+        recall: Of the truth.
         f_score: Their harmonic mean; 0 if both are 0.
     """
 
@@ -321,7 +310,7 @@ class TwoSided(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceComparison(Record):
-    """How a surface compares with the true one.
+    """Distances of a surface and the true one.
 
     Attributes:
         diagonal: Of the true object's bounding box along the axes of the truth, scene units.
@@ -329,12 +318,8 @@ class SurfaceComparison(Record):
             surroundings.
         surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
             surroundings than to the object, and is left out of the accuracy.
-        seen: With that of the truth seen from at least ``seen_from`` positions; ``None`` if
-            it is unknown, or none is.
-        seen_from: How many positions of the camera.
-        seen_fraction: Fraction of the truth that is seen so; ``None`` if unknown.
-        calibration: Of the estimate's expected error, over its samples that count for the
-            accuracy; ``None`` if it tells none.
+        seen: Over the truth seen from at least ``seen_from`` positions of the camera.
+        calibration: Of the estimate's expected error, over the samples of the accuracy.
     """
 
     diagonal: float
@@ -351,13 +336,11 @@ class TrueSurface:
     """The true surface prepared for the comparison with any number of estimates.
 
     Samples are drawn evenly over each surface, and each is compared with the nearest point
-    of the other surface itself, not with its samples or vertices. Points stand for the
-    surface where one has no faces.
+    of the other surface itself, not with its samples or vertices.
 
     Args:
-        capture: With the true mesh or points, and its cameras for what is seen.
-        seen_from: How many positions of the camera must see a true point that is counted as
-            seen; see :func:`pimper_torch.evidence.metrics.surface_distances.count_seeing`.
+        capture: With the true mesh or points, and its cameras.
+        seen_from: Positions of the camera that must see a true point; see :func:`count_seeing`.
 
     Raises:
         InputError: There is no true surface, or it has no extent.
@@ -382,14 +365,10 @@ class TrueSurface:
     def compare(
         self, mesh: Mesh, thresholds_percent: Sequence[float] = (0.25, 0.5, 1.0)
     ) -> SurfaceComparison:
-        """Measure the distances between an estimate and the truth, area by area.
+        """Measure the distances between an estimate, in the frame of the truth, and the truth.
 
         Args:
-            mesh: The estimate, in the frame of the truth.
             thresholds_percent: Of the diagonal, for precision, recall and F-score.
-
-        Raises:
-            InputError: The estimate has no extent.
         """
         self._generator.set_state(self._state)  # the order of the estimates changes nothing
         drawn = sample_surface(mesh, self._samples, self._generator)
@@ -433,10 +412,7 @@ def true_surface(capture: Capture) -> Mesh:
 
 
 def bounding_diagonal(mesh: Mesh) -> float:
-    """Return the diagonal of the box, along the axes of the world, round what a mesh shows.
-
-    Vertices without a face count only where there are no faces at all.
-    """
+    """Return the diagonal of the box, along the axes of the world, round the faces of a mesh."""
     vertices = mesh.vertices_world.double()
     used = vertices[torch.unique(mesh.faces)] if len(mesh.faces) else vertices
     return float((used.amax(dim=0) - used.amin(dim=0)).norm())

@@ -102,11 +102,7 @@ def moved(
 def push_clear(
     mesh: Mesh, others: Sequence[Mesh], position: tuple[float, float], step: float = 0.02
 ) -> Mesh:
-    """Shift a solid to a position on the table, and on away from the centre until it is free.
-
-    Args:
-        position: Where it would best be; not the centre.
-    """
+    """Shift a closed solid to a position on the table, and outward from there until it is free."""
     own, rest = _Solid(mesh), [_Solid(one) for one in others]
     x, y = position
     shift = own.points.new_tensor([x, y, 0.0])
@@ -169,10 +165,7 @@ def mesh_level_set(
     highest: tuple[float, float, float],
     cell: float,
 ) -> Mesh:
-    """Triangulate where a function is zero, by marching cubes; float64.
-
-    The vertices are then moved on to the surface exactly, and get the function's gradient
-    for a normal.
+    """Triangulate the zero level of a function by marching cubes, moved on to it exactly; float64.
 
     Args:
         level: Negative inside, differentiable, with a gradient of about 1.

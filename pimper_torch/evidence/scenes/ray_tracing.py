@@ -1,6 +1,6 @@
 """Ray tracing of one photograph of a scene, with the truth about every pixel."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -121,9 +121,8 @@ class Stage:
         """Return the radiance that reaches the eye.
 
         Args:
-            eye: Where it is, or where each ray comes from.
-            flash: Where the flash is, and casts shadows from; by default at the eye, which sees
-                none of them.
+            eye: Its position, or the origin of each ray.
+            flash: Position of the flash, which then casts shadows; by default the eye.
             bounces: Of conductors that mirror one another.
         """
         specular, roughness = (
@@ -223,16 +222,15 @@ _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Frame(Record):
-    """A photograph that no camera took, and what the rays through its pixels' centres meet.
+    """A photograph, and the intersections of the rays through its pixels' centres.
 
     Attributes:
         depth: Along the camera's z; infinite where the ray meets nothing.
         normals_world: Unit, outward; zero where the ray meets nothing.
         albedo: Linear; zero where the ray meets nothing.
         lit: True where the point light reaches the surface.
-        highlight: True where a highlight adds noticeably to the matte part: a hundredth of
-            saturation or more, and a twentieth of the matte part. So does all that a conductor
-            mirrors.
+        highlight: True where the mirrored part is a hundredth of saturation or more, and a
+            twentieth of the matte part.
     """
 
     image: Float[Tensor, "channel height width"]
@@ -257,75 +255,51 @@ def render_frame(
     One ray through each pixel's centre; where a pixel differs from its neighbours, a grid of
     rays over its area instead.
     """
-    look = _Look(stage, cameras, lights, view, sensor.exposure)
+    cam_from_world, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
+    eye, point_light = cameras.centers_world[view].float(), lights.point_light(view)
     width, height = (int(side) for side in cameras.sizes_px[view])
     centers = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
-    seen = [look.at(pixels) for pixels in torch.split(centers, _BATCH)]
-    radiance = torch.cat([one.radiance for one in seen])
+
+    def seen_at(pixels: Float[Tensor, "pixel 2"]) -> tuple[Spots, Shaded, Tensor]:
+        """Return the spots, their light and the radiance at positions in the image."""
+        rays = rays_through(pixels, cam_from_world, intrinsics).float()
+        spots = stage.trace(eye, rays)
+        shaded = stage.shade(spots, eye, point_light)
+        hit = (spots.object_index >= 0)[:, None]
+        beyond = point_light.surroundings(rays)
+        radiance = torch.where(hit, shaded.matte + shaded.mirrored, beyond)
+        return spots, shaded, sensor.exposure * radiance
+
+    found = [seen_at(pixels) for pixels in torch.split(centers, _BATCH)]
+    spots, shaded, radiances = zip(*found, strict=True)
+    radiance = torch.cat(radiances)
     if sensor.supersample > 1:
         (uneven,) = torch.nonzero(_uneven(radiance.reshape(height, width, -1)), as_tuple=True)
+        steps = (torch.arange(sensor.supersample).to(centers) + 0.5) / sensor.supersample - 0.5
+        offsets = torch.cartesian_prod(steps, steps)
         fine = [
-            look.over(centers[rows], sensor.supersample)
+            torch.stack([seen_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
             for rows in torch.split(uneven, _BATCH // 4)
         ]
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))
-    image = expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor)
-    object_index = torch.cat([one.spots.object_index for one in seen]).reshape(height, width)
+
+    def raster(parts: Iterable[Tensor]) -> Tensor:
+        whole = torch.cat(list(parts))
+        return whole.reshape(height, width, *whole.shape[1:])
+
+    object_index = raster(one.object_index for one in spots)
+    mirrored = sensor.exposure * raster(one.mirrored for one in shaded).mean(dim=-1)
+    matte = sensor.exposure * raster(one.matte for one in shaded).mean(dim=-1)
     return Frame(
-        image=image,
-        depth=torch.cat([one.spots.hits.distance for one in seen]).reshape(height, width),
-        normals_world=torch.cat([one.spots.normals for one in seen]).reshape(height, width, 3),
-        albedo=torch.cat([one.spots.albedo for one in seen]).reshape(height, width, -1),
+        image=expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor),
+        depth=raster(one.hits.distance for one in spots),
+        normals_world=raster(one.normals for one in spots),
+        albedo=raster(one.albedo for one in spots),
         foreground=(object_index >= 0) & ~stage.outside[object_index],
-        lit=torch.cat([one.lit for one in seen]).reshape(height, width),
-        highlight=torch.cat([one.highlight for one in seen]).reshape(height, width),
+        lit=raster(one.lit for one in shaded),
+        highlight=(mirrored > _NOTICEABLE) & (mirrored > _NOTICEABLE_FRACTION * matte),
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Seen(Record):
-    spots: Spots
-    radiance: Float[Tensor, "ray channel"]
-    lit: Bool[Tensor, " ray"]
-    highlight: Bool[Tensor, " ray"]
-
-
-class _Look:
-    """One camera under one light."""
-
-    def __init__(
-        self, stage: Stage, cameras: Cameras, lights: Lights, view: int, exposure: float
-    ) -> None:
-        self._stage, self._exposure = stage, exposure
-        self._cam_from_world = cameras.cam_from_world[view]
-        self._intrinsics = cameras.intrinsics[view]
-        self._eye = cameras.centers_world[view].float()
-        self._point_light = lights.point_light(view)
-
-    def at(self, pixels: Float[Tensor, "pixel 2"]) -> _Seen:
-        """Look through positions in the image."""
-        rays = rays_through(pixels, self._cam_from_world, self._intrinsics).float()
-        spots = self._stage.trace(self._eye, rays)
-        shaded = self._stage.shade(spots, self._eye, self._point_light)
-        hit = (spots.object_index >= 0)[:, None]
-        beyond = self._point_light.surroundings(rays)
-        radiance = self._exposure * torch.where(hit, shaded.matte + shaded.mirrored, beyond)
-        mirrored = self._exposure * shaded.mirrored.mean(dim=-1)
-        matte = shaded.matte.mean(dim=-1)
-        relative = mirrored > _NOTICEABLE_FRACTION * self._exposure * matte
-        return _Seen(
-            spots=spots,
-            radiance=radiance,
-            lit=shaded.lit,
-            highlight=(mirrored > _NOTICEABLE) & relative,
-        )
-
-    def over(self, centers: Float[Tensor, "pixel 2"], side: int) -> Float[Tensor, "pixel channel"]:
-        """Average the radiance over the areas of pixels."""
-        steps = (torch.arange(side).to(centers) + 0.5) / side - 0.5
-        offsets = torch.cartesian_prod(steps, steps)
-        return torch.stack([self.at(centers + offset).radiance for offset in offsets]).mean(dim=0)
 
 
 def _uneven(radiance: Float[Tensor, "height width channel"]) -> Bool[Tensor, " pixel"]:

@@ -88,21 +88,13 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RenderedScene(Record):
-    """Photographs that no camera took, and everything they were computed from.
-
-    Per-view maps hold what the ray through each pixel's centre meets first.
+    """Photographs in memory, and their truth; maps are as of :class:`.Frame`, one a view.
 
     Attributes:
-        lights_world: First-order light ``l`` at the object: radiance is
-            albedo * l . (1, n). Exact for closed-form scenes; for ray-traced ones the
-            light at the target, without fall-off, shadows and highlights.
-        depth: Along the camera's z; infinite where the ray meets nothing.
-        normals_world: Unit, outward; zero where the ray meets nothing.
-        albedo: Linear; zero where the ray meets nothing.
-        foreground: True on the object, false on the table and the background.
-        lit: True where the point light reaches the surface.
-        highlight: True where a highlight adds noticeably to the matte part.
-        mesh: What was ray traced; ``None`` for closed forms.
+        lights_world: First-order light ``l`` at the object: radiance is albedo * l . (1, n). Exact
+            for closed-form scenes; for ray-traced ones the light at the target, without
+            fall-off, shadows and highlights.
+        mesh: The ray-traced one; ``None`` for closed forms.
     """
 
     views: Views
@@ -115,6 +107,9 @@ class RenderedScene(Record):
     lit: Bool[Tensor, "view height width"]
     highlight: Bool[Tensor, "view height width"]
     mesh: Mesh | None = None
+
+
+_MAPS = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
 
 
 def render_shape(
@@ -163,13 +158,9 @@ def render_objects(
     generator: torch.Generator,
     sensor: SensorConfig | None = None,
 ) -> RenderedScene:
-    """Ray trace meshes under point lights, all photographs in memory; float32.
+    """Ray trace meshes under point lights, all photographs in memory, of one size; float32.
 
-    Light falls off with the square of the distance and is stopped by every object; highlights
-    are those of :mod:`pimper_torch.evidence.scenes.scene_object`.
-
-    Args:
-        objects: Those that are no surroundings are the foreground.
+    Light falls off with the square of the distance and is stopped by every object.
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = Stage(objects)
@@ -181,12 +172,7 @@ def render_objects(
         views=_views(torch.stack([frame.image for frame in frames]), cameras),
         cameras=cameras,
         lights_world=lights.harmonics_world(cameras.centers_world),
-        depth=torch.stack([frame.depth for frame in frames]),
-        normals_world=torch.stack([frame.normals_world for frame in frames]),
-        albedo=torch.stack([frame.albedo for frame in frames]),
-        foreground=torch.stack([frame.foreground for frame in frames]),
-        lit=torch.stack([frame.lit for frame in frames]),
-        highlight=torch.stack([frame.highlight for frame in frames]),
+        **{name: torch.stack([getattr(frame, name) for frame in frames]) for name in _MAPS},
         mesh=stage.mesh,
     )
 
@@ -210,61 +196,6 @@ def _views(images: Float[Tensor, "view channel height width"], cameras: Cameras)
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class OneView(Record):
-    """Photographs from one viewpoint, and what they show.
-
-    Attributes:
-        normals: Unit, of the pixels inside the mask in raster order.
-    """
-
-    images: Float[Tensor, "view channel height width"]
-    mask: Bool[Tensor, "height width"]
-    normals: Float[Tensor, "3 pixel"]
-    albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view 3"]
-
-    @property
-    def shading(self) -> Float[Tensor, "3 pixel"]:
-        """Albedo, summed over channels, times normal."""
-        return self.albedo.sum(dim=0) * self.normals
-
-
-def photograph(
-    normals: Float[Tensor, "height width 3"],
-    albedo: Float[Tensor, "height width channel"],
-    mask: Bool[Tensor, "height width"],
-    lights: Float[Tensor, "view 3"],
-    generator: torch.Generator,
-    noise: float = 0.0,
-) -> OneView:
-    """Render a Lambertian surface, attached shadows black.
-
-    Args:
-        noise: Standard deviation of what is added to each value before negative ones are cut
-            off, as a fraction of the brightest.
-    """
-    n, rho = normals[mask].mT, albedo[mask].mT
-    values = (lights @ n).clamp_min(0)[:, None] * rho
-    drawn = torch.randn(values.shape, generator=generator, dtype=torch.float64).to(values)
-    values = (values + noise * values.max() * drawn).clamp_min(0)
-    images = values.new_zeros(*values.shape[:2], *mask.shape)
-    images[..., mask] = values
-    return OneView(images=images, mask=mask, normals=n, albedo=rho, lights=lights)
-
-
-def point_lights(
-    views: int, generator: torch.Generator, widest_deg: float = 50.0
-) -> Float[Tensor, "view 3"]:
-    """Draw distant point lights evenly over the cap round the view, of strength 0.7 to 1.3."""
-    widest = torch.cos(torch.deg2rad(torch.tensor(widest_deg, dtype=torch.float64)))
-    drawn = torch.rand(3, views, generator=generator, dtype=torch.float64)
-    z = 1 - (1 - widest) * drawn[0]
-    angle, radius = 2 * torch.pi * drawn[1], (1 - z * z).sqrt()
-    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), -z], dim=1)
-    return (0.7 + 0.6 * drawn[2])[:, None] * directions
-
-
 def potato_on_table(
     seed: int = 0,
     *,
@@ -274,11 +205,11 @@ def potato_on_table(
 ) -> RenderedScene:
     """Photograph a bumpy, textured potato under a point light that moves between photographs.
 
-    The point light is two to three times the potato's length away, so its light falls off over
-    the object, and the potato shadows itself and the table.
+    The point light is two to three times the potato's length away, so that its light falls off over
+    the object.
 
     Args:
-        seed: Decides form, texture, lights and noise.
+        seed: Of form, texture, lights and noise.
         num_views: On an arc at about 35 degrees over the table.
     """
     generator = torch.Generator().manual_seed(seed)

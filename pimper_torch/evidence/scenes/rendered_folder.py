@@ -17,14 +17,8 @@ file                            content
 """
 
 import json
-import multiprocessing
-import os
-import pickle
-import signal
-import threading
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +38,7 @@ from pimper_torch.io.decode import write_deep_png
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.folders import require_apart, written_whole
-from pimper_torch.progress import report
+from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.sfm.colmap import write_binary
 
@@ -100,20 +94,15 @@ def render_scene(
     processes: int = 2,
     overwrite: bool = False,
 ) -> Path:
-    """Photograph a scene, and write photographs and truth to a folder.
+    """Photograph a scene, and write photographs and truth to a new or empty folder, and return it.
 
     The folder is written whole or not at all; :mod:`.rendered_folder` lists its contents. The same
-    settings give the same files, whatever the number of processes.
+    settings give the same files, whatever their number.
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file.
-        folder: New or empty; its parents are made.
-        processes: That render at the same time. More than 1 start Python anew, so that a
-            script that calls this must guard its top level by ``__name__ == "__main__"``.
-
-    Returns:
-        The folder.
+        processes: Threads that render side by side, each a photograph.
 
     Raises:
         InputError: No such scene, or a mesh that cannot be read.
@@ -134,98 +123,25 @@ def render_scene(
     return folder
 
 
-def _render_all(scene: Scene, folder: Path, processes: int) -> None:
-    total = scene.config.num_views
-    if processes == 1:
-        with _one_thread():
-            studio = _Studio(scene, folder)
-            for view in range(total):
-                studio.take(view)
-                report(view + 1, total)
-        return
-    # Pickled here, for torch would pass tensors through shared memory, of which containers
-    # have little. Spawned, for a forked torch may hang.
-    packed = pickle.dumps((scene, folder))
-    with ProcessPoolExecutor(
-        processes,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_open_studio,
-        initargs=(packed,),
-    ) as pool:
-        with _deaf():
-            taken = [pool.submit(_take, view) for view in range(total)]
-        try:
-            for done, one in enumerate(as_completed(taken), start=1):
-                one.result()
-                report(done, total)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+def _render_all(scene: Scene, folder: Path, threads: int) -> None:
+    """Render all photographs and write them with their truth."""
+    shared = Stage(scene.objects_in(0))
 
-
-class _Studio:
-    """A scene set up in one process."""
-
-    def __init__(self, scene: Scene, folder: Path) -> None:
-        self._scene, self._folder = scene, folder
-        self._stage = Stage(scene.objects_in(0))
-
-    def take(self, view: int) -> None:
-        """Render one photograph and write it with its truth."""
-        scene, name = self._scene, self._scene.names[view]
-        stage = Stage(scene.objects_in(view)) if scene.fixed else self._stage
+    def take(view: int) -> None:
+        stage = Stage(scene.objects_in(view)) if scene.fixed else shared
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
         )
-        _write_photograph(frame.image, scene.config, self._folder / "photos" / name)
+        name = scene.names[view]
+        _write_photograph(frame.image, scene.config, folder / "photos" / name)
         mask = Image.fromarray(255 * frame.foreground.numpy().astype(np.uint8))
-        mask.save(self._folder / "masks" / name)
-        write_maps(frame, (self._folder / "truth" / "maps" / name).with_suffix(".npz"))
+        mask.save(folder / "masks" / name)
+        write_maps(frame, (folder / "truth" / "maps" / name).with_suffix(".npz"))
 
-
-_studio: _Studio | None = None  # of this process
-
-
-def _open_studio(packed: bytes) -> None:
-    global _studio
-    threading.Thread(target=_leave_with_the_parent, daemon=True).start()
-    torch.set_num_threads(1)
-    _studio = _Studio(*pickle.loads(packed))  # our own, from the parent process
-
-
-def _leave_with_the_parent() -> None:
-    """End this process when the one that started it is killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextmanager
-def _deaf() -> Iterator[None]:
-    """Let processes that are started in the block not hear Ctrl-C: their parent ends them."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)
-
-
-def _take(view: int) -> None:
-    assert _studio is not None
-    _studio.take(view)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute as the processes of a pool do, to the last bit."""
     former = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     try:
-        yield
+        deque(side_by_side(take, range(scene.config.num_views)), maxlen=0)
     finally:
         torch.set_num_threads(former)
 

@@ -62,16 +62,15 @@ def arc_cameras(
     front: tuple[float, float, float] = (0.0, 0.0, 1.0),
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Cameras:
-    """Walk round a target on an arc, looking at it; float64.
+    """Place cameras on an arc round a target, looking at it; float64.
 
     The defaults face flat shapes such as :class:`.Plane` from above.
 
     Args:
         span_deg: From the first camera to the last, about ``up``.
         elevation_deg: Mean height of the arc over the plane across ``up``.
-        sway_deg: How far the elevation goes up and down on the way.
+        sway_deg: Amplitude of the elevation along the arc.
         front: Towards the centre of the arc; must be across ``up``.
-        up: Axis of the arc, and up in the photographs.
     """
     toward_world = arc_directions(
         num_views,
@@ -116,13 +115,11 @@ def turntable_directions(num_views: int, *, elevation_deg: float) -> Float[Tenso
 def handheld_directions(
     num_views: int, generator: torch.Generator, *, elevation_deg: float
 ) -> Float[Tensor, "view 3"]:
-    """Walk once round the object for each of three heights, as steadily as a hand is.
+    """Return directions once round the object at each of three heights, as steady as a hand.
 
     Args:
-        num_views: Shared out between the rounds: the first third goes at the middle height,
-            then higher, then lower.
-        elevation_deg: Of the middle round; the others are 18 degrees higher and 14
-            lower, none below 8 and above 75.
+        elevation_deg: Of the first third; then 18 degrees higher, then 14 lower, none below 8 and
+            above 75.
     """
     third = torch.arange(num_views) * 3 // num_views
     within = torch.bincount(third, minlength=3)[third]
@@ -161,20 +158,12 @@ def distance_to_fit(
 def aim_to_fit(
     toward_world: Float[Tensor, "view 3"],
     points_world: Float[Tensor, "point 3"],
-    *,
-    focal_px: float,
-    width: float,
-    height: float,
-    fill: float,
+    **picture: float,
 ) -> tuple[Float[Tensor, " 3"], float]:
     """Find what cameras look at, and from how far, to show all points as large as can be.
 
     Args:
-        toward_world: Unit, from the target to the cameras.
-        fill: Fraction of the picture, along its tighter side, that the points may take.
-
-    Returns:
-        The target, and the distance of :func:`distance_to_fit`.
+        picture: As of :func:`distance_to_fit`.
     """
     hull = points_world[torch.from_numpy(ConvexHull(points_world.numpy()).vertices).long()]
 
@@ -182,15 +171,7 @@ def aim_to_fit(
     mean_toward = toward_world.mean(dim=0)
 
     def distance(target: Float[Tensor, " 3"]) -> float:
-        return distance_to_fit(
-            toward_world,
-            hull,
-            target,
-            focal_px=focal_px,
-            width=width,
-            height=height,
-            fill=fill,
-        )
+        return distance_to_fit(toward_world, hull, target, **picture)
 
     def farness(values: np.ndarray) -> float:
         # How far the cameras are from the object's centre: their distance from the target

@@ -107,18 +107,15 @@ class Lights(Record):
     """A point light and an even ambient light for each view.
 
     A point of albedo 1 facing the point light at ``target_world`` has radiance
-    ``irradiance + ambient``; elsewhere the former falls off with the square of the
-    distance. A light placed very far away is a directional one.
+    ``irradiance + ambient``; elsewhere the former falls off with the square of the distance.
 
     Attributes:
         ambient: Radiance of a white point in shadow.
-        target_world: Where irradiance is stated.
-        flash: Irradiance at the target of a second light in the camera's own position, one a
-            view, without shadows.
+        flash: Irradiance at the target of a second light at the camera, without shadows.
         environments: The picture that the ambient light comes from, one a view. Matte surfaces
             get its mean; mirrors and the background show it.
         window: Direction to the middle of soft light times the irradiance ``w`` of what faces it;
-            what is turned by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
+            a surface turned by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
     """
 
     positions_world: Float[Tensor, "view 3"]
@@ -176,13 +173,12 @@ def wandering_lights(
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
     toward: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Lights:
-    """Carry a point light to another position for every photograph; float64.
+    """Draw another position of a point light in a cone for every photograph; float64.
 
     Args:
-        generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        toward: Axis of the cone the point light moves in.
+        toward: Axis of the cone, at angles from ``min_tilt_deg`` to ``spread_deg``.
     """
     axis = normalize(torch.tensor(toward, dtype=torch.float64), dim=0)
     aside = torch.linalg.svd(axis[None]).Vh[1:]
@@ -194,14 +190,7 @@ def wandering_lights(
     across = rotation.cos()[:, None] * aside[0] + rotation.sin()[:, None] * aside[1]
     direction = cosine[:, None] * axis + sine[:, None] * across
     target_world = torch.tensor(target, dtype=torch.float64)
-    return Lights(
-        positions_world=target_world
-        + (distance * _about_one(num_views, generator))[:, None] * direction,
-        irradiance=irradiance * _about_one(num_views, generator),
-        ambient=ambient * _about_one(num_views, generator),
-        target_world=target_world,
-        flash=torch.full((num_views,), flash, dtype=torch.float64),
-    )
+    return _placed(direction, target_world, generator, distance, (irradiance, ambient, flash))
 
 
 def lights_round(
@@ -217,17 +206,14 @@ def lights_round(
     sweep_deg: float = 160.0,
     elevations_deg: tuple[float, float] = (18.0, 72.0),
 ) -> Lights:
-    """Carry a point light round an object on a table, on the side that is photographed; float64.
+    """Draw positions of a point light round an object, on the photographed side; float64.
 
     Args:
         azimuths: Radians about the world's z, counter-clockwise from -y: the centre of the
             point light's sweep in each photograph.
-        generator: Decides where the point light goes, and how bright it is.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        far: The point light is so far away that its light comes from one direction and does not
-            fall off.
-        sweep_deg: How far round the object the point light goes.
+        far: Whether light comes from one direction and does not fall off.
         elevations_deg: Lowest and highest position of the point light over the table's plane.
     """
     count = len(azimuths)
@@ -237,9 +223,24 @@ def lights_round(
     sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     cosine = (1 - sine**2).sqrt()
     direction = torch.stack([cosine * rotation.sin(), -cosine * rotation.cos(), sine], dim=-1)
+    strengths = irradiance, ambient, flash
+    return _placed(direction, target, generator, distance, strengths, _FAR if far else 1.0)
+
+
+def _placed(
+    direction: Float[Tensor, "view 3"],
+    target: Float[Tensor, " 3"],
+    generator: torch.Generator,
+    distance: float,
+    strengths: tuple[float, float, float],
+    farther: float = 1.0,
+) -> Lights:
+    """Draw distances and strengths of point lights, up to a quarter less or more."""
+    count = len(direction)
     away = distance * _about_one(count, generator)
+    irradiance, ambient, flash = strengths
     return Lights(
-        positions_world=target + (_FAR if far else 1) * away[:, None] * direction,
+        positions_world=target + farther * away[:, None] * direction,
         irradiance=irradiance * _about_one(count, generator),
         ambient=ambient * _about_one(count, generator),
         target_world=target,

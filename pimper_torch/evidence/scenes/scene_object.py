@@ -79,18 +79,15 @@ def reflect(
     specular: Float[Tensor, "*batch"],
     roughness: Float[Tensor, "*batch"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Split light of irradiance 1 into what the matte part sends and what is mirrored.
+    """Split light of irradiance 1 into the radiance of a white matte part and of the highlight.
 
-    The matte part lies under the glaze: it gets what is not mirrored on the way in, and sends
-    what is not mirrored on the way out, so that no more leaves the surface than arrives. With
-    ``specular`` 0 it is the cosine alone.
+    The matte part lies under the glaze: it receives and sends only light that is not mirrored. Both
+    are 0 where the light is below the horizon.
 
     Args:
-        specular: Share mirrored head on.
-
-    Returns:
-        Radiance of a white matte part, and of the highlight. Both 0 where the light is below
-        the horizon.
+        normals: Unit, as the directions to light and eye.
+        specular: Fraction mirrored head on.
+        roughness: Its square is GGX's alpha.
     """
     cosine = (normals * to_light).sum(dim=-1)
     above = cosine > 0
@@ -110,19 +107,16 @@ Texture = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch channel"]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneObject:
-    """A mesh and what it is made of.
+    """A mesh and its material.
 
     Attributes:
-        mesh: World. Its normals are interpolated over the faces; without them, those of the
-            faces averaged round each vertex.
+        mesh: World, with normals, or those of the faces averaged at each vertex.
         texture: Albedo at points of the world; ``None`` takes the mesh's own albedo.
-        specular: Fraction of light that the surface mirrors where it comes straight down: 0 is
-            wholly matte, 0.04 is glaze or varnish.
-        roughness: Of the mirroring facets, as artists count it (its square is GGX's alpha):
-            0.1 is polished, 0.5 satin.
-        conductor: A metal in place of matte surface under glaze: it mirrors the point lights as
-            ``roughness`` says, other objects and the environment sharply. Its albedo is 0.
-        surroundings: True for what stands around the reconstructed object, such as the table.
+        specular: Fraction of light that the surface mirrors head on: 0 is matte, 0.04 is glaze.
+        roughness: Of the mirroring facets (its square is GGX's alpha): 0.1 is polished, 0.5 satin.
+        conductor: A metal: it mirrors the point lights as ``roughness`` says, other objects and the
+            environment sharply. Its albedo is 0.
+        surroundings: True for objects around the reconstructed one, such as the table.
     """
 
     mesh: Mesh

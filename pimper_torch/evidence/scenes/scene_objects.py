@@ -23,7 +23,7 @@ from pimper_torch.evidence.scenes.procedural_meshes import (
     smooth_union,
     table,
 )
-from pimper_torch.evidence.scenes.scene_object import SceneObject
+from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
 from pimper_torch.evidence.scenes.textures import (
     CylinderRegion,
     Marked,
@@ -235,43 +235,34 @@ def pair(generator: torch.Generator) -> tuple[SceneObject, ...]:
     )
 
 
-def cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
-    """Lay a matte cloth of modest texture on the table."""
-    weave = random_speckle(
-        generator,
-        cells=(0.61, 0.23, 0.09),
-        darkest=0.16,
-        brightest=0.44,
-        contrast=0.7,
-        colour=0.15,
-        tint=(0.86, 0.92, 1.0),
-    )
-    return SceneObject(mesh=table(half_side, cells=64), texture=weave, surroundings=True)
+def _cloth(texture: Texture) -> SceneObject:
+    """Lay a matte cloth on the table."""
+    return SceneObject(mesh=table(4.0, cells=64), texture=texture, surroundings=True)
 
 
-def patterned_cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
-    """Lay a matte cloth of strong contrast on the table, with features of every size."""
-    print_ = random_speckle(
-        generator,
-        cells=(0.53, 0.23, 0.097, 0.043, 0.019),
-        darkest=0.08,
-        brightest=0.75,
-        contrast=2.0,
-    )
-    return SceneObject(mesh=table(half_side, cells=64), texture=print_, surroundings=True)
-
-
-def plain_cloth(generator: torch.Generator, half_side: float = 4.0) -> SceneObject:
-    """Lay a matte cloth without texture on the table."""
-    return SceneObject(
-        mesh=table(half_side, cells=64), texture=Uniform(albedo=(0.5, 0.5, 0.5)), surroundings=True
-    )
-
-
+# Cloths of modest texture, of strong contrast with features of every size, and without texture.
 TABLES: dict[str, Callable[[torch.Generator], SceneObject]] = {
-    "cloth": cloth,
-    "patterned": patterned_cloth,
-    "plain": plain_cloth,
+    "cloth": lambda generator: _cloth(
+        random_speckle(
+            generator,
+            cells=(0.61, 0.23, 0.09),
+            darkest=0.16,
+            brightest=0.44,
+            contrast=0.7,
+            colour=0.15,
+            tint=(0.86, 0.92, 1.0),
+        )
+    ),
+    "patterned": lambda generator: _cloth(
+        random_speckle(
+            generator,
+            cells=(0.53, 0.23, 0.097, 0.043, 0.019),
+            darkest=0.08,
+            brightest=0.75,
+            contrast=2.0,
+        )
+    ),
+    "plain": lambda generator: _cloth(Uniform(albedo=(0.5, 0.5, 0.5))),
 }
 RECIPES: dict[str, Recipe] = {
     "mug": mug,

@@ -158,73 +158,68 @@ class SceneConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
         require_ranges(self)
+        _ = self.sensor  # refuses its own
         # Rays of a photograph take 100 bytes each.
-        most = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
-        require(
-            self.supersample <= most,
-            "supersample",
-            self.supersample,
-            f"{most} at most with {self.width} x {self.height} pixels; or fewer of these",
-        )
-        several = self.lights_per_pose > 1
+        rays = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
         moving = self.turned_over or self.fixed_point_light or self.jitter_px > 0
-        require(
-            self.num_views % self.lights_per_pose == 0 and not (several and moving),
-            "lights_per_pose",
-            self.lights_per_pose,
-            f"a divisor of num_views ({self.num_views}), and neither turned_over, "
-            "fixed_point_light nor jitter with more than 1",
-        )
-        require(math.isfinite(self.rotation_deg), "rotation_deg", self.rotation_deg, "finite")
+        shared = self.num_views % self.lights_per_pose == 0
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
-        require(
-            self.sway_deg >= 0 and lowest >= 2 and highest <= 85,
-            "elevation_deg",
-            self.elevation_deg,
-            f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
-        )
-        for name in ("fixed_point_light", "fixed_room", "fixed_table"):
-            fixed = getattr(self, name)
-            require(
-                not fixed or self.path == "turntable",
-                name,
-                fixed,
-                f"path turntable instead of {self.path}, for what stands still before the camera",
-            )
-        require(
-            not self.turned_over or (self.num_views >= 2 and not self._at_rest),
-            "turned_over",
-            self.turned_over,
-            "2 views or more, and no environment, window, or anything fixed before the camera",
-        )
+        on_axis = self.path == "turntable"
+        before = f"path turntable instead of {self.path}, for what stands still before the camera"
         widest = 0.3 * min(self.width, self.height)
-        needed = (
+        jitter = (
             f"0 or more, and both jitters together at most {widest:.0f}, 0.3 of the tighter side"
         )
-        for name in ("pan_jitter_px", "crop_jitter_px"):
-            require(0 <= getattr(self, name) <= widest, name, getattr(self, name), needed)
-        require(self.jitter_px <= widest, "pan_jitter_px", self.pan_jitter_px, needed)
-        require(
-            not (self.constant_light and self.fixed_point_light),
-            "constant_light",
-            self.constant_light,
-            "no fixed_point_light, under which the light goes round the object",
-        )
-        require(
-            self.irradiance + self.ambient + self.flash + self.window > 0,
-            "irradiance",
-            self.irradiance,
-            "some light: irradiance, ambient, flash or window",
-        )
-        _ = self.sensor  # refuses its own
-        for channel in self.albedo or ():
-            require(0 <= channel <= 1, "albedo", self.albedo, "between 0 and 1 in every channel")
-        require(
-            self.conductor == "none" or (self.albedo is None and self.specular is None),
-            "conductor",
-            self.conductor,
-            "none with albedo or specular: a metal has no matte part, and its own reflectance",
-        )
+        for holds, name, needed in (
+            (
+                self.supersample <= rays,
+                "supersample",
+                f"{rays} at most with {self.width} x {self.height} pixels; or fewer of these",
+            ),
+            (
+                shared and not (self.lights_per_pose > 1 and moving),
+                "lights_per_pose",
+                f"a divisor of num_views ({self.num_views}), and neither turned_over, "
+                "fixed_point_light nor jitter with more than 1",
+            ),
+            (math.isfinite(self.rotation_deg), "rotation_deg", "finite"),
+            (
+                self.sway_deg >= 0 and lowest >= 2 and highest <= 85,
+                "elevation_deg",
+                f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
+            ),
+            (on_axis or not self.fixed_point_light, "fixed_point_light", before),
+            (on_axis or not self.fixed_room, "fixed_room", before),
+            (on_axis or not self.fixed_table, "fixed_table", before),
+            (
+                not self.turned_over or (self.num_views >= 2 and not self._at_rest),
+                "turned_over",
+                "2 views or more, and no environment, window, or anything fixed before the camera",
+            ),
+            (0 <= self.crop_jitter_px <= widest, "crop_jitter_px", jitter),
+            (self.pan_jitter_px >= 0 and self.jitter_px <= widest, "pan_jitter_px", jitter),
+            (
+                not (self.constant_light and self.fixed_point_light),
+                "constant_light",
+                "no fixed_point_light, under which the light goes round the object",
+            ),
+            (
+                self.irradiance + self.ambient + self.flash + self.window > 0,
+                "irradiance",
+                "some light: irradiance, ambient, flash or window",
+            ),
+            (
+                all(0 <= channel <= 1 for channel in self.albedo or ()),
+                "albedo",
+                "between 0 and 1 in every channel",
+            ),
+            (
+                self.conductor == "none" or (self.albedo is None and self.specular is None),
+                "conductor",
+                "none with albedo or specular: a metal has no matte part, and its own reflectance",
+            ),
+        ):
+            require(holds, name, getattr(self, name), needed)
 
     @property
     def surrounded(self) -> Literal["none", "constant", "changing"]:

@@ -62,16 +62,14 @@ def random_waves(
 class Speckle:
     """A solid texture: an albedo for every point of space.
 
-    Several subdivided meshes of random values, each finer than the one before, are blended
-    linearly, added and pushed towards light and dark, so that features of many sizes have
-    edges. The same point has the same colour in every view.
+    Grids of random values, each finer than the one before, are interpolated linearly, added and
+    pushed towards light and dark, so that features of many sizes have edges.
 
     Attributes:
         subdivisions: One an octave, periodic: along each axis the last value repeats the first.
-        cells: Scene units between subdivided mesh points, one an octave.
-        contrast: Steepness of the push; the smaller, the less texture.
-        offset: Added before the push: far from 0, most is light (or dark) and only rare
-            spots are not.
+        cells: Scene units between grid points, one an octave.
+        contrast: Steepness of the push.
+        offset: Added before the push: far from 0, only rare spots are dark (or light).
     """
 
     subdivisions: Float[Tensor, "octave channel side side side"]
@@ -120,8 +118,7 @@ def random_speckle(
         cells: Sizes of its features in scene units.
         contrast: 0 is uniform; 2.5 gives plenty of features to structure from motion.
         colour: 0 is gray; 1 gives the channels nothing in common.
-        offset: Positive leaves rare dark spots, negative rare light ones; the values it is
-            added to have a standard deviation of about half the root of the octaves.
+        offset: Positive leaves rare dark spots, negative rare light ones.
         tint: Multiplies the channels; one number, or one for each.
     """
     side = 64  # repeats after 64 cells; no two octaves repeat together

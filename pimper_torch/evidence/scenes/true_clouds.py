@@ -28,18 +28,16 @@ def sparse_scene(
 ) -> SparseScene:
     """Sample visible surface points, follow them through the views and triangulate them.
 
-    Without noise the points lie on the surface to the precision of the depth maps. Noise
-    is put on the observations, and the points are triangulated from those again, so that
+    Noise is put on the observations, and the points are triangulated from those again, so that
     their errors are along the rays as in real clouds.
 
     Args:
-        generator: Decides which points, and the noise.
+        num_points: At most.
+        noise_px: Standard deviation of every observation.
         outlier_fraction: Fraction of the points that are moved along their first ray by up to
-            half their depth, keeping their short, wrong tracks.
-        in_views: Pick points in the maps of these views; ``None`` is all of them, so that
-            some points lie on sides that the middle view does not see.
-        dtype: Of photographs, cameras and points; the default is what structure from
-            motion gives.
+            half their depth, with tracks of two views.
+        in_views: Pick points in the maps of these views; ``None`` is all of them.
+        dtype: Of photographs, cameras and points.
     """
     require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
     require(0 <= outlier_fraction < 1, "outlier_fraction", outlier_fraction, "at least 0, below 1")
@@ -159,13 +157,12 @@ def true_model(
     """Draw points evenly over a surface and follow them through the photographs.
 
     Args:
-        surface: Where the points lie; it has an albedo.
-        blockers: Everything that may stand in front of them.
-        num_points: At most; fewer where less of the surface is seen.
+        surface: With albedo.
+        blockers: Everything that may stand in front of it.
         min_views: Views that see a point at least, or all there are.
 
     Returns:
-        Cameras, points and exact observations, and the points' albedo.
+        Cameras, at most ``num_points`` points with exact observations, and the points' albedo.
     """
     points, normals, albedo = _scatter(surface, 6 * num_points, generator)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)

@@ -86,12 +86,9 @@ def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) 
     """
     count = len(world_from_room)
     positions = light_room.positions_world.expand(count, 3)
-    return Lights(
+    return light_room.take([0] * count).replace(
         positions_world=transform(world_from_room, positions[:, None])[:, 0],
-        irradiance=light_room.irradiance.expand(count),
-        ambient=light_room.ambient.expand(count),
         target_world=transform(world_from_room[0], light_room.target_world[None])[0],
-        flash=light_room.flash.expand(count),
     )
 
 
@@ -144,9 +141,9 @@ class Scene:
     Attributes:
         name: Of the object, or the path of its mesh.
         objects: At rest in the world: the object's first, then its table, if that turns along.
-        fixed: Objects that are at rest while the object turns or is turned over, in the frame of
-            :mod:`pimper_torch.evidence.scenes.whole_scene`.
-        world_from_room: Where that frame is in each photograph.
+        fixed: Objects that are at rest while the object turns or is turned over, in the room's
+            frame: z up from the table's plane, origin on the turntable's axis, camera at -y.
+        world_from_room: Of each photograph.
     """
 
     name: str
@@ -200,8 +197,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
-            file, which is scaled to the size of the others. Its vertex colours are its texture;
-            without any it gets one. Its normals are those of its faces, averaged at the vertices.
+            file, which is scaled to the size of the others. Its vertex colours are its texture.
 
     Raises:
         InputError: No such scene and no such file, or a mesh that has no surface.
@@ -213,30 +209,24 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     points = join(*(item.mesh for item in objects)).vertices_world
     if config.turned_over:
         return _turned_over(str(name_or_path), objects, points, config, generator)
-    taken = _taken(points, config, generator)
-    world_from_room = rotated_about(taken.target, taken.azimuths)
-    reach = float((points - taken.target)[:, :2].norm(dim=-1).amax())
+    cameras, lights, target, azimuths = _taken(points, config, generator)
+    world_from_room = rotated_about(target, azimuths)
+    reach = float((points - target)[:, :2].norm(dim=-1).amax())
     environments = _environments(config, world_from_room)
-    turning, fixed = _surroundings(config, generator, taken.target, _MARGIN * reach)
+    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
     return Scene(
         name=str(name_or_path),
         config=config,
         objects=(*objects, *turning),
-        cameras=taken.cameras,
-        lights=_coloured(taken.lights, config).replace(environments=environments),
+        cameras=cameras,
+        lights=_coloured(lights, config).replace(environments=environments),
         fixed=fixed,
         world_from_room=world_from_room,
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Taken:
-    """Cameras and lights round an object, what they look at, and where they stand round it."""
-
-    cameras: Cameras
-    lights: Lights
-    target: Float[Tensor, " 3"]
-    azimuths: Float[Tensor, " view"]
+_Taken = tuple[Cameras, Lights, Float[Tensor, " 3"], Float[Tensor, " view"]]
+"""Cameras and lights round an object, their target, and the cameras' azimuths."""
 
 
 def _taken(
@@ -256,12 +246,9 @@ def _taken(
     )
     poses = look_at(target + distance * toward, target, target.new_tensor(UP))
     azimuths = torch.atan2(toward[:, 0], -toward[:, 1])
-    return _Taken(
-        cameras=_shifted(pinholes(poses, focal_px, config.width, config.height), config),
-        lights=_lights(config, generator, azimuths, target, (lowest, highest)),
-        target=target,
-        azimuths=azimuths,
-    )
+    cameras = _shifted(pinholes(poses, focal_px, config.width, config.height), config)
+    lights = _lights(config, generator, azimuths, target, (lowest, highest))
+    return cameras, lights, target, azimuths
 
 
 def _turned_over(
@@ -284,24 +271,22 @@ def _turned_over(
     ]
     room_from_world = rooms.repeat_interleave(torch.tensor(counts), dim=0)
     world_from_room = invert_rigid(room_from_world)
-    cameras = Cameras.cat([one.cameras for one in series])
-    lights = [one.lights for one in series]
+    cameras = Cameras.cat([taken[0] for taken in series])
+    lights = [taken[1] for taken in series]
     positions = torch.cat([one.positions_world for one in lights])
+    turned = Lights(
+        positions_world=transform(world_from_room, positions[:, None])[:, 0],
+        irradiance=torch.cat([one.irradiance for one in lights]),
+        ambient=torch.cat([one.ambient for one in lights]),
+        target_world=lights[0].target_world,  # the box's centre, which stays where it is
+        flash=torch.cat([one.flash for one in lights]),
+    )
     return Scene(
         name=name,
         config=config,
         objects=objects,
         cameras=cameras.replace(cam_from_world=cameras.cam_from_world @ room_from_world),
-        lights=_coloured(
-            Lights(
-                positions_world=transform(world_from_room, positions[:, None])[:, 0],
-                irradiance=torch.cat([one.irradiance for one in lights]),
-                ambient=torch.cat([one.ambient for one in lights]),
-                target_world=lights[0].target_world,  # the box's centre, which stays where it is
-                flash=torch.cat([one.flash for one in lights]),
-            ),
-            config,
-        ),
+        lights=_coloured(turned, config),
         fixed=(TABLES[config.table](generator),),
         world_from_room=world_from_room,
     )

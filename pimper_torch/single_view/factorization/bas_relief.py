@@ -76,11 +76,6 @@ class BasRelief(Record):
 _FLAT = 1e-12
 
 
-def usable_pixels(shading: Float[Tensor, "3 pixel"]) -> Bool[Tensor, " pixel"]:
-    """Find which vectors are finite and not zero."""
-    return shading.isfinite().all(dim=0) & (shading != 0).any(dim=0)
-
-
 def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
@@ -94,22 +89,6 @@ def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     curved = slant > _FLAT * (depth + (x * x + y * y).sum())
     lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
     return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)
-
-
-def require_standard(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
-    """Return the transformation to the standard form, in float64."""
-    relief = standard_relief(shading)
-    if not bool(relief.lam.isfinite()):
-        raise InputError(
-            f"the normals of {shading.shape[1]} pixels are parallel; needed: a curved surface, as "
-            "a plane does not determine a bas-relief transformation. Enlarge the mask."
-        )
-    return relief
-
-
-def cast(relief: BasRelief, like: Tensor) -> BasRelief:
-    """Convert a transformation to the dtype and device of a tensor."""
-    return BasRelief(mu=relief.mu.to(like), nu=relief.nu.to(like), lam=relief.lam.to(like))
 
 
 def rounded_relief(
@@ -150,10 +129,9 @@ def convex(
     Args:
         shading: It is applied to this, raster order.
     """
-    mu, nu, lam = (part.to(shading) for part in (relief.mu, relief.nu, relief.lam))
-    found = BasRelief(mu=mu, nu=nu, lam=lam)
+    found = relief.to(shading.dtype)
     sign = bulge(found.on_shading(shading)[:2], weight.to(shading), mask)
-    return BasRelief(mu=sign * mu, nu=sign * nu, lam=sign * lam)
+    return BasRelief(mu=sign * found.mu, nu=sign * found.nu, lam=sign * found.lam)
 
 
 def bulge(

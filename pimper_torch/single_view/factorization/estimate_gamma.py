@@ -19,62 +19,13 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
+from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
-
-# Widths of the band of details in pixels: wider than noise, narrower than shading; choices.
-_NARROW, _WIDE = 3, 9
-_DARKEST_DETAIL, _MAX_CONTRAST = 0.02, 0.3  # of encoded values, and of details in their logarithm
-_MIN_CONTRAST = 2e-3  # root mean square of details; half a level of 255 in the middle
-# Variance in the band over that above it: 0.11 for noise that is independent from pixel to pixel.
-_MIN_TEXTURE = 0.3
-# Correlation of two views' details where they lie, in standard deviations of that at all other
-# shifts: 0 for views of a moving camera, 4 and more for those of a fixed one; a choice between.
-_MIN_AGREEMENT = 1.5
-
-
-def camera_moved(
-    encoded: Float[Tensor, "view channel height width"], where: Bool[Tensor, "height width"]
-) -> bool:
-    """Return whether details of the photographs lie at other pixels in every one.
-
-    Details are those of the logarithm of the values, between pixel noise and shading, so that
-    light hardly changes them. False where the photographs have none.
-    """
-    logs = encoded.mean(dim=1, keepdim=True).clamp_min(_DARKEST_DETAIL).log()
-    smooth = _mean(logs, _NARROW)
-    where = where.clone()
-    where[:_WIDE], where[-_WIDE:] = False, False  # means lean to one side there
-    where[:, :_WIDE], where[:, -_WIDE:] = False, False
-    details = where * (smooth - _mean(smooth, _WIDE)).clamp(-_MAX_CONTRAST, _MAX_CONTRAST)[:, 0]
-    grain = where * (logs - smooth).clamp(-_MAX_CONTRAST, _MAX_CONTRAST)[:, 0]
-    texture = details.square().sum(dim=(1, 2)) / grain.square().sum(dim=(1, 2)).clamp_min(1e-12)
-    contrast = (details.square().sum(dim=(1, 2)) / where.sum().clamp_min(1)).sqrt()
-    if float(texture.median()) < _MIN_TEXTURE or float(contrast.median()) < _MIN_CONTRAST:
-        return False
-    spectra = torch.fft.rfft2(details)
-    count = len(details)
-    agreements = []
-    for first in range(count):
-        for second in {(first + 1) % count, (first + count // 2) % count}:
-            product = spectra[first] * spectra[second].conj()
-            correlation = torch.fft.irfft2(product, s=details.shape[1:])
-            spread = correlation.std().clamp_min(1e-12)
-            agreements.append(correlation[0, 0] / spread)
-    return float(torch.stack(agreements).median()) < _MIN_AGREEMENT
-
-
-def _mean(
-    planes: Float[Tensor, "view 1 height width"], size: int
-) -> Float[Tensor, "view 1 height width"]:
-    return avg_pool2d(planes, size, 1, size // 2, count_include_pad=False)
-
 
 # Further linearizations about the fit, with outlier weights: a choice, as each exponent starts from
 # the last one's fit.
@@ -221,9 +172,6 @@ _MAX_SAMPLES = 300
 
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
-# Cauchy's loss is as good as least squares on Gaussian noise to 95 % at 2.385 deviations
-# (Holland & Welsch, 1977).
-_CAUCHY = 2.385
 
 # The estimate is checked without these fractions of the entries, the darkest: a choice.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
@@ -232,9 +180,6 @@ _MIN_FREE = 100
 # Difference from the estimate of the brighter entries, in its standard errors, above which the
 # standard error grows, and above which the brighter entries replace the estimate: choices.
 _SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
-
-# Selections of entries by the fit; the first still starts from a selection by noisy values.
-_CHOICES = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -267,7 +212,7 @@ class GammaEstimate(Record):
             return f"{found}."
         noisy = self.residual > _MAX_RESIDUAL
         why = (
-            "shadows, highlights or another curve leave more than noise"
+            "shadows, highlights, another curve or a camera that moved leave more than noise"
             if noisy
             else "light or surfaces vary too little"
         )
@@ -315,7 +260,7 @@ def estimate_gamma(
         )
     with torch.no_grad():
         problem = _problem(encoded, seen, rank)
-        for _ in range(_CHOICES):
+        for _ in range(2):  # the first still starts from a selection by noisy values
             problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
         return _estimate_of(_consistent_minimum(problem))
 
@@ -334,7 +279,7 @@ def gamma_of_photographs(
         mask: True on the object, for all photographs.
 
     Raises:
-        InputError: As :func:`estimate_gamma`, for unlike sizes, and where the camera moved.
+        InputError: As :func:`estimate_gamma`, and for unlike sizes.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
         raise InputError(
@@ -349,12 +294,6 @@ def gamma_of_photographs(
                 f"{where.shape[1]} x {where.shape[0]}; needed: a mask of the same size."
             )
         where = where & mask
-    if camera_moved(views.images, where):
-        raise InputError(
-            "the photographs show their details at other pixels each, so that the camera or "
-            "the object moved; needed: photographs of one fixed camera and object, under several "
-            "lights. Gamma cannot be found from these: take such a series."
-        )
     encoded = views.images[:, views.images.shape[1] // 2][:, where]
     return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
@@ -412,7 +351,9 @@ def _chosen_by_fit(
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used
     residual = (encoded - predicted)[used]
-    scale = _CAUCHY * float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
+    scale = CAUCHY_TUNING * float(
+        robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool))
+    )
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
@@ -467,17 +408,11 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
     for position, estimate in enumerate(found):
-        subsets = [brighter for brighter in found[position + 1 :] if brighter.inner]
-        differences = [abs(brighter.gamma - estimate.gamma) for brighter in subsets]
-        consistent = [
-            each <= _MAX_ERRORS * brighter.error + _ROUNDING * estimate.gamma
-            for each, brighter in zip(differences, subsets, strict=True)
-        ]
-        if all(consistent):
-            excess = [
-                each - _SUSPECT_ERRORS * brighter.error
-                for each, brighter in zip(differences, subsets, strict=True)
-            ]
+        brighter = [one for one in found[position + 1 :] if one.inner]
+        apart = [(abs(one.gamma - estimate.gamma), one.error) for one in brighter]
+        rounding = _ROUNDING * estimate.gamma
+        if all(gap <= _MAX_ERRORS * error + rounding for gap, error in apart):
+            excess = [gap - _SUSPECT_ERRORS * error for gap, error in apart]
             return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
     raise AssertionError("nothing contradicts the last estimate")
 

@@ -25,8 +25,6 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.bilinear import Bilinear, Factors
-from pimper_torch.photometry.cone import tangents
-from pimper_torch.photometry.quadratics import outer
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
 
@@ -55,42 +53,16 @@ class Free:
         return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the space; with rank three by albedo, then by two rotations of the normal."""
-        if self.rank == 3:
-            _, normal = self.split(shading.mT)
-            return [column.mT for column in (normal, *tangents(normal))]
+        """Return the axes of the space."""
         eye = torch.eye(self.rank, dtype=shading.dtype, device=shading.device)
         return [axis[:, None].expand_as(shading) for axis in eye]
 
     def split(
         self, shading: Float[Tensor, "*batch rank"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        """Return albedo and unit normal of vectors of rank three."""
-        self._only_three()
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch rank"]]:
+        """Return lengths and directions: albedo and normals with rank three."""
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]
-
-    def join(
-        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch 3"]:
-        """Return the vectors of albedo and normal."""
-        self._only_three()
-        return albedo[..., None] * normals
-
-    def normal_prior(
-        self, normals: Float[Tensor, "*batch 3 sample"]
-    ) -> Float[Tensor, "*batch 6 sample"]:
-        r"""Return the penalty :math:`\lVert b - (b \cdot \bar n) \bar n \rVert^2`, packed."""
-        self._only_three()
-        one, zero = torch.ones_like(normals[..., 0, :]), torch.zeros_like(normals[..., 0, :])
-        unit = torch.stack([one, zero, zero, one, zero, one], dim=-2)
-        return unit - outer(normals)
-
-    def _only_three(self) -> None:
-        if self.rank != 3:
-            raise InputError(
-                f"vectors of rank {self.rank} have no albedo and normal; needed: rank 3."
-            )
 
 
 def low_rank_problem(

@@ -18,9 +18,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import (
     BasRelief,
-    cast,
-    require_standard,
-    usable_pixels,
+    standard_relief,
 )
 
 # Channels darker than this fraction of a photograph's brightest value are ignored: a choice.
@@ -152,20 +150,25 @@ def resolve_by_albedo_entropy(
     scale, the standard form and the use of colour are ours.
     """
     with torch.no_grad():
-        usable = usable_pixels(shading)
+        usable = shading.isfinite().all(dim=0) & (shading != 0).any(dim=0)
         count = int(usable.sum())
         if count < 50:
             raise InputError(
                 f"{count} of {shading.shape[1]} shading vectors are finite and not zero; needed: "
                 "50 at least for a histogram of albedo. Enlarge the mask."
             )
-        start = require_standard(shading[:, usable])
+        start = standard_relief(shading[:, usable])
+        if not bool(start.lam.isfinite()):
+            raise InputError(
+                f"the normals of {count} pixels are parallel; needed: a curved surface, as a plane "
+                "does not determine a bas-relief transformation. Enlarge the mask."
+            )
         b = start.on_shading(shading[:, usable].double())
         labels = torch.zeros_like(b[0]).long() if groups is None else groups[usable]
         labels = torch.unique(labels, return_inverse=True)[1]
         found = _minimized(b, labels, width, max_pixels)
         whole = BasRelief(mu=found[0], nu=found[1], lam=found[2].exp()).after(start)
-        return cast(whole, shading)
+        return whole.to(shading.dtype)
 
 
 def albedo_entropy(

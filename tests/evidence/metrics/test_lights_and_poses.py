@@ -7,6 +7,7 @@ from pimper_torch.evidence.metrics import (
     similarity_between_cameras,
 )
 from pimper_torch.geometry.frames import rigid
+from pimper_torch.records import Mesh
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
@@ -53,6 +54,14 @@ def test_unknown_lights_are_left_out(generator):
     assert compare_lights(ours[:2], truth[:2], torch.eye(3).double()) is None
 
 
+def cloud(points):
+    return Mesh(vertices_world=points, faces=torch.zeros(0, 3, dtype=torch.long))
+
+
+def cloud_diagonal(points):
+    return float((points.amax(dim=0) - points.amin(dim=0)).norm())
+
+
 def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
     truth = make.cameras()
     ours = truth.cam_from_world.clone()
@@ -63,9 +72,8 @@ def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
         cam_from_world=ours,
         intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([1.1, 1.1, 1])[:, None],
     )
-    found = compare_cameras(
-        cameras, truth, IDENTITY, views=7, centre=torch.zeros(3).double(), diagonal=2.0
-    )
+    corners = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]]).double()
+    found = compare_cameras(cameras, truth, IDENTITY, views=7, surface=cloud(corners))
     assert (found.views, found.missing) == (7, 2)
     assert found.mean_rotation_deg == pytest.approx(3 / 5)
     assert found.median_rotation_deg == pytest.approx(0, abs=1e-6)
@@ -93,15 +101,16 @@ def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(ma
 def test_positions_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):
     truth = make.cameras()
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
+    points[:2] = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]])  # a diagonal of 2 and a little
     shift = torch.eye(4).double()
     shift[0, 3] = 0.02
-    found = compare_cameras(truth, truth, shift, views=5, diagonal=2.0, points_true=points)
-    assert found.mean_position_percent == pytest.approx(1.0)
+    found = compare_cameras(truth, truth, shift, views=5, surface=cloud(points))
+    assert found.mean_position_percent == pytest.approx(2 / cloud_diagonal(points))
     assert found.mean_bend_percent < 1e-9
     longer = truth.replace(
         intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([1.05, 1.05, 1])[:, None]
     )
-    found = compare_cameras(longer, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
+    found = compare_cameras(longer, truth, IDENTITY, views=5, surface=cloud(points))
     assert found.mean_bend_percent > 0.01
     assert found.mean_position_percent > found.mean_bend_percent
 
@@ -113,7 +122,7 @@ def test_positions_of_resized_photographs_are_compared_in_their_own_pixels(make,
         intrinsics=truth.intrinsics * truth.intrinsics.new_tensor([0.5, 0.5, 1])[:, None],
         sizes_px=truth.sizes_px // 2,
     )
-    found = compare_cameras(half, truth, IDENTITY, views=5, diagonal=2.0, points_true=points)
+    found = compare_cameras(half, truth, IDENTITY, views=5, surface=cloud(points))
     assert found.mean_position_percent < 1e-9
 
 

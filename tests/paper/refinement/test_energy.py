@@ -9,9 +9,9 @@ from pimper_torch.paper.refine import assemble, seam_weight
 
 def minimiser(subdivision, blend, supported, radius, num_facets, spacing=0.1):
     fidelity = torch.full((num_facets,), (radius * spacing) ** -2, dtype=torch.float64)
-    parts = assemble(subdivision, fidelity, supported)
-    factor = SparseCholesky(parts.rows, parts.cols, parts.values, size=len(blend))
-    return factor.solve(parts.mass[:, None] * blend)
+    rows, cols, values, mass = assemble(subdivision, fidelity, supported)
+    factor = SparseCholesky(rows, cols, values, size=len(blend))
+    return factor.solve(mass[:, None] * blend)
 
 
 @pytest.fixture

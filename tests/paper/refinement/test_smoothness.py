@@ -28,9 +28,9 @@ def everywhere(subdivision):
 
 def published(subdivision, blend, radius):
     fidelity = torch.full((2,), (radius * SPACING) ** -2, dtype=torch.float64)
-    parts = assemble(subdivision, fidelity, everywhere(subdivision))
-    factor = SparseCholesky(parts.rows, parts.cols, parts.values, size=len(blend))
-    return factor.solve(parts.mass[:, None] * blend)
+    rows, cols, values, mass = assemble(subdivision, fidelity, everywhere(subdivision))
+    factor = SparseCholesky(rows, cols, values, size=len(blend))
+    return factor.solve(mass[:, None] * blend)
 
 
 def published_energy(subdivision, blend, places, radius):

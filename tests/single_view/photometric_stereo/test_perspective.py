@@ -1,11 +1,12 @@
 import pytest
 import torch
+from one_view import photograph, point_lights
 from reliefs import bumps_in_perspective, regions
 from torch.autograd.functional import jvp
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.render_in_memory import Sphere, photograph, point_lights
+from pimper_torch.evidence.scenes.render_in_memory import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.perspective import (
     factorize_in_perspective,
