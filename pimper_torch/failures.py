@@ -14,6 +14,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Int
 
 from pimper_torch.errors import (
     InputError,
@@ -95,6 +96,18 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
         return
     for failure in failures:
         journal.tell(failure)
+
+
+def skipped_patches(
+    stage: str, facets: Int[torch.Tensor, " patch"], reason: str, done: str
+) -> None:
+    """Note patches that were left out; see :func:`skipped`."""
+    skipped(
+        *(
+            Failure(stage=stage, what="patch", name=str(facet), reason=reason, done=done)
+            for facet in facets.tolist()
+        )
+    )
 
 
 def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:

@@ -33,6 +33,7 @@ class Journal:
         aside: Seconds by line of what no stage does.
         progress: Hears how many steps of how many are done.
         masks: Hears of the masks of guards.
+        worker: Whether this thread is one of several: what it calls runs in it alone.
     """
 
     events: list[object] | None = None
@@ -44,6 +45,7 @@ class Journal:
     aside: dict[str, float] = field(default_factory=dict)
     progress: Callable[[int, int], None] | None = None
     masks: Callable[..., None] | None = None
+    worker: bool = False
 
     def so_far(self) -> list[object]:
         """Return the list of events; a new one where nobody collects them."""
@@ -55,7 +57,7 @@ class Journal:
             self.events.append(event)
 
 
-_current: ContextVar[Journal] = ContextVar("journal", default=Journal())  # noqa: B039, as nobody adds to it
+_current: ContextVar[Journal] = ContextVar("journal", default=Journal())  # noqa: B039
 
 
 def current() -> Journal:

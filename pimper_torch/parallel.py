@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from contextvars import ContextVar, copy_context
+from contextvars import copy_context
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import TypeVar
@@ -17,6 +18,7 @@ from typing import TypeVar
 import torch
 
 from pimper_torch.failures import halved, out_of_memory, released, skipped
+from pimper_torch.journal import current, writing
 from pimper_torch.ledger import added_up
 from pimper_torch.mapped import drop_pages
 from pimper_torch.progress import listening, report
@@ -24,13 +26,10 @@ from pimper_torch.progress import listening, report
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Whether this thread is a worker already: what it calls runs in it alone.
-_working: ContextVar[bool] = ContextVar("working", default=False)
-
 
 def num_workers() -> int:
     """Return how many batches are worked on side by side: as many as torch has threads."""
-    return 1 if _working.get() else torch.get_num_threads()
+    return 1 if current().worker else torch.get_num_threads()
 
 
 def side_by_side(
@@ -51,7 +50,7 @@ def side_by_side(
     """
     workers = min(num_workers(), len(items))
     results = _in_threads(work, items, workers) if workers > 1 else _one_by_one(work, items)
-    with nullcontext() if _working.get() else added_up():
+    with nullcontext() if current().worker else added_up():
         for done, result in enumerate(results, start=1):
             yield result
             drop_pages()
@@ -101,8 +100,8 @@ def _in_threads(
     grad = torch.is_grad_enabled()
 
     def one(item: Item) -> Result:
-        _working.set(True)
-        with torch.set_grad_enabled(grad), listening(None):
+        alone = replace(current(), worker=True, progress=None)
+        with torch.set_grad_enabled(grad), writing(alone):
             return work(item)
 
     waiting: deque[tuple[Item, Future[Result]]] = deque()

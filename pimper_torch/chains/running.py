@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from types import FunctionType
 from typing import Any, ParamSpec, TypeVar
 
 from torch import Tensor, nn
@@ -21,7 +20,6 @@ from pimper_torch.records import PatchSet, Record, Views
 from pimper_torch.reporting import called
 from pimper_torch.reporting import stage as reported_stage
 from pimper_torch.store import Store, digest, kept
-from pimper_torch.store.code import code, is_known
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -92,24 +90,16 @@ class Running:
 
     def _kept(self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]) -> object:
         """Find the record of a stage, or make it and keep it."""
-        cls = None if self.store is None or name in _NOT_KEPT else _returns(stage)
-        key = None if cls is None else self._key(name, stage, inputs)
         make: Callable[[], Any] = partial(self._made, name, stage, inputs)
-        if cls is None or key is None:
+        cls = None if self.store is None or name in _NOT_KEPT else _returns(stage)
+        if cls is None:
             return make()
-        record, _ = kept(self.store, key, cls, make)
-        return _beside(record, inputs)
-
-    def _key(
-        self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]
-    ) -> str | None:
-        """Hash all that a record depends on; ``None`` where that is not known."""
         with aside(HASH):
-            parts = [part for each in _flat(stage, *inputs) for part in _parts(each)]
-            if not all(is_known(part.__module__) for part in parts):
-                return None
-            hashed = digest(code(), stage, *inputs)
-        return hashed and f"{name}-{hashed}"
+            hashed = digest(stage, *inputs)
+        if hashed is None:
+            return make()
+        record, _ = kept(self.store, f"{name}-{hashed}", cls, make)
+        return _beside(record, inputs)
 
     def _made(self, name: str, stage: Callable[..., Any], inputs: tuple[object, ...]) -> object:
         """Call a stage; what was put off is made first, or a few patches at a time with it."""
@@ -143,13 +133,6 @@ def _flat(*values: object) -> Iterator[object]:
     """Yield stages and records, those of records that are made later, too."""
     for value in values:
         yield from _flat(value.stage, *value.inputs) if isinstance(value, Later) else (value,)
-
-
-def _parts(value: object) -> Sequence[nn.Module | FunctionType]:
-    """List what of a value is code: all parts of a stage, or a function."""
-    if isinstance(value, nn.Module):
-        return list(value.modules())
-    return [value] if isinstance(value, FunctionType) else []
 
 
 def _returns(call: Callable[..., object]) -> type[Record] | None:

@@ -1,4 +1,4 @@
-"""Lights and albedo fitted together: twin of ``photometry.light_fit``'s descent.
+"""Lights and albedo fitted together by damped Gauss-Newton, for ``photometry.light_fit``.
 
 Arrays are view by sample, so that loops run along samples. Their count is a multiple of TILE; no
 view sees those of the padding.

@@ -10,14 +10,14 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.failures import skipped
+from pimper_torch.failures import skipped_patches
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
 from pimper_torch.patches.transfer import transfer
 from pimper_torch.patches.view_choice import view_blocks
-from pimper_torch.records import Cameras, CoarseMesh, Failure, PatchSet, Surface, Templates
+from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
 from pimper_torch.stage import Stage
 
 
@@ -119,18 +119,8 @@ def with_area(coarse: CoarseMesh) -> CoarseMesh:
     kept = (face_normals(mesh.vertices_world.detach(), mesh.faces) != 0).any(dim=1)
     if bool(kept.all()):
         return coarse
-    skipped(
-        *(
-            Failure(
-                stage="decompose",
-                what="patch",
-                name=str(facet),
-                reason="its facet has no area",
-                done="These facets are left out of the coarse mesh",
-            )
-            for facet in (~kept).nonzero()[:, 0].tolist()
-        )
-    )
+    reason, done = "its facet has no area", "These facets are left out of the coarse mesh"
+    skipped_patches("decompose", (~kept).nonzero()[:, 0], reason, done)
     if points is not None:
         points = points.take(kept[points.facet].nonzero()[:, 0])
         points = points.replace(facet=(kept.long().cumsum(dim=0) - 1)[points.facet])

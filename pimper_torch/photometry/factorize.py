@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
 from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.failures import by_data, out_of_memory, over_patches, reason_of, skipped
+from pimper_torch.failures import over_patches, skipped_patches, solved_or
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
@@ -46,7 +46,6 @@ from pimper_torch.photometry.status import light_varies, patch_status, warn_of_u
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
     Convergence,
-    Failure,
     Observations,
     PatchPriors,
     PatchStatus,
@@ -288,20 +287,15 @@ class Factorize(Stage):
         """Fit the light field; soft light, which is simpler, where what was asked for fails."""
         config, model = self.config, self.config.light
         fit = partial(light_of_mesh, seen, coarse, config.min_views, colours=config.colours)
-        try:
+        if model == "soft":
             return fit(model)
-        except Exception as error:
-            if model == "soft" or not by_data(error) or out_of_memory(error):
-                raise
-            failure = Failure(
-                stage="factorize",
-                what="solver",
-                name=f"fit of {model} light",
-                reason=reason_of(error),
-                done="Soft light was fitted instead",
-            )
-            skipped(failure, error=error)
-        return fit("soft")
+        return solved_or(
+            partial(fit, model),
+            partial(fit, "soft"),
+            stage="factorize",
+            name=f"fit of {model} light",
+            done="Soft light was fitted instead",
+        )
 
     def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
         """Factorize some patches, independently of others.
@@ -409,7 +403,8 @@ class Factorize(Stage):
         leave_out("photometry.robust", int(outvoted.sum()), total=int(rows.seen.sum()))
         failed = (prepared.status == int(PatchStatus.DETERMINED)) & ~is_solved
         status = torch.where(failed, int(PatchStatus.FAILED), prepared.status)
-        _tell_failed(bucket.templates.facet[failed])
+        lost, reason = bucket.templates.facet[failed], "the solver found no finite solution"
+        skipped_patches("factorize", lost, reason, _COARSE_NORMALS)
         determined = status == int(PatchStatus.DETERMINED)
         valid = enough_views & determined[:, None] & finite_normals & (found.normals[..., 2] < 0)
         fitted = factors.lights.isfinite().flatten(1).all(dim=1) & rows.seen.flatten(1).any(dim=1)
@@ -656,22 +651,6 @@ def _in_parts(seen: PatchViews, bucket: int) -> list[PatchViews]:
         for first in range(0, max(count, 1), size)
         for some in (slice(first, first + size),)
     ]
-
-
-def _tell_failed(facets: Int[Tensor, " failed"]) -> None:
-    """Note the patches for which the solver found no finite solution."""
-    skipped(
-        *(
-            Failure(
-                stage="factorize",
-                what="patch",
-                name=str(facet),
-                reason="the solver found no finite solution",
-                done=_COARSE_NORMALS,
-            )
-            for facet in facets.tolist()
-        )
-    )
 
 
 def _finite(convergence: Convergence, status: Int[Tensor, " patch"]) -> Convergence:

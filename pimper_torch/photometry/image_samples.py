@@ -47,11 +47,6 @@ class ImageSamples:
         """Return Cauchy's weights; zero where not seen."""
         return self.seen * cauchy_weights(residual, scale)
 
-    def cost(self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]) -> float:
-        """Return the sum of Cauchy's loss."""
-        relative = residual / torch.where(scale > 0, scale, 1)
-        return float((self.seen * scale**2 * torch.log1p(relative**2)).sum())
-
     def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
         """Return median radiance of each view, and of each sample relative to its views."""
         missing = torch.where(self.seen, self.radiance, torch.nan)

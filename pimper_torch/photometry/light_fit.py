@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.image_samples import MIN_SPREAD, ImageSamples
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
@@ -64,46 +63,13 @@ def fit_lights(
     limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
     with torch.no_grad():
         lights, albedo = start or model.initialize(samples)
-        minimize = _minimize_by_kernel if compiled_for(samples.radiance) else _minimize
-        lights, albedo = minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
+        lights, albedo = _minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
     return LightFit(model=model, lights=lights, albedo=albedo)
 
 
 def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
     parts = (samples.radiance, *model.geometry())
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
-
-
-def _minimize_by_kernel(
-    model: LightModel,
-    samples: ImageSamples,
-    lights: Float[Tensor, "view parameter"],
-    albedo: Float[Tensor, " sample"],
-    limit: int,
-    min_gain: float,
-) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-    from pimper_torch.kernels.lights import TILE, fit
-
-    count = len(albedo)
-    lights = lights.clone(memory_format=torch.contiguous_format)
-    padding = (0, -count % TILE)
-    known, radiance, seen = (
-        pad(each.detach().mT.to(albedo), padding).contiguous().numpy()
-        for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
-    )
-    found, level = pad(albedo, padding), samples.level.detach()
-    fit(
-        known,
-        radiance,
-        seen,
-        level.numpy(),
-        1 / MIN_DISTANCE,
-        limit,
-        min_gain,
-        lights.numpy(),
-        found.numpy(),
-    )
-    return lights, found[:count]
 
 
 def _minimize(
@@ -115,34 +81,28 @@ def _minimize(
     min_gain: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
     """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
-    shading = model.shade(lights)
-    residual = samples.residual(albedo, shading)
-    damping = 1e-3
-    for step in range(limit):
-        widen = max(1.0, 4.0 * 0.7**step)
-        scale = widen * samples.scale(residual)
-        weight = samples.weights(residual, scale)
-        cost = samples.cost(residual, scale)
-        jacobian = albedo[:, None, None] * model.jacobian(lights)
-        weighted = weight * residual
-        gradient = (weighted[..., None] * jacobian).sum(dim=0)
-        # Active bound: the gradient points out of the feasible set.
-        fixed = model.clamp(lights + gradient) == lights
-        normal = _normal_equations(shading, torch.where(fixed, 0, jacobian), weight, damping)
-        steps = normal.solve(torch.where(fixed, 0, gradient), (weighted * shading).sum(dim=1))
-        new_lights = model.clamp(lights + steps[0])
-        new_shading = model.shade(new_lights)
-        new_albedo = _best_albedo(samples, new_shading, albedo + steps[1], weight, scale)
-        new_residual = samples.residual(new_albedo, new_shading)
-        new_cost = samples.cost(new_residual, scale)
-        if new_cost < cost:
-            lights, albedo, shading, residual = new_lights, new_albedo, new_shading, new_residual
-            damping = max(damping / 4, 1e-9)
-            if widen == 1 and new_cost > cost * (1 - min_gain):
-                break
-        else:
-            damping = min(damping * 10, 1e6)
-    return lights, albedo
+    from pimper_torch.kernels.lights import TILE, fit
+
+    count, device = len(albedo), albedo.device
+    lights, found = lights.cpu().clone(memory_format=torch.contiguous_format), albedo.cpu()
+    padding = (0, -count % TILE)
+    known, radiance, seen = (
+        pad(each.detach().mT.to(found), padding).contiguous().numpy()
+        for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
+    )
+    found, level = pad(found, padding), samples.level.detach().cpu()
+    fit(
+        known,
+        radiance,
+        seen,
+        level.numpy(),
+        1 / MIN_DISTANCE,
+        limit,
+        min_gain,
+        lights.numpy(),
+        found.numpy(),
+    )
+    return lights.to(device), found[:count].to(device)
 
 
 def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
@@ -191,24 +151,6 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
         lights=answer[:count].reshape(found.lights.shape),
         albedo=answer[count:],
     )
-
-
-def _best_albedo(
-    samples: ImageSamples,
-    shading: Float[Tensor, "sample view"],
-    albedo: Float[Tensor, " sample"],
-    weight: Float[Tensor, "sample view"],
-    scale: Float[Tensor, " view"],
-) -> Float[Tensor, " sample"]:
-    """Return the albedo that minimizes the loss, by two steps of reweighted least squares.
-
-    The model is bilinear: after a joint step of lights and albedo it is not the minimum.
-    """
-    for _ in range(2):
-        best = samples.albedo_under(shading, weight)
-        albedo = torch.where(best.isfinite(), best, albedo)
-        weight = samples.weights(samples.residual(albedo, shading), scale)
-    return albedo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

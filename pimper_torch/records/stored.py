@@ -39,6 +39,7 @@ _DTYPES = frozenset(
     {torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
     | {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64}
 )
+_UNLIKE = object()
 _AGAIN = "Save the record again with `save_record`."
 
 
@@ -204,35 +205,47 @@ class _Reader:
         else:
             choices = (hint,)
         for choice in choices:
-            if _may_be(found, choice):
-                return self._made(found, choice, where)
+            made = self._made(found, choice, where)
+            if made is not _UNLIKE:
+                return made
         raise self._refused(where, f"is {_shortly(found)}", " or ".join(map(_named, choices)))
 
     def _made(self, found: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
-        """Return a value whose kind is right; what is inside it may not be."""
-        if _is_a(hint, Record):
-            return self._record(found["fields"], hint, where)
-        if _is_a(hint, AbstractArray) or _is_a(hint, Tensor):
-            return self._tensor(found["tensor"], where)
+        """Return the value, or ``_UNLIKE`` where it is of another kind than the annotation."""
+        origin, hints = typing.get_origin(hint) or hint, typing.get_args(hint)
+        if origin is typing.Literal:
+            same = any(type(found) is type(one) and found == one for one in hints)
+            return found if same else _UNLIKE
         if isinstance(found, list):
-            return self._tuple(found, typing.get_args(hint), where)
+            return self._tuple(found, hints, where) if origin in (object, tuple) else _UNLIKE
         if not isinstance(found, dict):
-            return found
-        ((kind, content),) = found.items()
-        if kind == "map":
-            inner = (*typing.get_args(hint), object, object)[1]
-            return {key: self.value(content[key], inner, _inside(where, key)) for key in content}
-        if kind == "list":
-            inner = (*typing.get_args(hint), object)[0]
-            items = enumerate(content)
-            return [self.value(item, inner, _inside(where, index)) for index, item in items]
-        if kind == "enum" and content not in hint.__members__:
-            raise self._refused(where, f"is {content!r}", f"one of {', '.join(hint.__members__)}")
-        if kind == "path" and "\0" in content:
-            raise self._refused(where, f"is {content!r}", "a path")
-        return (
-            hint[content] if kind == "enum" else Path(content) if kind == "path" else float(content)
-        )
+            kinds = (float, int) if origin is float else (origin,)
+            return found if origin is object or type(found) in kinds else _UNLIKE
+        match sorted(found.items()):
+            case [("fields", dict(fields)), ("record", name)] if _is_a(hint, Record):
+                return self._record(fields, hint, where) if name == hint.__name__ else _UNLIKE
+            case [("tensor", str(name))] if _is_a(hint, AbstractArray | Tensor):
+                return self._tensor(name, where)
+            case [("map", dict(content))] if origin is object or _is_a(origin, Mapping):
+                inner = (*hints, object, object)[1]
+                items = content.items()
+                return {key: self.value(item, inner, _inside(where, key)) for key, item in items}
+            case [("list", list(content))] if origin in (object, list):
+                inner = (*hints, object)[0]
+                pairs = enumerate(content)
+                return [self.value(item, inner, _inside(where, at)) for at, item in pairs]
+            case [("enum", str(name))] if _is_a(hint, Enum):
+                if name not in hint.__members__:
+                    known = f"one of {', '.join(hint.__members__)}"
+                    raise self._refused(where, f"is {name!r}", known)
+                return hint[name]
+            case [("path", str(text))] if _is_a(hint, Path):
+                if "\0" in text:
+                    raise self._refused(where, f"is {text!r}", "a path")
+                return Path(text)
+            case [("float", "nan" | "inf" | "-inf" as text)] if origin in (object, float):
+                return float(text)
+        return _UNLIKE
 
     def _record(self, fields: Mapping[str, Any], cls: Any, where: str) -> Record:  # noqa: ANN401
         hints, known = typing.get_type_hints(cls), {field.name for field in dataclasses.fields(cls)}
@@ -303,36 +316,7 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return made
 
 
-def _may_be(found: Any, hint: Any) -> bool:  # noqa: ANN401 - JSON
-    """Return whether a value of JSON is of the annotated kind, not whether its contents are."""
-    origin = typing.get_origin(hint) or hint
-    if origin is typing.Literal:
-        return any(type(found) is type(one) and found == one for one in typing.get_args(hint))
-    if isinstance(found, dict):
-        if found.keys() == {"record", "fields"}:
-            named = _is_a(hint, Record) and found["record"] == hint.__name__
-            return named and isinstance(found["fields"], dict)
-        if len(found) != 1:
-            return False
-        ((kind, content),) = found.items()
-        wanted, holds = {
-            "tensor": (_is_a(hint, AbstractArray) or _is_a(hint, Tensor), str),
-            "map": (origin is object or _is_a(origin, Mapping), dict),
-            "list": (origin in (object, list), list),
-            "enum": (_is_a(hint, Enum), str),
-            "path": (_is_a(hint, Path), str),
-            "float": (origin in (object, float), str),
-        }.get(kind, (False, object))
-        known = kind != "float" or content in ("nan", "inf", "-inf")
-        return wanted and isinstance(content, holds) and known
-    if isinstance(found, list):
-        return origin in (object, tuple)
-    if origin is float:
-        return type(found) in (float, int)
-    return origin is object or type(found) is origin
-
-
-def _is_a(hint: object, cls: type) -> bool:
+def _is_a(hint: object, cls: type | types.UnionType) -> bool:
     return isinstance(hint, type) and issubclass(hint, cls)
 
 
@@ -350,7 +334,7 @@ def _shortly(found: object) -> str:
 
 def _named(hint: Any) -> str:  # noqa: ANN401
     """Name an annotation."""
-    if _is_a(hint, AbstractArray) or _is_a(hint, Tensor):
+    if _is_a(hint, AbstractArray | Tensor):
         return "a tensor"
     plain = typing.get_origin(hint) is None and isinstance(hint, type)
     return "None" if hint is types.NoneType else hint.__name__ if plain else str(hint)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.mapped import LARGE, drop_pages
+from pimper_torch.store.code import code, is_known
 
 _BYTES = 16
 # Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
@@ -23,15 +24,17 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 def digest(*values: object) -> str | None:
     """Hash values, so that equal hashes mean equal bits.
 
-    A module is what it is made with: its class, attributes and submodules. A tensor's device
-    counts, its memory layout doesn't, nor do fields that are not compared, as where files lie.
+    A module is what it is made with: its class, attributes and submodules. The code of modules and
+    functions counts, see :func:`~pimper_torch.store.code.code`. A tensor's device counts, its
+    memory layout doesn't, nor do fields that are not compared, as where files lie.
 
     Args:
         values: Records and other dataclasses, tensors, modules, functions, tuples, lists, mappings,
             enums, paths, numbers, texts, bytes or ``None``.
 
     Returns:
-        Hexadecimal; ``None`` where something cannot be hashed, or gradients are asked for.
+        Hexadecimal; ``None`` where something cannot be hashed, as code of other packages, or
+        gradients are asked for.
     """
     try:
         text = json.dumps([_described(value) for value in values])
@@ -53,10 +56,11 @@ def _described(value: object) -> object:
         return [kind, _tensor(value)]
     if isinstance(value, float | complex | bytes | Path | Enum):
         return [kind, repr(value)]
-    if isinstance(value, types.FunctionType):
-        return [kind, _named(value)]
-    if isinstance(value, nn.Module):
-        return [kind, _described(_held(value))]
+    if isinstance(value, types.FunctionType | nn.Module):
+        if not is_known(value.__module__):
+            raise _UnknownError
+        held = _held(value) if isinstance(value, nn.Module) else _named(value)
+        return [kind, code(), _described(held)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value) if field.compare]
         return [kind, *((name, _described(getattr(value, name))) for name in fields)]

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.failures import over_patches, skipped
+from pimper_torch.failures import over_patches, skipped_patches
 from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
 from pimper_torch.kernels.switch import compiled_for
@@ -22,7 +22,6 @@ from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Failure,
     Heights,
     Observations,
     PatchViews,
@@ -188,18 +187,8 @@ class Sweep(Stage):
         finite = found.offset.isfinite() & found.information.isfinite()
         if bool(finite.all()):
             return found
-        skipped(
-            *(
-                Failure(
-                    stage="sweep",
-                    what="patch",
-                    name=str(int(facet)),
-                    reason="heights are not finite",
-                    done=_NO_HEIGHTS,
-                )
-                for facet in templates.facet[~finite.flatten(1).all(dim=1)]
-            )
-        )
+        lost_facets = templates.facet[~finite.flatten(1).all(dim=1)]
+        skipped_patches("sweep", lost_facets, "heights are not finite", _NO_HEIGHTS)
         return found.replace(
             offset=torch.where(finite, found.offset, 0),
             information=torch.where(finite, found.information, 0),

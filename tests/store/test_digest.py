@@ -1,5 +1,6 @@
 """Hashes of values: equal where the bits are, and nowhere else."""
 
+import sys
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -10,7 +11,7 @@ from torch import nn
 
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.meshing.extract import Extract
-from pimper_torch.store import digest
+from pimper_torch.store import digest, opened
 
 
 class Color(Enum):
@@ -30,16 +31,13 @@ class Other:
     b: object = 2
 
 
-def first() -> None: ...
-
-
-def second() -> None: ...
+def own() -> None: ...
 
 
 UNLIKE = [
     *(None, True, 1, "1", 1.0, b"1", (1,), [1], ((1,),), (), {}, {"a": 1}, {"b": 1}, {1: "a"}),
     *(0.0, -0.0, float("nan"), float("inf"), "None", 1j, Path("1"), Path("1/2")),
-    *(Color.RED, Color.BLUE, Pair(), Pair(b=3), Other(), first, second),
+    *(Color.RED, Color.BLUE, Pair(), Pair(b=3), Other(), digest, opened),
     *(torch.zeros(2), torch.zeros(2, 1), torch.zeros(2).double(), torch.tensor([0.0, -0.0])),
     *(torch.zeros(2, dtype=torch.int32), torch.zeros(8, dtype=torch.uint8), torch.zeros(0)),
     *(torch.tensor(0.0), torch.tensor([0.0]), torch.zeros(2, dtype=torch.bfloat16)),
@@ -98,7 +96,20 @@ def test_a_tensor_is_hashed_once_until_it_is_written_into(monkeypatch):
         assert digest(torch.zeros(5)) == before
 
 
-def test_a_function_made_inside_another_is_not_known():
+class Own(nn.Module):
+    """A module of another package."""
+
+
+def test_code_of_other_packages_or_made_inside_a_function_is_not_known():
     def inner() -> None: ...
 
-    assert digest(inner) is None
+    inner.__module__ = digest.__module__
+    for unknown in (inner, own, Own(), nn.Sequential(Own())):
+        assert digest(unknown) is None
+
+
+def test_the_package_s_code_counts_where_code_is_hashed(monkeypatch):
+    before = [digest(value) for value in (opened, Fuse(), 1)]
+    monkeypatch.setattr(sys.modules[digest.__module__], "code", lambda: "edited")
+    changed = [digest(value) for value in (opened, Fuse(), 1)]
+    assert [one == other for one, other in zip(before, changed, strict=True)] == [0, 0, 1]
