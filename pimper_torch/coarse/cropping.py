@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.ledger import leave_out
-from pimper_torch.mapped import by_view, zeros
+from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.records import Silhouettes, SparseScene
 
 # Pixels kept round the silhouettes, for windows that reach beyond what they match. A choice.
@@ -38,10 +38,11 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     shown = zeros((views.num_views, height, width), torch.bool, images.device)
     leave_out("coarse.cropping", by_view(lambda one, mask: one & ~mask, views.inside, masks))
     intrinsics = scene.cameras.intrinsics.clone()
-    for view, ((left, top), (w, h)) in enumerate(zip(low.tolist(), size.tolist(), strict=True)):
+    for view, (image, mask) in enumerate(each(views.images, masks)):
+        (left, top), (w, h) = low[view].tolist(), size[view].tolist()
         rows, columns = slice(top, top + h), slice(left, left + w)
-        images[view, :, :h, :w] = views.images[view, :, rows, columns]
-        shown[view, :h, :w] = masks[view, rows, columns]
+        images[view, :, :h, :w] = image[:, rows, columns]
+        shown[view, :h, :w] = mask[rows, columns]
         intrinsics[view] = crop_intrinsics(intrinsics[view], float(left), float(top))
     return scene.replace(
         views=views.replace(images=images, masks=shown, sizes_px=size, priors=()),
