@@ -218,6 +218,15 @@ def test_a_decompression_bomb_is_refused(tmp_path, monkeypatch, pixels):
         decode(tmp_path / "bomb.png")
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_tiff_of_floats_is_told_from_no_tiff(tmp_path, channels):
+    values = np.zeros((8, 12) if channels == 1 else (8, 12, 3), dtype=np.float32)
+    kind = "minisblack" if channels == 1 else "rgb"
+    tifffile.imwrite(tmp_path / "float.tif", values, photometric=kind)
+    with pytest.raises(InputError, match=r"float\.tif: its samples are float32; needed: 8 or 16"):
+        decode(tmp_path / "float.tif")
+
+
 def test_messages_do_not_speak_for_libraries(tmp_path, deep, write_png16):
     write_png16(tmp_path / "deep.png", deep[..., :3])
     data = bytearray((tmp_path / "deep.png").read_bytes())

@@ -150,6 +150,12 @@ def test_a_loader_of_batches_puts_records_together(cameras):
     assert torch.equal(batch.cam_from_world, cameras.cam_from_world)
 
 
+def test_camera_centres_are_transferred_to_the_origin_of_their_camera(cameras):
+    homogeneous = torch.cat([cameras.centers_world, torch.ones(2, 1).double()], dim=1)
+    in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world, homogeneous)
+    torch.testing.assert_close(in_cam[:, :3], torch.zeros(2, 3).double())
+
+
 def test_padding_is_outside_the_photographs():
     views = views_of(2).replace(sizes_px=torch.tensor([[6, 4], [3, 2]]))
     assert views.inside[0].all()

@@ -5,6 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.projection import project
 from pimper_torch.sfm.camera_in_place import (
     fit_map,
+    least_squares_map,
     mapped,
     reference_from_photographs,
     shift_px,
@@ -88,3 +89,18 @@ def test_a_picture_that_rolls_far_is_no_camera_in_its_place(generator):
     angle = torch.tensor(-0.6, dtype=torch.float64)
     second = first @ torch.stack([angle.cos(), angle.sin(), -angle.sin(), angle.cos()]).view(2, 2)
     assert fit_map(first, second, first.new_tensor([300.0, 300.0]), 2.0, generator) is None
+
+
+def test_least_squares_maps_are_those_that_made_the_matches(generator):
+    first = 600 * torch.rand(20, 2, generator=generator, dtype=torch.float64)
+    centre = first.new_tensor([300.0, 200.0])
+    around = torch.eye(3, dtype=torch.float64)
+    around[:2, 2] = -centre
+    any_map = torch.tensor([[1.1, -0.2, 30.0], [0.1, 0.9, -20.0], [1e-4, -2e-4, 1.0]]).double()
+    similar = torch.tensor([[1.1, -0.2, 30.0], [0.2, 1.1, -20.0], [1e-4, -2e-4, 1.0]]).double()
+    similar = around.inverse() @ similar @ around
+    for true, about in ((any_map, None), (similar, centre), (similar, None)):
+        found = least_squares_map(first, mapped(true, first), about)
+        assert_close(found / found[2, 2], true / true[2, 2])
+    found = least_squares_map(first, mapped(any_map, first), centre)
+    assert (mapped(found, first) - mapped(any_map, first)).norm(dim=1).max() > 5

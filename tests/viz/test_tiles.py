@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.viz.tiles import Tile, encoded, fitted, sheet
+from pimper_torch.viz.tiles import Tile, encoded, fitted, sheet, with_triangles
 
 
 def plain(color, height=30, width=40):
@@ -58,6 +58,15 @@ def test_pictures_are_scaled_to_their_tile_and_kept_where_they_fit():
     assert fitted(picture, 40) is picture
     assert fitted(picture, 80).shape == (60, 80, 3)
     np.testing.assert_allclose(fitted(picture, 20), plain((0.2, 0.4, 0.6), 15, 20), atol=1 / 255)
+
+
+def test_triangles_are_drawn_along_their_sides():
+    corners = torch.tensor([[[5.0, 5.0], [35.0, 5.0], [5.0, 25.0]]])
+    drawn = with_triangles(plain((0, 0, 0)), corners, "#ff0000")
+    assert drawn[5, 20, 0] > 0.3
+    assert drawn[15, 5, 0] > 0.3
+    assert drawn[12, 12].max() == 0  # inside
+    assert drawn[28, 38].max() == 0
 
 
 def test_radiance_is_encoded_and_grey_has_three_channels():
