@@ -7,6 +7,14 @@ from torch.testing import assert_close
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets import (
+    read_colmap,
+    read_idr,
+    read_transforms,
+    write_colmap,
+    write_idr,
+    write_transforms,
+)
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
@@ -255,3 +263,31 @@ def test_two_masks_for_one_photograph_are_refused(tmp_path, paint):
         paint(tmp_path / "m" / name, 100)
     with pytest.raises(InputError, match=r"1-a\.png, 1-b\.png"):
         mask_finder(tmp_path / "m", "a toy")(tmp_path / "1.jpg")
+
+
+@pytest.mark.parametrize(
+    ("write", "read", "names"),
+    [
+        (write_colmap, read_colmap, ("first.png", "side_second.png")),
+        (write_transforms, read_transforms, ("first.png", "side_second.png")),
+        (write_idr, read_idr, ("000.png", "001.png")),
+    ],
+)
+def test_what_is_written_is_read_back(capture, tmp_path, sees, write, read, names):
+    write(capture.views, capture.cameras, tmp_path)
+    again = read(tmp_path)
+    assert again.views.names == names
+    assert sees(again) == pytest.approx([9, 11])
+    assert_close(again.views.images, capture.views.images)
+    assert torch.equal(again.views.masks, capture.views.masks)
+    assert_close(again.cameras.intrinsics, capture.cameras.intrinsics)
+    assert_close(again.cameras.cam_from_world, capture.cameras.cam_from_world)
+    assert torch.equal(again.cameras.sizes_px, capture.cameras.sizes_px)
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_a_skew_that_a_layout_has_no_place_for_is_refused(capture, tmp_path, write):
+    K = capture.cameras.intrinsics.clone()
+    K[:, 0, 1] = 5
+    with pytest.raises(InputError, match="a skew"):
+        write(capture.views, capture.cameras.replace(intrinsics=K), tmp_path)
