@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from PIL import Image
@@ -15,6 +14,7 @@ from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.conventions.pictures import (
     REACHES,
+    Ways,
     allowed_turns,
     changed_views,
     find_turns,
@@ -35,21 +35,6 @@ from pimper_torch.sfm.quarter_turns import (
 
 # Of the corners of a photograph by a skew, up to which it is rounding: a choice.
 _MAX_SKEW_PX = 0.1
-
-
-class Ways(NamedTuple):
-    """Models that differ in how the photographs may have come from the pictures that they are of.
-
-    Attributes:
-        plain: Resized; in the pixels of photographs as they stand, then as files store them, where
-            no points tell. Empty where no resize leads to a photograph's shape.
-        cropped: Cut out in the usual ways, where sizes differ and no points tell of a resize.
-        changed: Numbers of the photographs of another size.
-    """
-
-    plain: Sequence[SparseModel]
-    cropped: Sequence[SparseModel] = ()
-    changed: Sequence[int] = ()
 
 
 def existing_ways(views: Views, path: Path) -> Ways:

@@ -17,8 +17,9 @@ from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.components import choose_component
+from pimper_torch.sfm.conventions.pictures import Ways
 from pimper_torch.sfm.doubt import doubt
-from pimper_torch.sfm.existing import Ways, existing_ways, follow_pictures, place, taken
+from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
 from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small
 from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
 from pimper_torch.sfm.model import SparseModel, select_views

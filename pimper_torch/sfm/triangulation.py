@@ -21,13 +21,8 @@ from pimper_torch.sfm.agreement import (
 )
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
-from pimper_torch.sfm.conventions.by_matches import (
-    choose_turns,
-    explained,
-    find_crop,
-    require_agreement,
-)
-from pimper_torch.sfm.existing import Ways
+from pimper_torch.sfm.conventions.by_matches import choose_way, explained
+from pimper_torch.sfm.conventions.pictures import Ways
 from pimper_torch.sfm.features import find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -90,16 +85,7 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
             match_pairs(space, pairs_to_match(space), settings)
             enter_room(leave_out_room(space.database, settings))
         verified = verified_pairs(space)
-        limit = settings.max_error_px
-        given = choose_turns(ways.plain, verified, limit, where) if ways.plain else None
-        crop = (
-            find_crop(given, ways.cropped, ways.changed, verified, limit, where)
-            if ways.cropped
-            else None
-        )
-        given = given if crop is None else crop
-        assert given is not None, "a crop is found, or refused, where no resize is possible"
-        require_agreement(given, verified, limit, where)
+        given = choose_way(ways, verified, settings.max_error_px, where)
         if ways.cropped and not lacks_points(given):
             return given
         offset = local_origin(given.cam_from_world, given.points_world)

@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 import torch
 
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import InputError
+from pimper_torch.numpy_files import read_npy, read_npz
 
 
 def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):
@@ -76,3 +78,21 @@ def test_a_name_longer_than_file_systems_have_is_refused_shortly(tmp_path):
     with pytest.raises(InputError, match="names of files") as told:
         DataSetPath(tmp_path, "a set").inside("x" * 9000)
     assert len(str(told.value)) < 1000
+
+
+@pytest.mark.parametrize("reader", [read_npy, read_npz])
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut short"])
+def test_whatever_a_reader_says_of_a_damaged_file_names_the_file(tmp_path, reader, content):
+    (tmp_path / "a.np").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.np: cannot be read as arrays .*of a toy"):
+        DataSetPath(tmp_path / "a.np", "a toy").read(reader, "arrays")
+    with pytest.raises(InputError, match=r"a file b\.np.*Found: a\.np"):
+        DataSetPath(tmp_path / "b.np", "a toy").read(reader, "arrays")
+
+
+def test_pickles_are_not_opened(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}]), allow_pickle=True)
+    np.savez(tmp_path / "a.npz", a=np.array([{"a": 1}], dtype=object))
+    for name, reader in (("a.npy", read_npy), ("a.npz", read_npz)):
+        with pytest.raises(InputError, match="cannot be read"):
+            DataSetPath(tmp_path / name, "a toy").read(reader, "arrays")

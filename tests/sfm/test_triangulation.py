@@ -16,7 +16,8 @@ from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.agreement import pinholes_of
 from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
 from pimper_torch.sfm.conventions.by_matches import explained
-from pimper_torch.sfm.existing import Ways, existing_ways
+from pimper_torch.sfm.conventions.pictures import Ways
+from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reprojection import observation_errors

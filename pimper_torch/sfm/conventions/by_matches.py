@@ -25,6 +25,7 @@ from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.camera_mistakes import camera_readings
 from pimper_torch.sfm.conventions.choice import far_better, surely_better
 from pimper_torch.sfm.conventions.pictures import (
+    Ways,
     around,
     cut,
     of_another_size,
@@ -72,7 +73,28 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     return near & ahead & ahead_there
 
 
-def choose_turns(
+def choose_way(
+    ways: Ways, verified: Sequence[VerifiedPair], max_error_px: float, where: str
+) -> SparseModel:
+    """Choose the cameras that explain most matches.
+
+    Args:
+        verified: Matches that an epipolar geometry of their own explains.
+        max_error_px: Distance from epipolar lines that is not told from a larger one.
+        where: The cameras are, for messages.
+
+    Raises:
+        InputError: None explains enough, or nothing tells which crop does.
+    """
+    given = _choose_turns(ways.plain, verified, max_error_px, where) if ways.plain else None
+    if ways.cropped:
+        given = _find_crop(given, ways, verified, max_error_px, where) or given
+    assert given is not None, "a crop is found, or refused, where no resize is possible"
+    _require_agreement(given, verified, max_error_px, where)
+    return given
+
+
+def _choose_turns(
     models: Sequence[SparseModel],
     verified: Sequence[VerifiedPair],
     max_error_px: float,
@@ -95,10 +117,9 @@ def choose_turns(
     return models[best]
 
 
-def find_crop(
+def _find_crop(
     plain: SparseModel | None,
-    crops: Sequence[SparseModel],
-    changed: Sequence[int],
+    ways: Ways,
     verified: Sequence[VerifiedPair],
     max_error_px: float,
     where: str,
@@ -110,18 +131,11 @@ def find_crop(
 
     Args:
         plain: Cameras of resized photographs, if such a shape is possible: the plain explanation.
-        crops: Of :func:`~pimper_torch.sfm.conventions.pictures.possible_crops`.
-        changed: Numbers of the photographs that may be cropped.
-        verified: Matches that an epipolar geometry of their own explains.
-        max_error_px: Distance from epipolar lines that is not told from a larger one.
-        where: The cameras are, for messages.
 
     Returns:
         ``None`` where a resize explains the matches as well.
-
-    Raises:
-        InputError: A crop explains them better, but none explains them, or several do.
     """
+    crops, changed = ways.cropped, ways.changed
     strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:_PAIRS]
 
     def errors(model: SparseModel) -> Float[Tensor, " match"]:
@@ -137,9 +151,9 @@ def find_crop(
     while step >= _STEP_PX:
         for _ in range(_MOST_STEPS):
             ring = torch.cat([torch.zeros(1, 2).to(shift), step * around(shift)])
-            ways = torch.minimum(torch.maximum(shift + ring, -room), room)
-            means = torch.stack([errors(shifted(way)).mean() for way in ways])
-            nearest = ways[means.argmin()]
+            shifts = torch.minimum(torch.maximum(shift + ring, -room), room)
+            means = torch.stack([errors(shifted(one)).mean() for one in shifts])
+            nearest = shifts[means.argmin()]
             if torch.equal(nearest, shift):
                 break
             shift = nearest
@@ -162,17 +176,10 @@ def find_crop(
     return crop
 
 
-def require_agreement(
+def _require_agreement(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float, where: str
 ) -> None:
-    """Refuse cameras that explain too little of what photographs show in common.
-
-    Args:
-        verified: Matches that an epipolar geometry of their own explains.
-
-    Raises:
-        InputError: Names the convention that would fit, if one of the usual does.
-    """
+    """Refuse cameras that explain too little; name the convention that would fit, if one does."""
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     total = sum(pair.num_matches for pair in pairs)
     given = _fraction(pairs, cameras, max_error_px)

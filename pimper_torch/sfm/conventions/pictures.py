@@ -8,6 +8,7 @@ model has it, and less so beside it.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -41,6 +42,21 @@ _SWEEPS = 5
 # to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard errors at
 # most; about the truth all are by 4.9 and more.
 _POINTS_BESIDE, REACHES = 400, (4.0, 8.0)
+
+
+class Ways(NamedTuple):
+    """Models that differ in how the photographs may have come from the pictures that they are of.
+
+    Attributes:
+        plain: Resized; in the pixels of photographs as they stand, then as files store them, where
+            no points tell. Empty where no resize leads to a photograph's shape.
+        cropped: Cut out in the usual ways, where sizes differ and no points tell of a resize.
+        changed: Numbers of the photographs of another size.
+    """
+
+    plain: Sequence[SparseModel]
+    cropped: Sequence[SparseModel] = ()
+    changed: Sequence[int] = ()
 
 
 def resize_fits(whole: Size, width: int, height: int) -> bool:

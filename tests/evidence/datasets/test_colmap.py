@@ -78,27 +78,8 @@ def test_a_folder_without_a_model_is_refused(tmp_path):
         read_colmap(tmp_path)
 
 
-def test_what_is_written_is_read_back(capture, tmp_path, sees):
-    write_colmap(capture.views, capture.cameras, tmp_path)
-    again = read_colmap(tmp_path)
-    assert again.views.names == ("first.png", "side_second.png")
-    assert sees(again) == pytest.approx([9, 11])
-    assert_close(again.views.images, capture.views.images)
-    assert torch.equal(again.views.masks, capture.views.masks)
-    assert_close(again.cameras.intrinsics, capture.cameras.intrinsics)
-    assert_close(again.cameras.cam_from_world, capture.cameras.cam_from_world)
-    assert torch.equal(again.cameras.sizes_px, capture.cameras.sizes_px)
-
-
 def test_a_cloud_is_written_with_the_model(capture, tmp_path):
     points = torch.tensor([[6.0, 3, 5], [1, 2, 4]])
     write_colmap(capture.views, capture.cameras, tmp_path, points_world=points)
     found = read_model(tmp_path / "sparse" / "0").points_world
     assert_close(found, points.double())
-
-
-def test_a_skew_is_refused(capture, tmp_path):
-    K = capture.cameras.intrinsics.clone()
-    K[:, 0, 1] = 5
-    with pytest.raises(InputError, match="a skew"):
-        write_colmap(capture.views, capture.cameras.replace(intrinsics=K), tmp_path)

@@ -75,12 +75,6 @@ def test_another_array_is_refused(folder, array):
         read_llff(folder)
 
 
-def test_a_pickle_is_not_opened(folder):
-    np.save(folder / "poses_bounds.npy", np.array([{"a": 1}]), allow_pickle=True)
-    with pytest.raises(InputError, match="cannot be read"):
-        read_llff(folder)
-
-
 def test_columns_that_are_no_rotation_are_refused(folder):
     rows = np.load(folder / "poses_bounds.npy")
     rows[0, 2] = 1.0  # back becomes forward: a reflection

@@ -7,6 +7,14 @@ from torch.testing import assert_close
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
+from pimper_torch.evidence.datasets import (
+    read_colmap,
+    read_idr,
+    read_transforms,
+    write_colmap,
+    write_idr,
+    write_transforms,
+)
 from pimper_torch.evidence.datasets.posed import (
     PosedPhotograph,
     assemble,
@@ -19,6 +27,10 @@ from pimper_torch.records import Lens
 from pimper_torch.sfm.colmap import distort
 
 LENS = Lens(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
+
+
+def put(shots, folder, **options):
+    return assemble(shots, DataSetPath(folder, "a toy"), **options)
 
 
 @pytest.fixture
@@ -34,7 +46,7 @@ def shot(tmp_path, paint, hand_camera):
 
 
 def test_the_camera_stays_with_its_photograph(shot, tmp_path, sees):
-    capture = assemble([shot()], DataSetPath(tmp_path, "a toy"))
+    capture = put([shot()], tmp_path)
     assert sees(capture) == pytest.approx([9, 11])
     assert capture.cameras.cam_from_world.dtype == torch.float64
     assert capture.views.images.dtype == torch.float32
@@ -45,29 +57,29 @@ def test_the_camera_stays_with_its_photograph(shot, tmp_path, sees):
 
 
 def test_linear_values_are_left_as_they_are(shot, tmp_path):
-    capture = assemble([shot()], DataSetPath(tmp_path, "a toy"), encoding=LINEAR)
+    capture = put([shot()], tmp_path, encoding=LINEAR)
     assert_close(float(capture.views.images[0, 0, 0, 0]), 120 / 255)
 
 
 @pytest.mark.parametrize("option", [{"max_size_px": 8}, {}])
 def test_the_camera_follows_when_its_photograph_is_smaller(shot, tmp_path, sees, option):
     small = shot() if option else shot(width=8, height=6)
-    capture = assemble([small], DataSetPath(tmp_path, "a toy"), **option)
+    capture = put([small], tmp_path, **option)
     assert sees(capture) == pytest.approx([4.5, 5.5])
     assert capture.cameras.sizes_px.tolist() == [[8, 6]] == capture.views.sizes_px.tolist()
 
 
 def test_the_skew_follows_a_resize(shot, tmp_path, sees):
     sheared = shot(skew_px=5.0)
-    assert sees(assemble([sheared], DataSetPath(tmp_path, "a toy"))) == pytest.approx([10, 11])
-    small = assemble([sheared], DataSetPath(tmp_path, "a toy"), max_size_px=8)
+    assert sees(put([sheared], tmp_path)) == pytest.approx([10, 11])
+    small = put([sheared], tmp_path, max_size_px=8)
     assert sees(small) == pytest.approx([5, 5.5])
 
 
 def test_photographs_of_unlike_sizes_are_padded(shot, tmp_path, sees):
     wide = Lens(camera=2, model="PINHOLE", params=(20.0, 30.0, 8.0, 4.0), width=20, height=10)
     shots = [shot(), shot("b.png", 20, 10, lens=wide)]
-    capture = assemble(shots, DataSetPath(tmp_path, "a toy"))
+    capture = put(shots, tmp_path)
     assert capture.views.images.shape == (2, 3, 12, 20)
     assert capture.views.sizes_px.tolist() == [[16, 12], [20, 10]]
     assert (capture.views.images[0, :, :, 16:] == 0).all()
@@ -77,14 +89,14 @@ def test_photographs_of_unlike_sizes_are_padded(shot, tmp_path, sees):
 def test_a_grey_photograph_among_coloured_ones_is_grey_in_all_channels(shot, tmp_path, paint):
     grey = shot("b.png")
     paint(tmp_path / "b.png", 50, mode="L")
-    images = assemble([shot(), grey], DataSetPath(tmp_path, "a toy")).views.images
+    images = put([shot(), grey], tmp_path).views.images
     assert images.shape[1] == 3
     assert torch.equal(images[1, 0], images[1, 2])
 
 
 def test_names_choose_and_order_photographs(shot, tmp_path):
     shots = [shot("a.png"), shot("b.png"), shot("c.png", skew_px=3.0)]
-    capture = assemble(shots, DataSetPath(tmp_path, "a toy"), names=["c.png", "a.png"])
+    capture = put(shots, tmp_path, names=["c.png", "a.png"])
     assert capture.views.names == ("c.png", "a.png")
     assert capture.cameras.intrinsics[:, 0, 1].tolist() == [3, 0]
     assert capture.position.tolist() == [0, 1] == capture.light.tolist()
@@ -93,7 +105,7 @@ def test_names_choose_and_order_photographs(shot, tmp_path):
 @pytest.mark.parametrize("names", [["d.png"], [], ["a.png", "a.png"]])
 def test_names_that_are_not_there_or_twice_are_refused(shot, tmp_path, names):
     with pytest.raises(InputError, match=r"needed: some of its 1 photographs.*a\.png"):
-        assemble([shot()], DataSetPath(tmp_path, "a toy"), names=names)
+        put([shot()], tmp_path, names=names)
 
 
 def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_camera):
@@ -113,7 +125,7 @@ def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_came
     shot = PosedPhotograph(
         name="a.png", image=tmp_path / "a.png", lens=lens, cam_from_world=hand_camera
     )
-    capture = assemble([shot], DataSetPath(tmp_path, "a toy"), encoding=LINEAR)
+    capture = put([shot], tmp_path, encoding=LINEAR)
     cameras = capture.cameras
     expected, _ = project(dot, cameras.cam_from_world[0], cameras.intrinsics[0])
     assert (expected - at).norm() > 1  # or the lens did nothing
@@ -127,7 +139,7 @@ def test_a_mask_of_another_size_is_stretched_over_the_photograph(shot, tmp_path)
     drawn = np.zeros((6, 8), dtype=np.uint8)
     drawn[1:3, 4:7] = 1  # a label, not a brightness
     Image.fromarray(drawn).save(tmp_path / "m.png")
-    masks = assemble([shot(mask=tmp_path / "m.png")], DataSetPath(tmp_path, "a toy")).views.masks
+    masks = put([shot(mask=tmp_path / "m.png")], tmp_path).views.masks
     expected = torch.zeros(12, 16, dtype=torch.bool)
     expected[2:6, 8:14] = True
     assert torch.equal(masks[0], expected)
@@ -138,7 +150,7 @@ def test_alpha_is_the_mask_where_there_is_no_other(shot, tmp_path):
     array = np.full((12, 16, 4), 200, dtype=np.uint8)
     array[:4, :, 3] = 0
     Image.fromarray(array).save(tmp_path / "b.png")
-    masks = assemble([with_alpha, shot("a.png")], DataSetPath(tmp_path, "a toy")).views.masks
+    masks = put([with_alpha, shot("a.png")], tmp_path).views.masks
     assert masks[0].sum() == 8 * 16
     assert not masks[0, :4].any()
     assert masks[1].all()
@@ -148,42 +160,42 @@ def test_a_mask_that_shows_a_cut_out_object_goes_by_its_alpha(shot, tmp_path):
     array = np.zeros((12, 16, 4), dtype=np.uint8)  # a black object
     array[3:6, 2:9, 3] = 255
     Image.fromarray(array).save(tmp_path / "m.png")
-    masks = assemble([shot(mask=tmp_path / "m.png")], DataSetPath(tmp_path, "a toy")).views.masks
+    masks = put([shot(mask=tmp_path / "m.png")], tmp_path).views.masks
     assert masks.sum() == 3 * 7
 
 
 def test_an_empty_mask_is_refused(shot, tmp_path):
     Image.fromarray(np.zeros((12, 16), dtype=np.uint8)).save(tmp_path / "m.png")
     with pytest.raises(InputError, match=r"m\.png: marks no pixel"):
-        assemble([shot(mask=tmp_path / "m.png")], DataSetPath(tmp_path, "a toy"))
+        put([shot(mask=tmp_path / "m.png")], tmp_path)
 
 
 def test_a_photograph_of_another_shape_than_its_camera_is_refused(shot, tmp_path):
     with pytest.raises(InputError, match="12 x 16, but its camera is for 16 x 12"):
-        assemble([shot(width=12, height=16)], DataSetPath(tmp_path, "a toy"))
+        put([shot(width=12, height=16)], tmp_path)
 
 
 def test_a_missing_photograph_is_refused_unless_it_is_not_asked_for(shot, tmp_path):
     shots = [shot("a.png"), shot("b.png")]
     (tmp_path / "b.png").unlink()
     with pytest.raises(InputError, match=r"no b\.png"):
-        assemble(shots, DataSetPath(tmp_path, "a toy"))
-    assert assemble(shots, DataSetPath(tmp_path, "a toy"), names=["a.png"]).views.num_views == 1
+        put(shots, tmp_path)
+    assert put(shots, tmp_path, names=["a.png"]).views.num_views == 1
 
 
 def test_two_photographs_of_one_name_are_refused(shot, tmp_path):
     with pytest.raises(InputError, match=r"several a\.png"):
-        assemble([shot(), shot()], DataSetPath(tmp_path, "a toy"))
+        put([shot(), shot()], tmp_path)
 
 
 def test_a_negative_size_is_refused(shot, tmp_path):
     with pytest.raises(InputError, match="max_size_px is -1"):
-        assemble([shot()], DataSetPath(tmp_path, "a toy"), max_size_px=-1)
+        put([shot()], tmp_path, max_size_px=-1)
 
 
 def test_the_true_surface_comes_along(shot, tmp_path):
     (tmp_path / "true.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
-    truth = assemble([shot()], DataSetPath(tmp_path, "a toy"), mesh=tmp_path / "true.obj").truth
+    truth = put([shot()], tmp_path, mesh=tmp_path / "true.obj").truth
     assert truth.mesh.vertices_world.tolist() == [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
 
 
@@ -255,3 +267,31 @@ def test_two_masks_for_one_photograph_are_refused(tmp_path, paint):
         paint(tmp_path / "m" / name, 100)
     with pytest.raises(InputError, match=r"1-a\.png, 1-b\.png"):
         mask_finder(tmp_path / "m", "a toy")(tmp_path / "1.jpg")
+
+
+@pytest.mark.parametrize(
+    ("write", "read", "names"),
+    [
+        (write_colmap, read_colmap, ("first.png", "side_second.png")),
+        (write_transforms, read_transforms, ("first.png", "side_second.png")),
+        (write_idr, read_idr, ("000.png", "001.png")),
+    ],
+)
+def test_what_is_written_is_read_back(capture, tmp_path, sees, write, read, names):
+    write(capture.views, capture.cameras, tmp_path)
+    again = read(tmp_path)
+    assert again.views.names == names
+    assert sees(again) == pytest.approx([9, 11])
+    assert_close(again.views.images, capture.views.images)
+    assert torch.equal(again.views.masks, capture.views.masks)
+    assert_close(again.cameras.intrinsics, capture.cameras.intrinsics)
+    assert_close(again.cameras.cam_from_world, capture.cameras.cam_from_world)
+    assert torch.equal(again.cameras.sizes_px, capture.cameras.sizes_px)
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_a_skew_that_a_layout_has_no_place_for_is_refused(capture, tmp_path, write):
+    K = capture.cameras.intrinsics.clone()
+    K[:, 0, 1] = 5
+    with pytest.raises(InputError, match="a skew"):
+        write(capture.views, capture.cameras.replace(intrinsics=K), tmp_path)

@@ -132,18 +132,6 @@ def test_a_folder_without_the_file_is_refused(tmp_path):
         read_transforms(tmp_path)
 
 
-def test_what_is_written_is_read_back(capture, tmp_path, sees):
-    write_transforms(capture.views, capture.cameras, tmp_path)
-    again = read_transforms(tmp_path)
-    assert sees(again) == pytest.approx([9, 11])
-    assert again.views.names == ("first.png", "side_second.png")
-    assert_close(again.views.images, capture.views.images)
-    assert torch.equal(again.views.masks, capture.views.masks)
-    assert_close(again.cameras.intrinsics, capture.cameras.intrinsics)
-    assert_close(again.cameras.cam_from_world, capture.cameras.cam_from_world)
-    assert torch.equal(again.cameras.sizes_px, capture.cameras.sizes_px)
-
-
 def test_intrinsics_shared_by_all_views_stand_once(capture, tmp_path):
     write_transforms(capture.views.take([0]), capture.cameras.take([0]), tmp_path / "one")
     said = json.loads((tmp_path / "one" / "transforms.json").read_text())
@@ -161,10 +149,3 @@ def test_a_cloud_is_written_beside(capture, tmp_path):
     assert json.loads((tmp_path / "transforms.json").read_text())["ply_file_path"]
     read = read_mesh(tmp_path / "sparse_pc.ply")
     assert_close(read.vertices_world, points.double())
-
-
-def test_a_skew_is_refused(capture, tmp_path):
-    K = capture.cameras.intrinsics.clone()
-    K[:, 0, 1] = 5
-    with pytest.raises(InputError, match="a skew"):
-        write_transforms(capture.views, capture.cameras.replace(intrinsics=K), tmp_path)
