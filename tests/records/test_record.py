@@ -142,14 +142,6 @@ def test_detached_records_are_cut_off(cameras):
     assert not moved.detach().intrinsics.requires_grad
 
 
-def test_a_record_is_saved_and_loaded_without_pickled_code(cameras, tmp_path):
-    box = Box(inside=cameras, many=(torch.ones(2),), label="box")
-    torch.save(box, tmp_path / "box.pt")
-    found = torch.load(tmp_path / "box.pt", weights_only=True)
-    assert found.label == "box"
-    assert torch.equal(found.inside.intrinsics, cameras.intrinsics)
-
-
 def test_a_loader_of_batches_puts_records_together(cameras):
     loader = DataLoader(
         [cameras.take([0]), cameras.take([1])], batch_size=2, collate_fn=Cameras.cat
