@@ -30,14 +30,12 @@ class Record:
     their values have to be, :meth:`check` asks where a record enters a stage. Frozen stops
     rebinding, not writing into a tensor; stages never write into what they were handed.
 
-    Every record is a pytree (``torch.utils._pytree``), whose leaves are its tensors, and may be
-    read by ``torch.load(weights_only=True)``.
+    Every record is a pytree (``torch.utils._pytree``), whose leaves are its tensors.
     """
 
     def __init_subclass__(cls, **settings: Any) -> None:  # noqa: ANN401 - whatever a base takes
         super(Record, cls).__init_subclass__(**settings)
         if "__slots__" in cls.__dict__:  # what `dataclass` makes of the class that was written
-            torch.serialization.add_safe_globals([cls])
             pytree.register_pytree_node(
                 cls,
                 _flatten,

@@ -32,5 +32,5 @@ def main(scene: pt.SparseScene, mesh: pt.Mesh, picture: str) -> None:
 
 
 if __name__ == "__main__":
-    placed, rough = torch.load(sys.argv[1], weights_only=True)
-    main(placed, rough, sys.argv[2])
+    placed = pt.load_record(pt.SparseScene, sys.argv[1])
+    main(placed, pt.load_record(pt.Mesh, sys.argv[2]), sys.argv[3])

@@ -1,0 +1,66 @@
+"""How a chain calls its stages."""
+
+import pytest
+from torch import nn
+
+from pimper_torch.chains.running import Later, Running
+from pimper_torch.errors import PimperWarning, caution
+
+
+class Noting(nn.Module):
+    """A stage that gives what it was handed, in a list, and says that it was called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def forward(self, *given):
+        self.calls += 1
+        caution(f"call {self.calls}")
+        return [*given]
+
+
+@pytest.fixture
+def stages():
+    return {name: Noting() for name in ("warp", "factorize", "sweep", "fuse")}
+
+
+def running(stages, *put_off):
+    return Running(names={one: name for name, one in stages.items()}, store=None, put_off=put_off)
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+def test_what_is_put_off_is_made_once_by_the_stage_that_asks_for_it(stages):
+    run = running(stages, "warp", "factorize")
+    seen = run(stages["warp"], "views", "cameras", "patches")
+    photometric = run(stages["factorize"], seen)
+    assert isinstance(seen, Later)
+    assert stages["warp"].calls == stages["factorize"].calls == 0
+    samples = ["views", "cameras", "patches", None]
+    heights = run(stages["sweep"], "views", "cameras", seen, photometric)
+    assert heights == ["views", "cameras", samples, [samples], None]
+    assert {one.calls for one in stages.values()} == {0, 1}
+
+
+@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+def test_samples_that_were_put_off_come_with_the_other_records(stages):
+    run = running(stages, "warp")
+    seen = run(stages["warp"], "views", "cameras", "patches")
+    found = run(stages["factorize"], "before", seen, "after")
+    assert found == ["before", ["views", "cameras", "patches", None], "after"]
+
+
+def test_passes_but_the_last_are_silent_unless_they_fail(stages):
+    run = running(stages)
+    with pytest.warns(PimperWarning) as caught:
+        found = [run(stages["fuse"], *one) for one in run.passes((0.25, 0.5, 1.0))]
+    assert found == [[0.25, False], [0.5, False], [1.0, True]]
+    assert [str(one.message) for one in caught] == ["call 3"]
+
+    def broken():
+        caution("before it broke")
+        raise ValueError("broken")
+
+    next(run.passes((0.5, 1.0)))
+    with pytest.warns(PimperWarning, match="before it broke"), pytest.raises(ValueError):  # noqa: PT011
+        run(broken)
