@@ -20,13 +20,13 @@ from pimper_torch.evidence.bench.bench_inputs import (
     BenchConfig,
     Inputs,
     Method,
-    Outcome,
+    MethodRun,
     method_named,
     prepare,
     scene_folder,
 )
 from pimper_torch.evidence.bench.bench_table import (
-    Row,
+    BenchRow,
     Table,
     markdown,
     row_of_failure,
@@ -61,8 +61,11 @@ Covered = Bool[Tensor, "height width"]
 
 
 def with_common(
-    rows: Sequence[Row], covered: Sequence[Covered | None], meshes: Sequence[Path], maps: Capture
-) -> list[Row]:
+    rows: Sequence[BenchRow],
+    covered: Sequence[Covered | None],
+    meshes: Sequence[Path],
+    maps: Capture,
+) -> list[BenchRow]:
     """Add figures over the pixels that all methods cover to the rows of a scene.
 
     A method that leaves out difficult parts has small errors on the rest.
@@ -83,7 +86,7 @@ def with_common(
     ]
 
 
-def _with_common(row: Row, path: Path, common: Covered, maps: Capture) -> Row:
+def _with_common(row: BenchRow, path: Path, common: Covered, maps: Capture) -> BenchRow:
     mesh = read_mesh(path)
     met = meet_truth(mesh, maps, 0)
     assert met is not None  # as when it was measured
@@ -183,7 +186,7 @@ class Measured(Record):
             has no surface.
     """
 
-    row: Row
+    row: BenchRow
     panels: MethodPanels
     covered: Covered | None = None
 
@@ -217,7 +220,7 @@ def run_bench(
     observer = observer or Silent()
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
-    rows: list[Row] = []
+    rows: list[BenchRow] = []
     sheet: list[SceneRow] = []
     with (
         written_whole(folder, "table", overwrite=overwrite) as staging,
@@ -263,7 +266,7 @@ def _scene(
     staging: Path,
     observer: Observer,
     cache: Path | str | None,
-) -> tuple[list[Row], list[SceneRow]]:
+) -> tuple[list[BenchRow], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem
     with _shown(observer, f"{name} render"):
@@ -327,18 +330,18 @@ def _cell(
 def row_of(
     scene: str,
     method: str,
-    outcome: Outcome,
+    outcome: MethodRun,
     evaluation: Evaluation,
     *,
     memory: float | None = None,
     sfm_minutes: float | None = None,
-) -> Row:
+) -> BenchRow:
     """Take a row's figures from an outcome and its evaluation."""
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
     seen, missing = surface.seen if surface else None, outcome.missing_fraction
     shape = view.shape_normals if view else None
-    return Row(
+    return BenchRow(
         scene=scene,
         method=method,
         mesh_points=outcome.mesh_points,
