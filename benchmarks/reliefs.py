@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.render_in_memory import Plane
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane
 from pimper_torch.evidence.scenes.textures import Waves
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
@@ -33,7 +33,7 @@ class WavyPlane:
         self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
         """Follow the ray until it is level with the height field."""
-        start = Plane().intersect(origins, directions)
+        start = EndlessPlane().intersect(origins, directions)
         distance = torch.where(start.isfinite(), start, 0)
         for _ in range(_NEWTON_STEPS):
             points = origins + distance[..., None] * directions

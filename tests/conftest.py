@@ -216,7 +216,7 @@ def lift():
     from types import SimpleNamespace
 
     from pimper_torch.evidence.scenes import render_shape
-    from pimper_torch.evidence.scenes.render_in_memory import Plane
+    from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane
     from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.evidence.scenes.scene_lights import wandering_lights
     from pimper_torch.evidence.scenes.textures import random_speckle
@@ -247,7 +247,9 @@ def lift():
             return torch.full_like(points, 0.5)
 
         texture = speckle if textured else bare
-        scene = render_shape(Plane(normal=slant), cameras, point_lights.harmonics_world(), texture)
+        scene = render_shape(
+            EndlessPlane(normal=slant), cameras, point_lights.harmonics_world(), texture
+        )
         normal = torch.tensor(slant, dtype=torch.float64)
         normal = normal / normal.norm()
         xy = torch.tensor([[-0.3, -0.25], [0.3, -0.25], [0.3, 0.25], [-0.3, 0.25]]).double()

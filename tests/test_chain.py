@@ -23,7 +23,7 @@ from pimper_torch.evidence.scenes import (
     render_shape,
 )
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.render_in_memory import Plane, Shape, Sphere
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Shape, Sphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import wandering_lights
 from pimper_torch.evidence.scenes.textures import random_speckle
@@ -97,7 +97,7 @@ def sample_spacing(result: Reconstruction) -> float:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_tilted_plane_stays_a_plane_through_the_whole_chain(preset):
-    plane = Plane(normal=(0.3, -0.2, 1.0))
+    plane = EndlessPlane(normal=(0.3, -0.2, 1.0))
     with warnings.catch_warnings():
         # One normal everywhere leaves the light open, which may rightly be said.
         warnings.simplefilter("ignore", PimperWarning)

@@ -81,7 +81,7 @@ _COMMANDS = {
     "doctor": "pimper_torch.cli.doctor",
     "demo": "pimper_torch.cli.run",
     "config": "pimper_torch.cli.settings",
-    "render": "pimper_torch.evidence.cli.render",
+    "render": "pimper_torch.evidence.cli.render_command",
     "export": "pimper_torch.cli.export",
     "evaluate": "pimper_torch.evidence.cli.evaluate",
     "bench": "pimper_torch.evidence.cli.bench",

@@ -199,7 +199,7 @@ def fill_pixels(
     )
     distance, _ = cKDTree(known).query(grid)
     proposed = torch.from_numpy(grid[distance > 0.8 * edge_px]).to(pixels)
-    return proposed[_inside_any(proposed, pixels, faces)]
+    return proposed[facets_under(proposed, pixels[faces]) >= 0]
 
 
 def interpolate_inverse_depth(
@@ -242,22 +242,6 @@ def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
     return torch.where(rotated[:, None], faces.flip(1), faces)
 
 
-def _inside_any(
-    points: Float[Tensor, "filled 2"],
-    pixels: Float[Tensor, "point 2"],
-    faces: Int[Tensor, "face 3"],
-) -> Tensor:
-    kept = {tuple(sorted(face)) for face in faces.tolist()}
-    found = Delaunay(pixels.detach().cpu().double().numpy())
-    simplex = found.find_simplex(points.detach().cpu().double().numpy())
-    allowed = np.array([tuple(sorted(face)) in kept for face in found.simplices.tolist()] + [False])
-    return torch.from_numpy(allowed[simplex]).to(points.device)
-
-
-# Pairs of points and facets that are tested at once; bounds memory to some 100 MB.
-_TESTS_AT_ONCE = 2_000_000
-
-
 def with_cloud(
     scene: SparseScene,
     reliable: Int[Tensor, " reliable"],
@@ -289,6 +273,10 @@ def with_cloud(
             facet=facet,
         ),
     )
+
+
+# Pairs of points and facets that are tested at once; bounds memory to some 100 MB.
+_TESTS_AT_ONCE = 2_000_000
 
 
 def facets_under(

@@ -118,7 +118,7 @@ def load() -> None:
     import pycolmap  # noqa: F401
 
     import pimper_torch.cli.run
-    import pimper_torch.evidence.cli.render  # noqa: F401
+    import pimper_torch.evidence.cli.render_command  # noqa: F401
     from pimper_torch.kernels.compile import compile_all
 
     compile_all()

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.render_in_memory import Plane, RenderedScene, render_shape
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, RenderedScene, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import CoarseMesh, Mesh
 
-TILTED = Plane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))
+TILTED = EndlessPlane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))
 
 
 def ramp(points: torch.Tensor) -> torch.Tensor:

@@ -4,7 +4,7 @@ import torch
 from pimper_torch.errors import PimperWarning, ReconstructionError
 from pimper_torch.evidence.metrics.similarity import similarity_between_cameras
 from pimper_torch.evidence.scenes.procedural_meshes import potato
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.frames import transform
@@ -34,7 +34,7 @@ def photographs(scene, chosen):
     """Take some of a scene's photographs as a camera of 8 bits does."""
     taken = []
     for view in chosen:
-        stage = Stage(scene.objects_in(view))
+        stage = TracedObjects(scene.objects_in(view))
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
         )

@@ -159,7 +159,7 @@ def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Outcome(Record):
+class MethodRun(Record):
     """A method's estimate, and its cost.
 
     Attributes:
@@ -177,7 +177,7 @@ class Outcome(Record):
     external: bool = False
 
 
-Method = Callable[[SparseScene, CoarseMesh], Outcome]
+Method = Callable[[SparseScene, CoarseMesh], MethodRun]
 
 _BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs": OpenMvs}
 
@@ -197,13 +197,13 @@ def method_named(name: str) -> Method:
 def _preset(name: str) -> Method:
     config = load_config(name)
 
-    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
         chain = make_chain(config)
         began = time.perf_counter()
         result = chain(scene)
         seconds = time.perf_counter() - began
         found = {key: value for report in result.report for key, value in report.figures.items()}
-        return Outcome(
+        return MethodRun(
             estimate=estimate_of(result),
             seconds=seconds,
             mesh_points=int(found["mesh_points"]),
@@ -216,10 +216,10 @@ def _preset(name: str) -> Method:
 
 
 def _baseline(module: nn.Module) -> Method:
-    def run(scene: SparseScene, coarse: CoarseMesh) -> Outcome:
+    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
         began = time.perf_counter()
         estimate = module(scene, coarse)
-        return Outcome(
+        return MethodRun(
             estimate=estimate,
             seconds=time.perf_counter() - began,
             external=isinstance(module, OpenMvs),

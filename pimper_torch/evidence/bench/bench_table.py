@@ -21,7 +21,7 @@ from pimper_torch.records import Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row(Record):
+class BenchRow(Record):
     """One method on one scene; ``None`` is a figure that was not, or cannot be, measured.
 
     Percentages are of 100, and lengths are percentages of the true bounding box's diagonal;
@@ -66,7 +66,9 @@ class Row(Record):
     published: bool = False
 
 
-def row_of_failure(scene: str, method: str, error: Exception, **known: int | float | None) -> Row:
+def row_of_failure(
+    scene: str, method: str, error: Exception, **known: int | float | None
+) -> BenchRow:
     """Return the row of a method that gave no surface; a missing program is no failure.
 
     Args:
@@ -74,14 +76,14 @@ def row_of_failure(scene: str, method: str, error: Exception, **known: int | flo
     """
     kind = "not installed\n" if isinstance(error, MissingProgramError) else "failed: "
     note = f"{kind}{str(error) or type(error).__name__}"
-    return Row(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
+    return BenchRow(scene=scene, method=method, note=note, **known)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table(Record):
     """All rows, the machine, and settings that decide the figures."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[BenchRow, ...]
     machine: Machine
     date: str
     scale: str
@@ -97,7 +99,7 @@ _PRINTED = (
 )
 PUBLISHED = (
     *(
-        Row(
+        BenchRow(
             scene=scene,
             method="PiMPeR",
             mesh_points=points,
@@ -110,7 +112,7 @@ PUBLISHED = (
         )
         for scene, points, triangles, samples, missing, minutes, error in _PRINTED
     ),
-    Row(
+    BenchRow(
         scene="potatoes",
         method="global-stereo",
         minutes=22 * 60.0,
@@ -122,7 +124,7 @@ PUBLISHED = (
 potatoes, in Matlab, 2014. The error is not defined there."""
 
 
-def with_published(rows: Sequence[Row]) -> tuple[Row, ...]:
+def with_published(rows: Sequence[BenchRow]) -> tuple[BenchRow, ...]:
     """Group rows by scene, each after the published figures for that scene."""
     scenes = dict.fromkeys(row.scene for row in rows)
     return tuple(row for name in scenes for row in (*PUBLISHED, *rows) if row.scene == name)
@@ -152,7 +154,7 @@ class Column(NamedTuple):
     """A figure of the table."""
 
     heading: str
-    value: Callable[[Row], int | float | None]
+    value: Callable[[BenchRow], int | float | None]
     decimals: int
 
 
@@ -195,7 +197,7 @@ _SURFACE = _columns(
 )
 
 
-def columns(rows: Sequence[Row]) -> dict[str, tuple[Column, ...]]:
+def columns(rows: Sequence[BenchRow]) -> dict[str, tuple[Column, ...]]:
     """Return the columns that some row has a figure for, by what they are about."""
 
     def known(columns: Sequence[Column]) -> tuple[Column, ...]:
@@ -276,7 +278,7 @@ def terminal(table: Table) -> Group:
     return Group(*parts)
 
 
-def _grid(title: str, shown: Sequence[Column], rows: Sequence[Row]) -> Grid:
+def _grid(title: str, shown: Sequence[Column], rows: Sequence[BenchRow]) -> Grid:
     grid = Grid(title=title, box=box.SIMPLE_HEAD, title_justify="left", padding=(0, 1, 0, 0))
     grid.add_column("scene")
     grid.add_column("method")
@@ -318,14 +320,14 @@ def legend(table: Table) -> list[str]:
     return sentences
 
 
-def short_note(row: Row) -> str:
+def short_note(row: BenchRow) -> str:
     """Return the first line of a note, cut to a cell's width; the JSON file has the whole."""
     lines = row.note.strip().splitlines()
     first = lines[0] if lines else ""
     return first if len(first) <= _NOTE_LENGTH else first[: _NOTE_LENGTH - 1].rstrip() + "…"
 
 
-def _method(row: Row) -> str:
+def _method(row: BenchRow) -> str:
     return f"{row.method} {_PUBLISHED_MARK}" if row.published else row.method
 
 

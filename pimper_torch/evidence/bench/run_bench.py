@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
 from pathlib import Path
@@ -20,13 +19,13 @@ from pimper_torch.evidence.bench.bench_inputs import (
     BenchConfig,
     Inputs,
     Method,
-    Outcome,
+    MethodRun,
     method_named,
     prepare,
     scene_folder,
 )
 from pimper_torch.evidence.bench.bench_table import (
-    Row,
+    BenchRow,
     Table,
     markdown,
     row_of_failure,
@@ -41,7 +40,7 @@ from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import listening
-from pimper_torch.records import Capture, Mesh, Record, StageReport
+from pimper_torch.records import Capture, Mesh, StageReport
 from pimper_torch.reporting import Observer, Silent, peak_memory_mb
 from pimper_torch.viz.heatmap import (
     ErrorScale,
@@ -61,8 +60,11 @@ Covered = Bool[Tensor, "height width"]
 
 
 def with_common(
-    rows: Sequence[Row], covered: Sequence[Covered | None], meshes: Sequence[Path], maps: Capture
-) -> list[Row]:
+    rows: Sequence[BenchRow],
+    covered: Sequence[Covered | None],
+    meshes: Sequence[Path],
+    maps: Capture,
+) -> list[BenchRow]:
     """Add figures over the pixels that all methods cover to the rows of a scene.
 
     A method that leaves out difficult parts has small errors on the rest.
@@ -83,7 +85,7 @@ def with_common(
     ]
 
 
-def _with_common(row: Row, path: Path, common: Covered, maps: Capture) -> Row:
+def _with_common(row: BenchRow, path: Path, common: Covered, maps: Capture) -> BenchRow:
     mesh = read_mesh(path)
     met = meet_truth(mesh, maps, 0)
     assert met is not None  # as when it was measured
@@ -174,18 +176,8 @@ def _crop(maps: Capture) -> tuple[slice, slice]:
 BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Measured(Record):
-    """One cell of the bench: a method on a scene.
-
-    Attributes:
-        covered: True where rays of the reference view meet truth and surface; ``None`` if it
-            has no surface.
-    """
-
-    row: Row
-    panels: MethodPanels
-    covered: Covered | None = None
+_Cell = tuple[BenchRow, MethodPanels, Covered | None]
+"""Row, pictures, and pixels of the reference view whose rays meet truth and surface."""
 
 
 def run_bench(
@@ -217,7 +209,7 @@ def run_bench(
     observer = observer or Silent()
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
-    rows: list[Row] = []
+    rows: list[BenchRow] = []
     sheet: list[SceneRow] = []
     with (
         written_whole(folder, "table", overwrite=overwrite) as staging,
@@ -263,7 +255,7 @@ def _scene(
     staging: Path,
     observer: Observer,
     cache: Path | str | None,
-) -> tuple[list[Row], list[SceneRow]]:
+) -> tuple[list[BenchRow], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem
     with _shown(observer, f"{name} render"):
@@ -277,14 +269,9 @@ def _scene(
     for method, run in methods.items():
         with _shown(observer, f"{name} {method}"):
             cells.append(_cell(name, method, run, inputs, config, staging))
-    row = scene_row(name, inputs, tuple(cell.panels for cell in cells))
-    rows = with_common(
-        [cell.row for cell in cells],
-        [cell.covered for cell in cells],
-        [_mesh_file(staging, name, method) for method in methods],
-        inputs.maps,
-    )
-    return rows, [row]
+    rows, panels, covered = zip(*cells, strict=True)
+    meshes = [_mesh_file(staging, name, method) for method in methods]
+    return with_common(rows, covered, meshes, inputs.maps), [scene_row(name, inputs, panels)]
 
 
 def _mesh_file(folder: Path, scene: str, method: str) -> Path:
@@ -293,7 +280,7 @@ def _mesh_file(folder: Path, scene: str, method: str) -> Path:
 
 def _cell(
     scene: str, method: str, run: Method, inputs: Inputs, config: BenchConfig, staging: Path
-) -> Measured:
+) -> _Cell:
     """Run a method and measure what it gives."""
     began = time.perf_counter()
     sfm_minutes = inputs.sfm_seconds / 60 or None
@@ -311,34 +298,32 @@ def _cell(
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
-        return Measured(row=row, panels=MethodPanels(method=method, note=row.note))
+        return row, MethodPanels(method=method, note=row.note), None
     mesh = transfer(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
     write_ply(mesh, _mesh_file(staging, scene, method))
     heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
     # Evaluated in a view, it has been met.
     met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
-    return Measured(
-        row=row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes),
-        panels=method_panels(mesh, met, inputs, scene, method, heatmap),
-        covered=met.both if met else None,
-    )
+    row = row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes)
+    panels = method_panels(mesh, met, inputs, scene, method, heatmap)
+    return row, panels, met.both if met else None
 
 
 def row_of(
     scene: str,
     method: str,
-    outcome: Outcome,
+    outcome: MethodRun,
     evaluation: Evaluation,
     *,
     memory: float | None = None,
     sfm_minutes: float | None = None,
-) -> Row:
+) -> BenchRow:
     """Take a row's figures from an outcome and its evaluation."""
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
     seen, missing = surface.seen if surface else None, outcome.missing_fraction
     shape = view.shape_normals if view else None
-    return Row(
+    return BenchRow(
         scene=scene,
         method=method,
         mesh_points=outcome.mesh_points,

@@ -94,7 +94,7 @@ _OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class ConvertJob:
     """Read a data set of one layout and write its photographs and cameras in another.
 
     Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
@@ -128,7 +128,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     output.result({"folder": job.out}, photographs=capture.views.num_views)
 
 
-def checked(command: str, arguments: Sequence[str]) -> Job:
+def checked(command: str, arguments: Sequence[str]) -> ConvertJob:
     """Read the arguments, and check what can be checked without reading DATA."""
     job = parse(arguments)
     inputs = {
@@ -144,9 +144,9 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
     return job
 
 
-def parse(arguments: Sequence[str]) -> Job:
+def parse(arguments: Sequence[str]) -> ConvertJob:
     """Read the arguments of ``convert``."""
-    return read_arguments(Job, "convert", arguments, levels=True)
+    return read_arguments(ConvertJob, "convert", arguments, levels=True)
 
 
 def readers() -> Mapping[Source, Callable[..., Capture]]:
@@ -166,7 +166,7 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
     }
 
 
-def read(job: Job) -> Capture:
+def read(job: ConvertJob) -> Capture:
     """Read the data set with the options that were given."""
     reader = readers()[job.source]
     known = dict(inspect.signature(reader).parameters)
@@ -219,7 +219,7 @@ def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
     return None if points is None else points[thinned(len(points)).to(points.device)]
 
 
-def describe(capture: Capture, job: Job) -> str:
+def describe(capture: Capture, job: ConvertJob) -> str:
     """Report what was read and where it is now."""
     sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"

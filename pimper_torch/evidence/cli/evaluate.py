@@ -49,7 +49,7 @@ _DEFAULT = EvaluateConfig()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class EvaluateJob:
     """Measure a result against the truth, each figure under its own named convention.
 
     Attributes:
@@ -111,9 +111,9 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     output.result(paths, figures={**report(evaluation), "relighting": relighting})
 
 
-def checked(command: str, arguments: Sequence[str]) -> Job:
+def checked(command: str, arguments: Sequence[str]) -> EvaluateJob:
     """Read the arguments, and check what can be checked without reading RESULT and TRUTH."""
-    job = read_arguments(Job, command, arguments)
+    job = read_arguments(EvaluateJob, command, arguments)
     for path in (job.result, job.truth):
         if not path.exists():
             raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
@@ -122,7 +122,7 @@ def checked(command: str, arguments: Sequence[str]) -> Job:
 
 
 def read_truth(
-    job: Job, estimate: Estimate, config: EvaluateConfig
+    job: EvaluateJob, estimate: Estimate, config: EvaluateConfig
 ) -> tuple[Capture, Capture | None, DtuProtocol | None]:
     """Read the truth, the maps of the views to compare in, if it has none, and its protocol.
 
@@ -226,7 +226,7 @@ def show(
 
 
 def write_report(
-    evaluation: Evaluation, job: Job, relighting: dict[str, Any] | None = None
+    evaluation: Evaluation, job: EvaluateJob, relighting: dict[str, Any] | None = None
 ) -> None:
     """Write all figures and the settings they were made with as JSON, whole or not at all."""
     assert job.out is not None
@@ -274,7 +274,7 @@ def _write_page(evaluation: Evaluation, capture: Capture, result: Path, path: Pa
         write_compared_page(result, mesh, evaluation.alignment.truth_from_world, fresh)
 
 
-def _prepare_files(job: Job) -> None:
+def _prepare_files(job: EvaluateJob) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace."""
     marks = {job.out: f'"format": "{FORMAT}"', job.calibration: TITLE, job.report: HEAD}
     for path, mark in marks.items():

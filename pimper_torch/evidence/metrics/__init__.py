@@ -8,7 +8,7 @@ from pimper_torch.evidence.metrics.camera_errors import (
 )
 from pimper_torch.evidence.metrics.dtu_protocol import DtuFigures, dtu_figures, thin
 from pimper_torch.evidence.metrics.evaluation import EvaluateConfig, Evaluation, evaluate
-from pimper_torch.evidence.metrics.figure_rows import Row, report, rows
+from pimper_torch.evidence.metrics.figure_rows import FigureRow, report, rows
 from pimper_torch.evidence.metrics.in_view import (
     AlbedoFigures,
     ViewFigures,
@@ -41,10 +41,10 @@ __all__ = [
     "DtuFigures",
     "EvaluateConfig",
     "Evaluation",
+    "FigureRow",
     "LightFigures",
     "Nearest",
     "NearestSurface",
-    "Row",
     "SurfaceComparison",
     "SurfaceSamples",
     "ViewFigures",

@@ -77,13 +77,6 @@ def compare_lights(
     )
 
 
-# Rays that make a point, and points that make a figure.
-_FEWEST_RAYS, _FEWEST_PLACES = 3, 10
-
-# Points of the true surface, about, whose positions are compared.
-_PLACES = 2000
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFigures(Record):
     """Errors of cameras, over the views that have one in both.
@@ -145,8 +138,8 @@ def compare_cameras(
         corners = surface.vertices_world.double().cpu()
         centre = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
         away, diagonal = (centers_true - centre).norm(dim=1), bounding_diagonal(surface)
-        found, right = _positions(ours, truth, corners[:: max(1, len(corners) // _PLACES)])
-        if len(found) >= _FEWEST_PLACES:
+        found, right = _positions(ours, truth, corners[:: max(1, len(corners) // 2000)])
+        if len(found) >= 10:
             fitted = similarity_between_points(found, right)
             position, bend = (
                 float(100 * (transform(transferred, found) - right).norm(dim=1).mean() / diagonal)
@@ -176,7 +169,7 @@ def _positions(
     )
     sizes = truth.sizes_px[:, None].cpu()
     seen = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    often = seen.sum(dim=0) >= _FEWEST_RAYS
+    often = seen.sum(dim=0) >= 3
     resized = ours.sizes_px[:, None].cpu().double() / sizes
     cameras = ours.replace(
         intrinsics=ours.intrinsics.double().cpu(),

@@ -1,5 +1,6 @@
 """A result against the truth: every figure that the truth allows."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -146,24 +147,19 @@ def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -
         InputError: A view that was asked for is not in the truth.
     """
     names = capture.views.names
-    if config.views:
-        found: dict[int, None] = {}
-        for asked in config.views:
-            try:
-                _, index = pair_views([asked], names)
-            except InputError as error:
-                raise InputError(
-                    f"there is no view {asked!r} in the truth; it has {', '.join(names[:5])}"
-                    f"{', ...' if len(names) > 5 else ''}. Choose one of these."
-                ) from error
-            found[int(index[0])] = None
-        return tuple(found)
-    if estimate.reference is not None:
+    chosen: dict[int, None] = {}
+    for asked in config.views:
         try:
-            return (int(pair_views([estimate.reference], names)[1][0]),)
-        except InputError:
-            pass
-    return (len(names) // 2,) if names else ()
+            chosen[int(pair_views([asked], names)[1][0])] = None
+        except InputError as error:
+            raise InputError(
+                f"there is no view {asked!r} in the truth; it has {', '.join(names[:5])}"
+                f"{', ...' if len(names) > 5 else ''}. Choose one of these."
+            ) from error
+    if not chosen and estimate.reference is not None:
+        with suppress(InputError):
+            chosen[int(pair_views([estimate.reference], names)[1][0])] = None
+    return tuple(chosen) or ((len(names) // 2,) if names else ())
 
 
 def _lights(

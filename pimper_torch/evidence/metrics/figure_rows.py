@@ -19,7 +19,7 @@ from pimper_torch.evidence.metrics.surface_distances import (
 )
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """A figure as a person reads it.
 
     Attributes:
@@ -45,13 +45,13 @@ def report(evaluation: Evaluation) -> dict[str, object]:
 
 def rows(
     evaluation: Evaluation, relighting: Mapping[str, Any] | None = None
-) -> list[tuple[str, list[Row]]]:
+) -> list[tuple[str, list[FigureRow]]]:
     """Return the figures as a table: its sections with their rows, none of them empty.
 
     Args:
         relighting: What ``summary.json`` of the result tells under this name.
     """
-    sections: list[tuple[str, Iterator[Row]]] = [("alignment", _alignment_rows(evaluation))]
+    sections: list[tuple[str, Iterator[FigureRow]]] = [("alignment", _alignment_rows(evaluation))]
     if evaluation.surface is not None:
         sections.append(("surface", _surface_rows(evaluation.surface)))
     sections += [(f"along the rays of {view.name}", _view_rows(view)) for view in evaluation.views]
@@ -66,25 +66,25 @@ def rows(
     return [(title, found) for title, lines in sections if (found := list(lines))]
 
 
-def _alignment_rows(evaluation: Evaluation) -> Iterator[Row]:
+def _alignment_rows(evaluation: Evaluation) -> Iterator[FigureRow]:
     alignment = evaluation.alignment
-    yield Row("method", alignment.method, alignment.description)
-    yield Row(
+    yield FigureRow("method", alignment.method, alignment.description)
+    yield FigureRow(
         "scale, rotation",
         f"{_number(alignment.scale)}, {alignment.rotation_deg:.2f}°",
         "of the similarity that carries the result to the truth",
     )
     if alignment.residual is not None:
         state = "came to rest" if alignment.converged else "stopped by the limit of iterations"
-        yield Row(
+        yield FigureRow(
             "residual",
             _number(alignment.residual),
             f"root mean square of the samples kept, scene units; {state}",
         )
 
 
-def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
-    yield Row(
+def _surface_rows(surface: SurfaceComparison) -> Iterator[FigureRow]:
+    yield FigureRow(
         "diagonal",
         _number(surface.diagonal),
         "of the true object's bounding box, scene units; % below are of it",
@@ -92,7 +92,7 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
     if surface.accuracy is not None:
         yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
     if surface.surroundings_fraction > 0:
-        yield Row(
+        yield FigureRow(
             "surroundings_fraction",
             _fraction(surface.surroundings_fraction),
             "of the result lies nearer to the surroundings; left out of the accuracy",
@@ -108,8 +108,8 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[Row]:
         yield from _calibration_rows(surface.calibration, surface.diagonal)
 
 
-def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
-    yield Row(
+def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[FigureRow]:
+    yield FigureRow(
         "expected_error",
         f"{found.ratio:.2f}; {_fraction(found.within_one)}, {_fraction(found.within_two)}; "
         f"{found.rank_correlation:.2f}",
@@ -117,7 +117,7 @@ def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
         "expected, 68 and 95 % if calibrated; rank correlation",
     )
     for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
-        yield Row(
+        yield FigureRow(
             f"{which} tenth",
             f"{_number(100 * one.expected / diagonal)} %; "
             f"{_number(100 * one.root_mean_square / diagonal)} %",
@@ -125,7 +125,7 @@ def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[Row]:
         )
 
 
-def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
+def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[FigureRow]:
     yield _distance_row(
         f"completeness{mark}", figures.completeness, f"truth to result, over {part}: mean; median"
     )
@@ -133,13 +133,13 @@ def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
         ("chamfer_mean", figures.chamfer_mean, figures.chamfer_mean_percent, "mean"),
         ("chamfer_sum", figures.chamfer_sum, figures.chamfer_sum_percent, "sum"),
     ):
-        yield Row(
+        yield FigureRow(
             name + mark,
             f"{_number(length)} ({_number(percent)} %)",
             f"{meaning} of mean accuracy and mean completeness{mark}",
         )
     for at in figures.thresholds:
-        yield Row(
+        yield FigureRow(
             f"f_score{mark} at {at.threshold_percent:g} %",
             _fraction(at.f_score),
             f"precision {_fraction(at.precision)}, recall{mark} {_fraction(at.recall)}, "
@@ -147,13 +147,13 @@ def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[Row]:
         )
 
 
-def _view_rows(view: ViewFigures) -> Iterator[Row]:
-    yield Row(
+def _view_rows(view: ViewFigures) -> Iterator[FigureRow]:
+    yield FigureRow(
         "relative_error",
         f"{_number(view.relative_error)} %",
         "100 ||S - S'|| / ||S - mean S|| where both are met",
     )
-    yield Row(
+    yield FigureRow(
         "coverage", _fraction(view.coverage), f"of {view.pixels} true pixels are met by the result"
     )
     for name, angles, meaning in (
@@ -168,58 +168,58 @@ def _view_rows(view: ViewFigures) -> Iterator[Row]:
             value = (
                 f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°; {angles.pitted_percent:.2f} %"
             )
-            yield Row(name, value, meaning)
+            yield FigureRow(name, value, meaning)
     if view.albedo is not None:
-        yield Row(
+        yield FigureRow(
             "albedo",
             f"{view.albedo.one_scale_percent:.1f} %; {view.albedo.one_scale_median_percent:.1f} %",
             "after one scale: root mean square, least squares; median, median ratio",
         )
-        yield Row(
+        yield FigureRow(
             "albedo, channel scales",
             f"{view.albedo.channel_scales_percent:.1f} %",
             "after a scale for each channel: root mean square, least squares",
         )
 
 
-def _light_rows(lights: LightFigures) -> Iterator[Row]:
-    yield Row(
+def _light_rows(lights: LightFigures) -> Iterator[FigureRow]:
+    yield FigureRow(
         "direction",
         f"{lights.mean_deg:.2f}°; {lights.median_deg:.2f}°",
         f"of {lights.lights} lights, in the frame of the truth: mean; median",
     )
-    yield Row(
+    yield FigureRow(
         "direction, rotated",
         f"{lights.mean_rotated_deg:.2f}°; {lights.median_rotated_deg:.2f}°",
         f"up to one rotation of all, by {lights.rotation_deg:.2f}°: mean; median",
     )
 
 
-def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
-    yield Row(
+def _camera_rows(cameras: CameraFigures) -> Iterator[FigureRow]:
+    yield FigureRow(
         "missing",
         f"{cameras.missing} of {cameras.views}",
         "photographs without a camera in the result",
     )
-    yield Row(
+    yield FigureRow(
         "rotation",
         f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°",
         "after the similarity on cameras: mean; median",
     )
     percent = cameras.mean_center_percent
     away = "" if math.isnan(percent) else f", {_number(percent)} % of the way to the object"
-    yield Row(
+    yield FigureRow(
         "center",
         f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}",
         f"after the similarity on cameras, scene units: mean; median{away}",
     )
-    yield Row(
+    yield FigureRow(
         "focal",
         f"{_number(cameras.mean_focal_percent)} %",
         "mean of the absolute differences of the focal length",
     )
     if not math.isnan(cameras.mean_position_percent):
-        yield Row(
+        yield FigureRow(
             "positions",
             f"{cameras.mean_position_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
             "of the diagonal, that exact rays put points off: after the similarity on "
@@ -227,7 +227,7 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[Row]:
         )
 
 
-def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[Row]:
+def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[FigureRow]:
     meaning = "mean over {} photographs of sRGB values on the object, each under its fitted light"
     meaning = meaning.format(len(relighting["views"]))
     names = {
@@ -237,38 +237,38 @@ def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[Row]:
     }
     for key, name in names.items():
         if (value := relighting.get(key)) is not None:
-            yield Row(name, f"{value:.2f} dB", meaning)
+            yield FigureRow(name, f"{value:.2f} dB", meaning)
     for one in relighting["materials"]:
-        yield Row(
+        yield FigureRow(
             "roughness, specular, metallic",
             f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}",
             f"glTF's material of {one['vertices']:.0%} of the vertices",
         )
 
 
-def _dtu_rows(dtu: DtuFigures) -> Iterator[Row]:
+def _dtu_rows(dtu: DtuFigures) -> Iterator[FigureRow]:
     cap = f"{CAP_MM:g} mm or more"
-    yield Row(
+    yield FigureRow(
         "accuracy",
         f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
         f"{dtu.evaluated} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
         f"{_fraction(dtu.capped_fraction)} {cap}",
     )
-    yield Row(
+    yield FigureRow(
         "completeness",
         f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
         f"{dtu.evaluated_true} points of the scan above the table: mean; median; "
         f"{_fraction(dtu.capped_fraction_true)} {cap}",
     )
-    yield Row("overall", f"{dtu.overall:.4f} mm", "mean of the two means")
+    yield FigureRow("overall", f"{dtu.overall:.4f} mm", "mean of the two means")
 
 
-def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> Row:
+def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> FigureRow:
     value = (
         f"{_number(figures.mean)} ({_number(figures.mean_percent)} %); "
         f"{_number(figures.median)} ({_number(figures.median_percent)} %)"
     )
-    return Row(name, value, meaning)
+    return FigureRow(name, value, meaning)
 
 
 def _number(value: float) -> str:

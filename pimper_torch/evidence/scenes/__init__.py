@@ -5,7 +5,7 @@
 scene in memory.
 """
 
-from pimper_torch.evidence.scenes.ray_tracing import Frame, Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import RenderedFrame, TracedObjects, render_frame
 from pimper_torch.evidence.scenes.render_in_memory import (
     RenderedScene,
     potato_on_table,
@@ -23,13 +23,13 @@ SCENES = tuple(RECIPES)
 
 __all__ = [
     "SCENES",
-    "Frame",
+    "RenderedFrame",
     "RenderedScene",
     "Scene",
     "SceneConfig",
     "SceneObject",
     "SensorConfig",
-    "Stage",
+    "TracedObjects",
     "build_scene",
     "potato_on_table",
     "render_frame",

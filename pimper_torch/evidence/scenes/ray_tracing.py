@@ -52,7 +52,7 @@ class Shaded(Record):
     lit: Bool[Tensor, " ray"]
 
 
-class Stage:
+class TracedObjects:
     """Objects in one ray caster; float32.
 
     Args:
@@ -221,7 +221,7 @@ _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Frame(Record):
+class RenderedFrame(Record):
     """A photograph, and the intersections of the rays through its pixels' centres.
 
     Attributes:
@@ -243,13 +243,13 @@ class Frame(Record):
 
 
 def render_frame(
-    stage: Stage,
+    stage: TracedObjects,
     cameras: Cameras,
     lights: Lights,
     view: int,
     generator: torch.Generator,
     sensor: SensorConfig,
-) -> Frame:
+) -> RenderedFrame:
     """Ray trace one photograph; float32.
 
     One ray through each pixel's centre; where a pixel differs from its neighbours, a grid of
@@ -291,7 +291,7 @@ def render_frame(
     object_index = raster(one.object_index for one in spots)
     mirrored = sensor.exposure * raster(one.mirrored for one in shaded).mean(dim=-1)
     matte = sensor.exposure * raster(one.matte for one in shaded).mean(dim=-1)
-    return Frame(
+    return RenderedFrame(
         image=expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor),
         depth=raster(one.hits.distance for one in spots),
         normals_world=raster(one.normals for one in spots),

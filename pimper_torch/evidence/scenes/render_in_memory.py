@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.evidence.scenes.procedural_meshes import potato, table
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import Lights, wandering_lights
 from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
@@ -66,7 +66,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plane:
+class EndlessPlane:
     """An endless plane through a point; both sides are seen."""
 
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -88,7 +88,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RenderedScene(Record):
-    """Photographs in memory, and their truth; maps are as of :class:`.Frame`, one a view.
+    """Photographs in memory, and their truth; maps are as of :class:`.RenderedFrame`, one a view.
 
     Attributes:
         lights_world: First-order light ``l`` at the object: radiance is albedo * l . (1, n). Exact
@@ -163,7 +163,7 @@ def render_objects(
     Light falls off with the square of the distance and is stopped by every object.
     """
     sensor = SensorConfig() if sensor is None else sensor
-    stage = Stage(objects)
+    stage = TracedObjects(objects)
     frames = [
         render_frame(stage, cameras, lights, view, generator, sensor)
         for view in range(cameras.num_views)

@@ -30,7 +30,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require, to_mapping
 from pimper_torch.evidence.scenes.procedural_meshes import join
-from pimper_torch.evidence.scenes.ray_tracing import Frame, Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import RenderedFrame, TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.true_clouds import true_model
 from pimper_torch.evidence.scenes.whole_scene import Scene, build_scene
@@ -46,7 +46,7 @@ MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight
 _MASKS = ("foreground", "lit", "highlight")
 
 
-def write_maps(frame: Frame, path: Path) -> None:
+def write_maps(frame: RenderedFrame, path: Path) -> None:
     """Write the maps of a frame as a compressed ``.npz``.
 
     Depth is float32 as rendered. Normals and albedo are float16, off by at most 0.03 degrees
@@ -125,10 +125,10 @@ def render_scene(
 
 def _render_all(scene: Scene, folder: Path, threads: int) -> None:
     """Render all photographs and write them with their truth."""
-    shared = Stage(scene.objects_in(0))
+    shared = TracedObjects(scene.objects_in(0))
 
     def take(view: int) -> None:
-        stage = Stage(scene.objects_in(view)) if scene.fixed else shared
+        stage = TracedObjects(scene.objects_in(view)) if scene.fixed else shared
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
         )

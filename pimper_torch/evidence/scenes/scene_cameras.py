@@ -64,7 +64,7 @@ def arc_cameras(
 ) -> Cameras:
     """Place cameras on an arc round a target, looking at it; float64.
 
-    The defaults face flat shapes such as :class:`.Plane` from above.
+    The defaults face flat shapes such as :class:`.EndlessPlane` from above.
 
     Args:
         span_deg: From the first camera to the last, about ``up``.

@@ -139,18 +139,6 @@ class SceneObject:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MovedTexture:
-    """A texture that moves with its object."""
-
-    texture: Texture
-    own_from_world: Float[Tensor, "4 4"]
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Return the albedo at points of the world."""
-        return self.texture(transform(self.own_from_world.to(points), points))
-
-
 def transferred(item: SceneObject, world_from_own: Float[Tensor, "4 4"]) -> SceneObject:
     """Move an object from its own frame into the world, with its texture."""
     normals, texture = item.mesh.normals_world, item.texture
@@ -158,9 +146,14 @@ def transferred(item: SceneObject, world_from_own: Float[Tensor, "4 4"]) -> Scen
         vertices_world=transform(world_from_own, item.mesh.vertices_world),
         normals_world=None if normals is None else rotate(world_from_own, normals),
     )
-    if texture is not None:
-        texture = MovedTexture(texture=texture, own_from_world=invert_rigid(world_from_own))
-    return replace(item, mesh=mesh, texture=texture)
+    if texture is None:
+        return replace(item, mesh=mesh)
+    own_from_world, own = invert_rigid(world_from_own), texture
+
+    def moved(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
+        return own(transform(own_from_world.to(points), points))
+
+    return replace(item, mesh=mesh, texture=moved)
 
 
 def normals_at_vertices(item: SceneObject) -> Float[Tensor, "vertex 3"]:

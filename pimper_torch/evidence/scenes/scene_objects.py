@@ -25,10 +25,9 @@ from pimper_torch.evidence.scenes.procedural_meshes import (
 )
 from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
 from pimper_torch.evidence.scenes.textures import (
-    CylinderRegion,
-    Marked,
-    Painted,
     Uniform,
+    marked,
+    painted,
     random_speckle,
 )
 from pimper_torch.records import Mesh
@@ -100,8 +99,7 @@ def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
     plain = random_speckle(
         generator, cells=(0.5, 0.06), darkest=0.5, brightest=0.8, contrast=0.3, colour=0.1
     )
-    outside = CylinderRegion(radii=(_MUG_RADIUS - _MUG_WALL / 2, float("inf")))
-    texture = Painted(base=plain, paint=decor, where=outside)
+    texture = painted(plain, decor, radii=(_MUG_RADIUS - _MUG_WALL / 2, float("inf")))
     mesh = moved(mug_mesh(), rotation_deg=-25.0)
     return (SceneObject(mesh=mesh, texture=texture, specular=0.045, roughness=0.22),)
 
@@ -146,8 +144,10 @@ def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
         colour=0.15,
         tint=(0.94, 0.98, 1.0),
     )
-    front = CylinderRegion(radii=(0.7, 1.0), heights=(0.62, 1.08), azimuths_deg=(-34.0, 34.0))
-    texture = Marked(base=Painted(base=glaze, paint=label, where=front), marks=blemishes)
+    front = painted(
+        glaze, label, radii=(0.7, 1.0), heights=(0.62, 1.08), azimuths_deg=(-34.0, 34.0)
+    )
+    texture = marked(front, blemishes)
     return (SceneObject(mesh=jar_mesh(), texture=texture, specular=0.05, roughness=0.3),)
 
 
@@ -211,7 +211,7 @@ def potatoes(generator: torch.Generator) -> tuple[SceneObject, ...]:
         )
         mesh = moved(grown, scale=size, rotation_deg=rotation_deg)
         mesh = push_clear(mesh, [one.mesh for one in made], (x, y))
-        made.append(SceneObject(mesh=mesh, texture=Marked(base=skin, marks=eyes)))
+        made.append(SceneObject(mesh=mesh, texture=marked(skin, eyes)))
     return tuple(made)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -138,33 +138,6 @@ def random_speckle(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CylinderRegion:
-    """What lies between two radii, two heights and two directions about the z axis.
-
-    Attributes:
-        azimuths_deg: Counter-clockwise from -y, where photographs are taken from.
-    """
-
-    radii: tuple[float, float] = (0.0, float("inf"))
-    heights: tuple[float, float] = (-float("inf"), float("inf"))
-    azimuths_deg: tuple[float, float] = (-180.0, 180.0)
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Bool[Tensor, "*batch"]:
-        """Find which points are inside."""
-        x, y, height = points.unbind(dim=-1)
-        radius = (x**2 + y**2).sqrt()
-        azimuth = torch.rad2deg(torch.atan2(x, -y))
-        inside = torch.ones_like(height, dtype=torch.bool)
-        for value, (low, high) in (
-            (radius, self.radii),
-            (height, self.heights),
-            (azimuth, self.azimuths_deg),
-        ):
-            inside = inside & (value >= low) & (value <= high)
-        return inside
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Uniform:
     """One albedo everywhere."""
 
@@ -175,26 +148,33 @@ class Uniform:
         return points.new_tensor(self.albedo).expand(*points.shape[:-1], -1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Painted:
-    """One texture with another on top of it in some places."""
+def painted(
+    base: Texture,
+    paint: Texture,
+    *,
+    radii: tuple[float, float],
+    heights: tuple[float, float] = (-float("inf"), float("inf")),
+    azimuths_deg: tuple[float, float] = (-180.0, 180.0),
+) -> Texture:
+    """Return a texture with another on top, between two radii, heights and azimuths about z.
 
-    base: Texture
-    paint: Texture
-    where: CylinderRegion
+    Args:
+        azimuths_deg: Counter-clockwise from -y, where photographs are taken from.
+    """
 
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Return the albedo at points."""
-        return torch.where(self.where(points)[..., None], self.paint(points), self.base(points))
+    def albedo(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
+        x, y, height = points.unbind(dim=-1)
+        radius = (x**2 + y**2).sqrt()
+        azimuth = torch.rad2deg(torch.atan2(x, -y))
+        inside = torch.ones_like(height, dtype=torch.bool)
+        bounds = (radius, radii), (height, heights), (azimuth, azimuths_deg)
+        for value, (low, high) in bounds:
+            inside = inside & (value >= low) & (value <= high)
+        return torch.where(inside[..., None], paint(points), base(points))
+
+    return albedo
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Marked:
-    """One texture darkened by another, such as by blemishes."""
-
-    base: Texture
-    marks: Texture
-
-    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
-        """Return the albedo at points."""
-        return self.base(points) * self.marks(points)
+def marked(base: Texture, marks: Texture) -> Texture:
+    """Return a texture darkened by another, such as by blemishes."""
+    return lambda points: base(points) * marks(points)

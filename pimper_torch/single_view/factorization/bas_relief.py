@@ -72,10 +72,6 @@ class BasRelief(Record):
         )
 
 
-# Relative rounding of squares of parallel vectors in float32.
-_FLAT = 1e-12
-
-
 def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
@@ -86,7 +82,8 @@ def standard_relief(shading: Float[Tensor, "3 pixel"]) -> BasRelief:
     depth = (z * z).sum()
     tilt_x, tilt_y = (x * z).sum() / depth, (y * z).sum() / depth
     slant = (x - tilt_x * z).square().sum() + (y - tilt_y * z).square().sum()
-    curved = slant > _FLAT * (depth + (x * x + y * y).sum())
+    # The relative rounding of squares of parallel vectors in float32.
+    curved = slant > 1e-12 * (depth + (x * x + y * y).sum())
     lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
     return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)
 
@@ -153,7 +150,6 @@ def bulge(
 
 # Initial depths of the search for a bas-relief, as factors of the given one: a choice.
 _DEPTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-_STEPS = 60
 
 _Curve = Callable[
     [Float[Tensor, "start 4"]], tuple[Float[Tensor, "start item"], Float[Tensor, "start item 4"]]
@@ -240,7 +236,7 @@ def _fitted(
         at, damping = begin, torch.full_like(begin[:, 0], 1e-2)
         values, slopes = curve(at)
         eye = torch.eye(4).to(begin)
-        for _ in range(_STEPS):
+        for _ in range(60):
             residual = 1 - values
             scale = CAUCHY_TUNING * median_deviation(residual, (given > 0).expand_as(residual))
             scale = scale.clamp_min(1e-6)[:, None]

@@ -27,12 +27,6 @@ from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
 
-# Further linearizations about the fit, with outlier weights: a choice, as each exponent starts from
-# the last one's fit.
-ITERATIONS = 1
-_ITERATIONS, _FIT_TOLERANCE = 30, 1e-7
-_FILL_STEPS = 30  # to a start good enough for the solver
-
 # Lower bound of the encoded value about which the fit is linearized: a choice.
 _DARKEST = 0.02
 
@@ -72,7 +66,7 @@ def fit_encoded(
     problem: EncodedMatrix,
     response: Response,
     start: EncodedFit | None,
-    iterations: int = ITERATIONS,
+    iterations: int = 1,
 ) -> EncodedFit:
     """Fit first-order light to encoded values through a response; constant to autograd.
 
@@ -81,6 +75,7 @@ def fit_encoded(
 
     Args:
         start: Fit of a similar response; ``None`` starts from the values.
+        iterations: Further linearizations about the fit, with outlier weights.
     """
     mask = problem.used.double()
     about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
@@ -95,7 +90,7 @@ def fit_encoded(
         if left is None:
             left = _start(target, mask, problem.rank)
         matrix = low_rank_problem(target[None], heavy[None], left[None])
-        solved = solve_variable_projection(matrix, _ITERATIONS, _FIT_TOLERANCE)
+        solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
         linear = left @ solved.shading[0]
         about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
@@ -125,7 +120,7 @@ def _start(
     gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
     level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
     guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
-    return singular_left(matrix[None], mask[None], rank, guess[None], _FILL_STEPS - 1)[0]
+    return singular_left(matrix[None], mask[None], rank, guess[None], 29)[0]
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
@@ -155,8 +150,6 @@ MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
 _TRIALS = 8
 # Of gamma's logarithm: a choice, a tenth of the smallest standard errors.
 _TOLERANCE = 1e-4
-# Relative difference between estimates of data without noise.
-_ROUNDING = 1e-3
 
 # Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
@@ -175,8 +168,6 @@ _MIN_SCALE = 5e-4
 
 # The estimate is checked without these fractions of the entries, the darkest: a choice.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
-# Fewer degrees of freedom give no reliable standard error: a choice.
-_MIN_FREE = 100
 # Difference from the estimate of the brighter entries, in its standard errors, above which the
 # standard error grows, and above which the brighter entries replace the estimate: choices.
 _SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
@@ -397,20 +388,20 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
 
     Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
     """
-    best, fit = _grid_search(problem, ITERATIONS)
+    best, fit = _grid_search(problem, 1)
     step = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
     found = [_minimise(problem, fit, best / step, best * step)]
     predicted = found[0].fit.predicted
     for fraction in _DARKEST_FRACTIONS:
         level = predicted[problem.used].quantile(fraction)
         used = enough(problem.used & (predicted > level), problem.rank)
-        if freedom(used, problem.rank) < _MIN_FREE:
+        if freedom(used, problem.rank) < 100:  # no reliable standard error
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
     for position, estimate in enumerate(found):
         brighter = [one for one in found[position + 1 :] if one.inner]
         apart = [(abs(one.gamma - estimate.gamma), one.error) for one in brighter]
-        rounding = _ROUNDING * estimate.gamma
+        rounding = 1e-3 * estimate.gamma
         if all(gap <= _MAX_ERRORS * error + rounding for gap, error in apart):
             excess = [gap - _SUSPECT_ERRORS * error for gap, error in apart]
             return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
@@ -440,8 +431,8 @@ def _estimate_of(found: _Minimum) -> GammaEstimate:
     """Return the estimate, with residuals under the linear and the sRGB response."""
     problem = found.problem
     residual = residual_spread(problem, found.fit)
-    linear = fit_encoded(problem, Linear(), found.fit, 2 * ITERATIONS)
-    srgb = fit_encoded(problem, Srgb(), found.fit, 2 * ITERATIONS)
+    linear = fit_encoded(problem, Linear(), found.fit, 2)
+    srgb = fit_encoded(problem, Srgb(), found.fit, 2)
     sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
     return GammaEstimate(
         gamma=found.gamma,

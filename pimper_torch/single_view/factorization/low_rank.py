@@ -146,13 +146,6 @@ def _leading(filled: Float[Tensor, "batch row column"], rank: int) -> Float[Tens
     return torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]
 
 
-# Residuals below this fraction of the data are zero but for rounding.
-_ROUNDING = 1e-6
-# Choices: the steps of a start, its tolerance, and the fraction by which residuals of the same
-# minimum differ.
-_STEPS, _TOLERANCE, _CLOSENESS = 300, 1e-9, 1e-6
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Restarted(Record):
     """The best of several factorizations of one matrix.
@@ -197,12 +190,12 @@ def factorize_from_many(
     while len(residuals) < max_starts:
         start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
         problem = low_rank_problem(matrix[None], weight[None], start)
-        found = solve_variable_projection(problem, _STEPS, _TOLERANCE)
+        found = solve_variable_projection(problem, 300, 1e-9)
         residuals.append(float(found.convergence.residual))
         if best is None or residuals[-1] < float(best.convergence.residual):
             best = found
         # On exact data the residuals are rounding, and all differ.
-        same = max(min(residuals) * (1 + _CLOSENESS), _ROUNDING * level)
+        same = max(min(residuals) * (1 + 1e-6), 1e-6 * level)
         repeated = sum(one <= same for one in residuals) >= repeats
         if repeated:
             break

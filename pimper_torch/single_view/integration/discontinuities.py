@@ -31,12 +31,6 @@ from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 
-# Initial scale, in pixels, and the factor by which each iteration divides it: choices.
-_FIRST_SCALE, _NARROWER = 3.0, 3.0
-
-# Of the linear systems' solutions, in their energy: a choice, far below any scale.
-_TOLERANCE = 1e-6
-
 # The final scale: residual at which a step keeps a quarter of its weight, in widths of a pixel at
 # the surface's depth, and the least in deviations of the residuals, so that noisy normals make no
 # discontinuities.
@@ -98,12 +92,10 @@ def find_discontinuities(
         tested &= joined(steps.twist_right, steps.twist_down) < _TWIST
         fraction = torch.where(tested, 1.0, _TIE) * inside
         solution = None
-        scale, cause = _FIRST_SCALE, StopCause.LIMIT
+        scale, cause = 3.0, StopCause.LIMIT  # pixels
         for taken in range(1, _MAX_ITERATIONS + 1):
             weights = weight * fraction
-            system = RasterSystem(
-                *parts(weights), anchor, tolerance=_TOLERANCE, what="the integration"
-            )
+            system = RasterSystem(*parts(weights), anchor, tolerance=1e-6, what="the integration")
             source = differences_transposed(*parts(weights * target))
             if anchor is not None and heights is not None:
                 source = source + anchor * heights
@@ -124,7 +116,7 @@ def find_discontinuities(
             if narrowed and change < _CHANGE:
                 cause = StopCause.CONVERGED
                 break
-            scale = max(scale / _NARROWER, smallest)
+            scale = max(scale / 3, smallest)
         square = (fraction * residual.square()).sum() / fraction.sum().clamp_min(1)
         right, down = parts(fraction)
         return Continuity(

@@ -10,9 +10,7 @@ unit; times the distance of neighbouring pixels (``unit``: their spacing, or one
 length) they are steps of the unknown.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -85,7 +83,7 @@ def orthographic_steps(
     valid = mask & known & (normals[..., 2] < -_GRAZING)
     safe = torch.where(valid[..., None], normals, normals.new_tensor([0, 0, -1])).double()
     slopes = _filled(-safe[..., :2] / safe[..., 2:], valid)
-    return _steps(slopes, (_between_planes, _between_planes), mask, valid, spacing)
+    return _steps(slopes, (0.0, 0.0), mask, valid, spacing)
 
 
 def perspective_steps(
@@ -125,27 +123,19 @@ def perspective_steps(
     facing = -(safe * rays).sum(dim=-1)
     slopes = _filled(safe[..., :2] / facing[..., None], valid)
     unit = 1 / float(K[0, 0]), 1 / float(K[1, 1])
-    between = (
-        partial(_between_planes_seen, unit=unit[0]),
-        partial(_between_planes_seen, unit=unit[1]),
-    )
-    return _steps(slopes, between, mask, valid, unit)
-
-
-# From slopes before and after each step: the step between the pixels' tangent planes, and the
-# rotation between the planes.
-Between = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    return _steps(slopes, unit, mask, valid, unit)
 
 
 def _between_planes(
-    first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"]
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    return (first + second) / 2, second - first
-
-
-def _between_planes_seen(
     first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"], unit: float
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Return the step between tangent planes, and the rotation between them.
+
+    Args:
+        unit: One over the focal length; 0 for parallel rays.
+    """
+    if unit == 0:
+        return (first + second) / 2, second - first
     # With r_m half-way, n . r_m / n . r_a = 1 - (slope at a) unit / 2.
     ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
     behind = (1 - unit / 2 * first).clamp_min(_GRAZING).log()
@@ -156,7 +146,7 @@ def _between_planes_seen(
 
 def _steps(
     slopes: Float[Tensor, "height width 2"],
-    between: tuple[Between, Between],
+    bend: tuple[float, float],
     mask: Bool[Tensor, "height width"],
     valid: Bool[Tensor, "height width"],
     unit: tuple[float, float],
@@ -164,8 +154,10 @@ def _steps(
     known = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
     inside = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
     across, along = slopes.unbind(dim=-1)
-    right, kink_right = _curved(*between[0](across[:, :-1], across[:, 1:]), known[0])
-    down, kink_down = _curved(*between[1](along.mT[:, :-1], along.mT[:, 1:]), known[1].mT)
+    right, kink_right = _curved(*_between_planes(across[:, :-1], across[:, 1:], bend[0]), known[0])
+    down, kink_down = _curved(
+        *_between_planes(along.mT[:, :-1], along.mT[:, 1:], bend[1]), known[1].mT
+    )
     twist_right = _excess(along.diff(dim=1), known[0])
     twist_down = _excess(across.diff(dim=0).mT, known[1].mT).mT
     return Steps(

@@ -1,9 +1,9 @@
 """Photometric stereo from one viewpoint: lights known or not, and one call for all methods."""
 
 from pimper_torch.single_view.photometric_stereo.stereo import (
-    Finding,
     PhotometricStereo,
+    PixelStatus,
     photometric_stereo,
 )
 
-__all__ = ["Finding", "PhotometricStereo", "photometric_stereo"]
+__all__ = ["PhotometricStereo", "PixelStatus", "photometric_stereo"]

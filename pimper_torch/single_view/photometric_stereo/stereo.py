@@ -39,7 +39,7 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-class Finding(IntEnum):
+class PixelStatus(IntEnum):
     """The status of a pixel."""
 
     FOUND = 0
@@ -61,7 +61,7 @@ class PhotometricStereo(Record):
         lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
         valid: Where the normal is determined and faces the viewer.
-        finding: A :class:`Finding` for each pixel.
+        finding: A :class:`PixelStatus` for each pixel.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -239,16 +239,16 @@ def _spread_out(
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
     enough, spanned = determined(found.weight, found.lights)
-    finding = torch.full_like(spanned, int(Finding.FOUND), dtype=torch.long)
+    finding = torch.full_like(spanned, int(PixelStatus.FOUND), dtype=torch.long)
     checks = [
-        (found.normals[2] >= 0, Finding.AVERTED),
-        ((found.normals == 0).all(dim=0) | (found.albedo <= 0).all(dim=0), Finding.BLACK),
-        (~spanned, Finding.FLAT),
-        (~enough, Finding.TOO_FEW),
+        (found.normals[2] >= 0, PixelStatus.AVERTED),
+        ((found.normals == 0).all(dim=0) | (found.albedo <= 0).all(dim=0), PixelStatus.BLACK),
+        (~spanned, PixelStatus.FLAT),
+        (~enough, PixelStatus.TOO_FEW),
     ]
     for wrong, name in checks:  # the last one that applies is reported
         finding = torch.where(wrong, int(name), finding)
-    raster = torch.full(mask.shape, int(Finding.OUTSIDE), device=mask.device)
+    raster = torch.full(mask.shape, int(PixelStatus.OUTSIDE), device=mask.device)
     raster[mask] = finding
     normals = like.new_zeros(*mask.shape, 3)
     normals[mask] = found.normals.mT.to(like)
@@ -265,7 +265,7 @@ def _spread_out(
         albedo=albedo,
         lights=lights,
         lit=lit,
-        valid=raster == int(Finding.FOUND),
+        valid=raster == int(PixelStatus.FOUND),
         finding=raster,
         applied=found.applied,
         free=found.free,

@@ -12,7 +12,7 @@ from pimper_torch.errors import (
     ReconstructionError,
 )
 from pimper_torch.evidence.bench import run_bench as runner
-from pimper_torch.evidence.bench.bench_inputs import BenchConfig, Inputs, Outcome, method_named
+from pimper_torch.evidence.bench.bench_inputs import BenchConfig, Inputs, MethodRun, method_named
 from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, error_along_rays, run_bench
 from pimper_torch.evidence.metrics import TrueSurface
 from pimper_torch.evidence.metrics.in_view import meet_truth
@@ -83,7 +83,7 @@ def of_radius(radius):
             cameras=scene.cameras,
             reference=scene.views.names[coarse.reference],
         )
-        return Outcome(estimate=estimate, seconds=6.0, samples=1000, missing_fraction=0.25)
+        return MethodRun(estimate=estimate, seconds=6.0, samples=1000, missing_fraction=0.25)
 
     return method
 

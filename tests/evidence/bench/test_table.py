@@ -16,7 +16,7 @@ from pimper_torch.errors import MissingProgramError, ReconstructionError
 from pimper_torch.evidence.bench.bench_table import (
     MISSING,
     PUBLISHED,
-    Row,
+    BenchRow,
     Table,
     cell,
     columns,
@@ -37,7 +37,7 @@ MACHINE = Machine(
     python="3.11.7",
     versions=("torch 2.13.0",),
 )
-FULL = Row(
+FULL = BenchRow(
     scene="mug",
     method="default",
     mesh_points=251,
@@ -66,7 +66,7 @@ FULL = Row(
     f_scores=((0.5, 97.5), (1.0, 99.25)),
     peak_memory_mb=1234.0,
 )
-EMPTY = Row(scene="mug", method="pmvs", note="not installed: pmvs2")
+EMPTY = BenchRow(scene="mug", method="pmvs", note="not installed: pmvs2")
 
 
 def table(*rows, **settings):
@@ -166,12 +166,14 @@ def test_thresholds_that_differ_between_rows_have_columns_of_their_own():
 
 
 def test_nothing_in_a_name_or_a_note_breaks_the_table():
-    odd = Row(scene="a|b", method="x\ny", minutes=1.0, note="failed: one | two\nIts last lines:")
+    odd = BenchRow(
+        scene="a|b", method="x\ny", minutes=1.0, note="failed: one | two\nIts last lines:"
+    )
     (row,) = cells(markdown(table(odd)))
     assert row["scene"] == "a\\|b"
     assert row["method"] == "x y"
     assert row["note"] == "failed: one \\| two"
-    long = Row(scene="mug", method="m", minutes=1.0, note="word " * 50)
+    long = BenchRow(scene="mug", method="m", minutes=1.0, note="word " * 50)
     assert len(cells(markdown(table(long)))[0]["note"]) <= 60
 
 
@@ -248,7 +250,7 @@ def test_json_holds_every_field(tmp_path):
     write_json(before, tmp_path / "bench.json")
     report = json.loads((tmp_path / "bench.json").read_text())
     assert report["settings"] == {"seed": 3, "scenes": ["mug", "jar"]}
-    assert [build(Row, row, "row") for row in report["rows"]] == [*before.rows]
+    assert [build(BenchRow, row, "row") for row in report["rows"]] == [*before.rows]
     assert build(Machine, report["machine"], "machine") == MACHINE
 
 

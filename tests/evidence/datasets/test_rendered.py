@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
@@ -50,7 +50,7 @@ def test_what_is_read_is_what_was_rendered(rendering, ball):
     assert_close(truth.mesh.vertices_world, scene.object_mesh.vertices_world, atol=1e-6, rtol=0)
     assert_close(truth.mesh.faces, scene.object_mesh.faces)
     assert len(truth.surroundings.faces) == len(scene.surroundings_mesh.faces)
-    stage = Stage(scene.objects)
+    stage = TracedObjects(scene.objects)
     for view in range(3):
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), CONFIG.sensor
@@ -94,7 +94,7 @@ def test_linear_deep_photographs_are_not_decoded_as_srgb(ball, tmp_path):
     render_scene(ball, tmp_path / "deep", config, processes=1)
     scene = build_scene(ball, config)
     frame = render_frame(
-        Stage(scene.objects), scene.cameras, scene.lights, 0, scene.noise(0), config.sensor
+        TracedObjects(scene.objects), scene.cameras, scene.lights, 0, scene.noise(0), config.sensor
     )
     found = read_rendered(tmp_path / "deep", views=[0]).views.images[0]
     assert_close(found, frame.image, atol=0.51 / 65535, rtol=0)

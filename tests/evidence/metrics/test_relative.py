@@ -7,7 +7,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics import relative_error
 from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
-from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere, render_shape
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Sphere, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.records import Mesh
@@ -44,7 +44,7 @@ def test_the_error_is_in_units_of_the_truth_not_of_the_estimate():
 
 
 def test_a_raised_table_has_the_error_computed_by_hand(cameras):
-    truth = truth_of(Plane(), cameras)
+    truth = truth_of(EndlessPlane(), cameras)
     found = compare_in_view(
         raised(table(), 0.1),
         IDENTITY,
@@ -119,7 +119,7 @@ def test_an_estimate_in_another_frame_is_transferred_to_the_truth(cameras):
 
 
 def test_rays_that_miss_count_against_the_coverage_alone(cameras):
-    truth = truth_of(Plane(), cameras)
+    truth = truth_of(EndlessPlane(), cameras)
     corners = torch.tensor([[0.0, -9, 0], [9, -9, 0], [9, 9, 0], [0, 9, 0]], dtype=torch.float64)
     half = Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     found = compare_in_view(half, IDENTITY, cameras, 0, truth.depth[0])
@@ -129,7 +129,7 @@ def test_rays_that_miss_count_against_the_coverage_alone(cameras):
 
 
 def test_tilted_normals_are_off_by_their_tilt(cameras):
-    truth = truth_of(Plane(), cameras)
+    truth = truth_of(EndlessPlane(), cameras)
     mesh = table()
     tilt = torch.deg2rad(torch.tensor(20.0, dtype=torch.float64))
     normal = torch.stack([tilt.sin(), torch.zeros_like(tilt), tilt.cos()])
@@ -149,7 +149,7 @@ def test_angles_are_accurate_at_both_ends():
 
 
 def test_a_mesh_elsewhere_is_refused(cameras):
-    truth = truth_of(Plane(), cameras)
+    truth = truth_of(EndlessPlane(), cameras)
     aside = table(0.1)
     aside = aside.replace(vertices_world=aside.vertices_world + 100)
     with pytest.raises(InputError, match="Check the frame"):

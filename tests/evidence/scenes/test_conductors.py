@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere, moved, table
-from pimper_torch.evidence.scenes.ray_tracing import Stage
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects
 from pimper_torch.evidence.scenes.scene_lights import PointLight, random_environment
 from pimper_torch.evidence.scenes.scene_object import CONDUCTORS, Conductor, SceneObject
 from pimper_torch.geometry.directions import even_directions
@@ -67,7 +67,7 @@ def test_a_flat_mirror_shows_what_is_above_it(generator):
     metal = CONDUCTORS["copper"]
     black = torch.zeros_like
     floor = SceneObject(mesh=table(4.0), texture=black, conductor=metal)
-    stage = Stage([floor, SceneObject(mesh=ceiling, texture=pattern, surroundings=True)])
+    stage = TracedObjects([floor, SceneObject(mesh=ceiling, texture=pattern, surroundings=True)])
     eye = torch.tensor([0.3, -0.2, 1.0])
     down = torch.randn(200, 3, generator=generator)
     down[:, 2] = -1.5
@@ -83,7 +83,9 @@ def test_a_flat_mirror_shows_what_is_above_it(generator):
 def test_a_mirroring_sphere_shows_the_environment_by_the_reflected_ray(generator):
     vertices, faces = icosphere(6)
     mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
-    stage = Stage([SceneObject(mesh=mesh, texture=torch.zeros_like, conductor=CONDUCTORS["gold"])])
+    stage = TracedObjects(
+        [SceneObject(mesh=mesh, texture=torch.zeros_like, conductor=CONDUCTORS["gold"])]
+    )
     picture = random_environment(generator)
     eye = torch.tensor([0.0, -4.0, 1.0])
     toward = 0.9 * even_directions(4000).float()
@@ -101,7 +103,7 @@ def test_mirrors_face_to_face_end():
     up = SceneObject(mesh=table(4.0), texture=torch.zeros_like, conductor=CONDUCTORS["silver"])
     above = moved(table(4.0), shift=(0.0, 0.0, 2.0))
     down = above.replace(faces=above.faces.flip(1), normals_world=-above.normals_world)
-    stage = Stage(
+    stage = TracedObjects(
         [up, SceneObject(mesh=down, texture=torch.zeros_like, conductor=CONDUCTORS["silver"])]
     )
     eye = torch.tensor([0.0, 0.0, 1.0])
@@ -115,7 +117,9 @@ def test_a_point_light_on_metal_has_the_metals_colour():
         item = SceneObject(mesh=table(4.0), texture=torch.zeros_like, roughness=0.3, **material)
         eye = torch.tensor([0.0, 0.0, 3.0])
         down = torch.tensor([[0.0, 0.0, -1.0]])
-        return radiance(Stage([item]), eye, down, point_light(irradiance=1.0, ambient=0.0))[1][0]
+        return radiance(TracedObjects([item]), eye, down, point_light(irradiance=1.0, ambient=0.0))[
+            1
+        ][0]
 
     copper = highlight(conductor=CONDUCTORS["copper"])
     full = highlight(specular=1.0)

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.procedural_meshes import moved, potato, table
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import Lights
 from pimper_torch.evidence.scenes.scene_object import SceneObject
@@ -24,7 +24,7 @@ def objects():
 
 @pytest.fixture(scope="module")
 def stage(objects):
-    return Stage(objects)
+    return TracedObjects(objects)
 
 
 def shot(stage, sensor, seed=0, **changes):
@@ -68,7 +68,7 @@ def test_exposure_multiplies_radiance_before_it_saturates(stage):
 def test_the_highlight_is_marked_where_gloss_makes_it(stage, objects):
     glossy = shot(stage, sensor(supersample=1))
     matte = [SceneObject(mesh=item.mesh, texture=item.texture) for item in objects]
-    plain = shot(Stage(matte), sensor(supersample=1))
+    plain = shot(TracedObjects(matte), sensor(supersample=1))
     assert not plain.highlight.any()
     assert glossy.highlight.any()
     assert not (glossy.highlight & ~glossy.foreground).any()

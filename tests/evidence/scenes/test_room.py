@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
@@ -32,7 +32,7 @@ def settings(**changes):
 
 
 def photograph(scene, view):
-    stage = Stage(scene.objects_in(view))
+    stage = TracedObjects(scene.objects_in(view))
     noise = scene.noise(view)
     return render_frame(stage, scene.cameras, scene.lights, view, noise, scene.config.sensor)
 

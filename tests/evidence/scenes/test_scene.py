@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.scenes import scene_objects
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.ray_tracing import Stage
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects
 from pimper_torch.evidence.scenes.scene_cameras import (
     aim_to_fit,
     arc_directions,
@@ -15,7 +15,7 @@ from pimper_torch.evidence.scenes.scene_cameras import (
 )
 from pimper_torch.evidence.scenes.scene_lights import lights_round
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
-from pimper_torch.evidence.scenes.textures import CylinderRegion, Marked, Painted
+from pimper_torch.evidence.scenes.textures import marked, painted
 from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.frames import rotate
@@ -181,7 +181,7 @@ def test_an_environment_stands_still_with_a_fixed_room(egg):
 
 def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
     scene = build_scene("pair", SceneConfig(num_views=5, width=80, height=60))
-    behind, front = (Stage([item]) for item in scene.objects[:2])
+    behind, front = (TracedObjects([item]) for item in scene.objects[:2])
     gap = KDTree(scene.objects[0].mesh.vertices_world.numpy()).query(
         scene.objects[1].mesh.vertices_world.numpy()
     )[0]
@@ -289,10 +289,9 @@ def test_paint_covers_and_marks_darken():
     def gray(at):
         return torch.full_like(at, 0.25)
 
-    front = CylinderRegion(radii=(0.5, 1.5), heights=(0.0, 1.0), azimuths_deg=(-30.0, 30.0))
-    painted = Painted(base=white, paint=gray, where=front)
-    assert painted(points)[:, 0].tolist() == [0.25, 1.0, 1.0]
-    assert Marked(base=painted, marks=gray)(points)[:, 0].tolist() == [0.0625, 0.25, 0.25]
+    front = painted(white, gray, radii=(0.5, 1.5), heights=(0.0, 1.0), azimuths_deg=(-30.0, 30.0))
+    assert front(points)[:, 0].tolist() == [0.25, 1.0, 1.0]
+    assert marked(front, gray)(points)[:, 0].tolist() == [0.0625, 0.25, 0.25]
 
 
 @pytest.mark.parametrize("name", scene_objects.RECIPES)

@@ -3,7 +3,7 @@ import torch
 from reliefs import WavyPlane
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Sphere
 from pimper_torch.evidence.scenes.textures import random_waves
 
 
@@ -25,7 +25,7 @@ LEVELS = {
 }
 SHAPES = {
     "sphere": Sphere(),
-    "plane": Plane(point=(0.0, 0.0, 0.3), normal=(0.2, -0.1, 1.0)),
+    "plane": EndlessPlane(point=(0.0, 0.0, 0.3), normal=(0.2, -0.1, 1.0)),
 }
 
 
@@ -58,7 +58,7 @@ def test_rays_that_pass_a_sphere_or_leave_a_plane_behind_meet_nothing():
     origins = torch.tensor([[0.0, 0.0, 4.0], [2.0, 0.0, 4.0]], dtype=torch.float64)
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
     assert Sphere().intersect(origins, directions).isinf().all()
-    assert Plane().intersect(origins[:1], directions[:1]).isinf().all()
+    assert EndlessPlane().intersect(origins[:1], directions[:1]).isinf().all()
 
 
 def test_a_ray_from_inside_a_sphere_meets_its_far_side():

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.render_in_memory import Plane, Sphere, render_shape
+from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Sphere, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.evidence.scenes.true_clouds import sparse_scene
@@ -78,7 +78,7 @@ def test_rays_through_noiseless_pixels_meet_in_their_points(generator):
 def test_a_plane_fills_all_views_with_points(generator):
     cameras = arc_cameras(4, width=40, height=30, focal_px=50.0, distance=4.0, span_deg=20.0)
     lights = torch.ones(4, 4, dtype=torch.float64)
-    scene = render_shape(Plane(), cameras, lights, random_speckle(generator))
+    scene = render_shape(EndlessPlane(), cameras, lights, random_speckle(generator))
     sparse = exact_cloud(scene, 100, generator, in_views=(1,))
     assert_close(sparse.points_world[:, 2], torch.zeros(100, dtype=torch.float64))
     assert sparse.observed[:, 1].all()

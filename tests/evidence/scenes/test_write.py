@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError, OutputError, PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.ray_tracing import Stage, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.rendered_folder import render_scene, unpack_maps
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
@@ -55,7 +55,7 @@ def test_a_rendering_holds_what_it_says(rendering):
 def test_photographs_and_masks_are_those_of_the_frames(rendering, ball):
     scene = build_scene(ball, SMALL)
     views = load_views(rendering / "photos", masks=rendering / "masks")
-    stage = Stage(scene.objects)
+    stage = TracedObjects(scene.objects)
     for view in range(3):
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), SMALL.sensor
@@ -73,7 +73,7 @@ def test_deep_linear_photographs_are_read_back_to_the_last_bit(ball, tmp_path):
     views = load_views(tmp_path / "deep" / "photos", encoding=LINEAR)
     scene = build_scene(ball, config)
     frame = render_frame(
-        Stage(scene.objects), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
+        TracedObjects(scene.objects), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
     )
     assert_close(views.images[1], frame.image, atol=0.51 / 65535, rtol=0)
 

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.photometric_stereo import Finding, photometric_stereo
+from pimper_torch.single_view.photometric_stereo import PixelStatus, photometric_stereo
 from pimper_torch.single_view.photometric_stereo.stereo import METHODS
 
 COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
@@ -106,14 +106,14 @@ def test_pixels_that_cannot_be_determined_say_why():
         images, mask, method="calibrated", lights=lights, weight=weight, robust=False
     )
     expected = [
-        Finding.FOUND,
-        Finding.BLACK,
-        Finding.TOO_FEW,
-        Finding.FLAT,
-        Finding.OUTSIDE,
-        Finding.AVERTED,
+        PixelStatus.FOUND,
+        PixelStatus.BLACK,
+        PixelStatus.TOO_FEW,
+        PixelStatus.FLAT,
+        PixelStatus.OUTSIDE,
+        PixelStatus.AVERTED,
     ]
-    assert [Finding(one) for one in found.finding[0].tolist()] == expected
+    assert [PixelStatus(one) for one in found.finding[0].tolist()] == expected
     assert found.valid[0].tolist() == [True, False, False, False, False, False]
     assert (found.normals[0, 4] == 0).all()
 
