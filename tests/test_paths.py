@@ -22,7 +22,7 @@ def functions() -> Iterator[typing.Any]:
     for name in EXPORTING:
         room = importlib.import_module(f"pimper_torch.evidence.{name}")
         yield from (getattr(room, exported) for exported in room.__all__)
-    for name in ("store.store", "evidence.bench.run", *modules()):
+    for name in ("store.store", "evidence.bench.run_bench", *modules()):
         module = importlib.import_module(f"pimper_torch.{name}")
         for found in vars(module).values():
             if getattr(found, "__module__", None) == module.__name__:

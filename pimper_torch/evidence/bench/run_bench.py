@@ -62,7 +62,7 @@ Covered = Bool[Tensor, "height width"]
 def with_common(
     rows: Sequence[BenchRow],
     covered: Sequence[Covered | None],
-    meshes: Sequence[Path],
+    meshes: Sequence[Path | str],
     maps: Capture,
 ) -> list[BenchRow]:
     """Add figures over the pixels that all methods cover to the rows of a scene.
@@ -85,7 +85,7 @@ def with_common(
     ]
 
 
-def _with_common(row: BenchRow, path: Path, common: Covered, maps: Capture) -> BenchRow:
+def _with_common(row: BenchRow, path: Path | str, common: Covered, maps: Capture) -> BenchRow:
     mesh = read_mesh(path)
     met = meet_truth(mesh, maps, 0)
     assert met is not None  # as when it was measured
@@ -117,7 +117,12 @@ ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
 
 
 def method_panels(
-    mesh: Mesh, met: Meeting | None, inputs: Inputs, scene: str, method: str, heatmap: Path
+    mesh: Mesh,
+    met: Meeting | None,
+    inputs: Inputs,
+    scene: str,
+    method: str,
+    heatmap: Path | str | str,
 ) -> MethodPanels:
     """Draw the errors of a surface on it, and return its pictures for the sheet.
 
