@@ -17,10 +17,10 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[2] / "pimper_torch"
 
 BARS = {
-    "docstrings that begin with Give, Tell, Say, Mark, What or How": 44,
-    "file names that occur twice or more": 64,
-    "public class names that occur twice or more": 16,
-    "numeric module constants": 622,
+    "docstrings that begin with Give, Tell, Say, Mark, What or How": 21,
+    "file names that occur twice or more": 34,
+    "public class names that occur twice or more": 8,
+    "numeric module constants": 608,
 }
 
 _OPENING = re.compile(r'^ *r?"""(?:Give|Tell|Say|Mark|What|How) ', re.MULTILINE)
