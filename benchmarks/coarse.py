@@ -21,13 +21,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.coarse.cropping import cropped
 from pimper_torch.coarse.fine_surface import (
     CELL_PX,
     POINT_PX,
     REACH_PX,
     TOLERANCE_PX,
     closed_surface,
+    cropped,
     poisson,
     seen_surface,
     supports,

@@ -2,10 +2,15 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.densify import agreeing, push_pull, sweep
+from pimper_torch.coarse.densify import (
+    agreeing,
+    choose_sources,
+    push_pull,
+    step_for_one_pixel,
+    sweep,
+)
 from pimper_torch.coarse.fine_surface import near_points
 from pimper_torch.coarse.matching import Matcher, Windows, level_of, pair
-from pimper_torch.coarse.neighbours import choose_sources, step_for_one_pixel
 from pimper_torch.coarse.oriented import (
     OrientedPoints,
     no_points,

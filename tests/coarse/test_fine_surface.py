@@ -3,8 +3,12 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.coarse.cropping import cropped
-from pimper_torch.coarse.fine_surface import FineSurfaceConfig, closed_surface, seen_surface
+from pimper_torch.coarse.fine_surface import (
+    FineSurfaceConfig,
+    closed_surface,
+    cropped,
+    seen_surface,
+)
 from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.coarse.trim import ViewCounts

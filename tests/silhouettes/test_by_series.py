@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.records import Silhouettes
-from pimper_torch.silhouettes.by_series import by_series
+from pimper_torch.silhouettes.find import by_series
 
 
 @pytest.fixture
