@@ -1,4 +1,4 @@
-"""What a call tells while it works, and who hears of it; no result depends on it.
+"""The journal: messages of a call while it works, and their listeners; no result depends on it.
 
 Cautions (:mod:`~pimper_torch.errors`), failures (:mod:`~pimper_torch.failures`), what guards leave
 out (:mod:`~pimper_torch.ledger`), reports of stages (:mod:`~pimper_torch.reporting`) and progress

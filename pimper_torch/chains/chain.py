@@ -1,4 +1,4 @@
-"""What both chains have in common: a run is a sequence of steps, and the last one's mesh."""
+"""The base of both chains: a run is a sequence of steps, and the last one's mesh."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""How a chain calls its stages: kept, reported, and a few patches at a time."""
+"""Calls of a chain's stages: kept, reported, and a few patches at a time."""
 
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -86,7 +86,7 @@ class Sweeping(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Bucket(Record):
-    """What is kept of a bucket."""
+    """Photometry and heights of a bucket."""
 
     photometry: Photometry
     heights: Heights

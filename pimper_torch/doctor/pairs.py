@@ -1,4 +1,4 @@
-"""What photographs show in common, by features of small copies: overlap, and how light varies."""
+"""Overlap of photographs and variation of their light, by features of small copies."""
 
 from collections.abc import Iterator, Sequence
 from statistics import median

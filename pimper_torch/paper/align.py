@@ -136,7 +136,7 @@ class AlignConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Problem(Record):
-    """What stays the same from round to round; lengths in scene units."""
+    """Constants of all rounds; lengths in scene units."""
 
     patches: PatchSet
     seams: Seams
@@ -145,7 +145,7 @@ class _Problem(Record):
 
     @property
     def in_scene(self) -> Float[Tensor, " 4"]:
-        """What carries transforms from units of the edge length to scene units."""
+        """Factors from units of the edge length to scene units."""
         return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
 
 

@@ -66,7 +66,7 @@ def psnr(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Judged(Record):
-    """How near a surface comes to photographs, each under the light that suits it best.
+    """Errors of a surface in photographs, each under the light that suits it best.
 
     Attributes:
         psnr_db: Of sRGB values in [0, 1], over the object's pixels.

@@ -122,7 +122,7 @@ class SurfacePixels(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Incidence(Record):
-    """How lights reach the pixels of a view.
+    """Visibility of the lights at the pixels of a view.
 
     Attributes:
         cosine: Between the normal and the light; 0 where the surface faces away or is shadowed.
@@ -213,7 +213,7 @@ class LitSurface:
 
 
 DIELECTRIC = 0.04
-"""What glTF's dielectric mirrors head on."""
+"""Reflectance of glTF's dielectric at normal incidence."""
 
 
 def diffuse_color(

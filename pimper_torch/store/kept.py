@@ -60,7 +60,7 @@ def _plain(event: object) -> object:
 
 
 def _tell(plain: str | dict[str, Any]) -> None:
-    """Tell an event of an earlier run again."""
+    """Repeat an event of an earlier run."""
     if isinstance(plain, str):
         caution(plain)
         return

@@ -17,7 +17,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[2] / "pimper_torch"
 
 BARS = {
-    "docstrings that begin with Give, Tell, Say, Mark, What or How": 21,
+    "docstrings that begin with Give, Tell, Say, Mark, What or How": 0,
     "file names that occur twice or more": 34,
     "public class names that occur twice or more": 8,
     "numeric module constants": 608,

@@ -42,7 +42,7 @@ METHODS = {
     "quick": ("default", "smoothed"),
     "full": ("default", "paper", "smoothed", "openmvs"),
 }
-"""What each scale runs by default."""
+"""Methods that each scale runs by default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,12 +88,12 @@ class BenchConfig:
 
     @property
     def evaluation(self) -> EvaluateConfig:
-        """How the surfaces are measured."""
+        """Settings of the evaluation."""
         return EvaluateConfig(seed=self.seed, samples=self.samples)
 
     @property
     def scene(self) -> SceneConfig:
-        """How the scenes are photographed at this scale."""
+        """Settings of the rendered scenes at this scale."""
         if self.scale == "full":
             return SceneConfig(seed=self.seed)
         return SceneConfig(seed=self.seed, num_views=16, width=640, height=480)

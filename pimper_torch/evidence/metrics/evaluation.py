@@ -38,7 +38,7 @@ from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluateConfig:
-    """What is measured, and after which alignment.
+    """Settings of an evaluation.
 
     Attributes:
         alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),

@@ -29,7 +29,7 @@ _MIRRORS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spots(Record):
-    """What rays meet; depth is infinite, normal and albedo zero, index -1 for a miss."""
+    """First hits of rays; depth is infinite, normal and albedo zero, index -1 for a miss."""
 
     hits: Hits
     points: Float[Tensor, "ray 3"]
@@ -40,7 +40,7 @@ class Spots(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shaded(Record):
-    """What spots send to the eye.
+    """Radiance of spots towards the eye.
 
     Attributes:
         mirrored: Radiance of the highlight, and of what a conductor mirrors.

@@ -54,7 +54,7 @@ _MOST_RAYS = 640_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
-    """How a scene is photographed.
+    """Settings of a rendered scene.
 
     Attributes:
         num_views: Photographs.
@@ -236,7 +236,7 @@ class SceneConfig:
 
     @property
     def jitter_px(self) -> float:
-        """How far the picture can be from where it is meant to be, for all reasons."""
+        """Return the largest error of a picture's place, of all causes together."""
         return self.pan_jitter_px + self.crop_jitter_px
 
     @property

@@ -56,7 +56,7 @@ class Rays(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How well a mesh fits what photographs show.
+    """Agreement of a mesh with photographs.
 
     Attributes:
         rays: To observed points.

@@ -1,4 +1,4 @@
-"""How photographs came from the pictures that cameras are of: resized, turned, or cropped.
+"""Photographs as resized, turned or cropped versions of the pictures that cameras are of.
 
 COLMAP works on the pixels of files, which EXIF may say are to be turned; photographs are turned
 when they are read. Sizes tell a quarter turn, but not which, and not a half; nor do they tell a
