@@ -189,7 +189,7 @@ def test_a_worker_that_does_not_answer_is_given_up_and_its_late_answer_is_ignore
             return late[0]
 
     executor = Hangs()
-    found = world.batch(executor=executor, time_limit_min=0.005)
+    found = world.batch(executor=executor, time_limit_min=0.05)  # of a child that imports
     assert (found["ball"].status, found["ball"].tries) == ("ended", 2)
     assert executor.tasks[1].avoid == ("far",)
     assert ("ball", "lost", True) in world.heard
