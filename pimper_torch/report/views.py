@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.relighting.fit_lights import ViewLights
 from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
@@ -42,6 +43,7 @@ def view_entries(
             small = shrunk(silhouettes.inside[view, :height, :width][None], longest)[0]
             entry["outline"] = outline(small, width / small.shape[1])
         entries.append(entry | ({} if predicted is None else _prediction(predicted, longest)))
+        drop_pages()
     return entries
 
 

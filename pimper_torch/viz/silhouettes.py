@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, max_pool2d
 
+from pimper_torch.mapped import drop_pages
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
 
@@ -37,6 +38,7 @@ def thumbnails(
         )
         top, left = view // across * high, view % across * wide
         sheet[top : top + high, left : left + wide] = tile
+        drop_pages()
     return sheet
 
 
