@@ -3,7 +3,7 @@
 import inspect
 import typing
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from torch import nn
 
@@ -15,6 +15,7 @@ R = TypeVar("R", covariant=True)
 T = TypeVar("T")
 
 
+@runtime_checkable
 class _Forward(Protocol[P, R]):
     def forward(self, *args: P.args, **kwargs: P.kwargs) -> R: ...
 

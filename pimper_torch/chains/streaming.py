@@ -60,6 +60,7 @@ class Prepares(Protocol):
 Factorizing = Callable[[PatchViews], PhotometricPatches]
 
 
+@runtime_checkable
 class Warping(Protocol):
     """A stage that resamples all views on all templates."""
 
@@ -69,6 +70,7 @@ class Warping(Protocol):
         """Return the samples J of every patch, and which of them are missing."""
 
 
+@runtime_checkable
 class Sweeping(Protocol):
     """A stage that finds heights under the fitted light."""
 
