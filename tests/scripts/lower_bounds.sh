@@ -17,6 +17,5 @@ cd "$folder"  # the installed package, not the working tree
 pimper --version
 pimper doctor
 pimper render jar -o scene --num-views 8 --width 160 --height 120 --processes 1
-pimper reconstruct scene/photos -o out --preset fast --sparse scene/truth/sparse \
-    --kernels torch  # compiling takes two minutes
+pimper reconstruct scene/photos -o out --preset fast --sparse scene/truth/sparse
 pimper evaluate out scene
