@@ -12,10 +12,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from one_viewpoint import read_uw_ps, read_yale_b
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.datasets import read_uw_ps, read_yale_b
 from pimper_torch.radiometry import Gamma, Linear, Srgb
 from pimper_torch.single_view.factorization.estimate_gamma import (
     GammaEstimate,
