@@ -374,7 +374,7 @@ _MARGIN = 8
 
 
 def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
-    """Cut every photograph to its silhouette's bounding box, and mask it.
+    """Cut every photograph to its silhouette's bounding box, and mask it and what hides it.
 
     The photographs share one raster: the largest box's. Views without a silhouette keep their
     left upper corner, masked. Cameras follow; priors are left out, as their maps cover whole
@@ -391,7 +391,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     low = boxes[:, 0]
     size = boxes[:, 1] - low
     width, height = size.amax(dim=0).tolist()
-    views, masks = scene.views, silhouettes.masks
+    views, masks = scene.views, silhouettes.shown
     images = zeros(
         (*views.images.shape[:2], height, width), views.images.dtype, views.images.device
     )

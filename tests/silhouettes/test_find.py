@@ -76,7 +76,7 @@ def test_what_hides_the_object_is_of_its_silhouette_and_is_not_used(staged):
     assert (staged.truth & ~used).sum() > 100
 
 
-@pytest.mark.parametrize("seen_in", [1, 12])
+@pytest.mark.parametrize("seen_in", [1, 3])
 def test_a_view_abstains_where_something_stands_before_the_object(staged, monkeypatch, seen_in):
     """What a view's cut lacks carves the hull, unless something else stands there."""
     cues = cues_of(staged.scene, *SMALL)
