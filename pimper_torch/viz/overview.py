@@ -88,8 +88,9 @@ def _all_views(result: Reconstruction, width_px: int) -> Tile:
     """Show photographs with their silhouettes: of many a selection, those not trusted first."""
     silhouettes = result.silhouettes
     shown = _selected(silhouettes.reliable.cpu())
-    views, chosen = result.scene.views.take(shown), silhouettes.take(shown)
-    small = thumbnails(views, chosen, width_px=width_px, across=_THUMBNAILS_ACROSS)
+    small = thumbnails(
+        result.scene.views, silhouettes, shown, width_px=width_px, across=_THUMBNAILS_ACROSS
+    )
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
     count = len(silhouettes.reliable)
     title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"

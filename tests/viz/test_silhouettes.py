@@ -29,7 +29,7 @@ def test_every_view_has_its_tile_and_its_silhouette():
         names=("a", "b", "c"),
         focals_px=torch.ones(3),
     )
-    sheet = thumbnails(views, silhouettes, width_px=60, across=2)
+    sheet = thumbnails(views, silhouettes, range(3), width_px=60, across=2)
     assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
     assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))
     for view, colour in enumerate((RELIABLE, RELIABLE, DOUBTED)):
@@ -41,3 +41,5 @@ def test_every_view_has_its_tile_and_its_silhouette():
         assert torch.equal(drawn, border(wanted))
         grey = srgb_from_linear(images[view, 0, 0, 0])
         assert_close(tile[~drawn], grey.expand(int((~drawn).sum()), 3))
+    last = thumbnails(views, silhouettes, [2, 0], width_px=60, across=2)
+    assert torch.equal(last, torch.cat([sheet[20:, :30], sheet[:20, :30]], dim=1))
