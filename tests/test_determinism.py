@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import os
 import subprocess
 import sys
 import warnings
@@ -76,9 +77,14 @@ def test_what_two_processes_give_has_the_same_bits():
         "from tests.test_determinism import of_every_stage\n"
         "print(hashlib.sha256(repr(of_every_stage('paper')).encode()).hexdigest())"
     )
+    path = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     told = {
         subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | path,
         ).stdout
         for _ in range(2)
     }
