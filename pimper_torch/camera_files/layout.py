@@ -64,7 +64,7 @@ class DataSetPath(NamedTuple):
         parent.expect(self.path.is_file(), f"a file {self.path.name}")
         try:
             return reader(self.path)
-        except InputError:
+        except (InputError, MemoryError):
             raise
         except Exception as error:  # every parser has its own kinds
             raise InputError(
