@@ -29,11 +29,11 @@ from pimper_torch.chains.presets import load_chain, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_llff, write_colmap
-from pimper_torch.exchange.pictures import file_names
+from pimper_torch.exchange.picture_files import file_names
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene
-from pimper_torch.sfm.scene import write_model
+from pimper_torch.sfm.sparse_scene import write_model
 from pimper_torch.stage import Given
 from pimper_torch.viz.render import crop
 

@@ -42,12 +42,12 @@ from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras, transfer
 from pimper_torch.evidence.metrics.in_view import compare_along_rays
 from pimper_torch.evidence.metrics.surface_distances import TrueSurface
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
+from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.surfaces import reduced
 from pimper_torch.sfm.undistort import undistorted
 from pimper_torch.silhouettes.contours import Contours, TraceContours
 

@@ -37,8 +37,8 @@ from pimper_torch.evidence.datasets import read_rendered
 from pimper_torch.evidence.metrics.evaluation import camera_figures
 from pimper_torch.evidence.metrics.similarity import align_estimate, transfer
 from pimper_torch.evidence.metrics.surface_distances import TrueSurface, true_surface
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.photographs import load_views
 from pimper_torch.ledger import GUARDS, listening
 from pimper_torch.records import Capture, Estimate, LeftOut, Reconstruction

@@ -30,7 +30,7 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Capture, Estimate, Mesh, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 COLMAP = ReconstructConfig(
     peak_threshold=0.0067,

@@ -27,7 +27,7 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.prior_files.read_silhouettes import read_silhouettes
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import SilhouettePrior, Silhouettes, SparseScene
-from pimper_torch.silhouettes.settings import SilhouetteConfig
+from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
 
 
 def main() -> None:

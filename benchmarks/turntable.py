@@ -17,11 +17,11 @@ import torch
 from pimper_torch.errors import PimperError, PimperWarning
 from pimper_torch.evidence.datasets import read_rendered
 from pimper_torch.evidence.metrics.similarity import similarity_between_cameras
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 COLUMNS = ("scene", "masks", "views", "points", "centres %", "worst %", "doubtful", "CPU s")
 

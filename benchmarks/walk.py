@@ -26,8 +26,8 @@ from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh
 from pimper_torch.sfm import reconstruct, registration
-from pimper_torch.sfm.scene import assemble_scene
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.sfm.sparse_scene import assemble_scene
 
 Spent = defaultdict[str, float]
 

@@ -1,7 +1,7 @@
 # Public names, which are imported when they are asked for (`__init__.py`).
 __all__: list[str]
+from .batches.many_objects import batch as batch
 from .batches.objects import Object as Object
-from .batches.run import batch as batch
 from .batches.task import Outcome as Outcome
 from .chains.chain import Chain as Chain
 from .chains.chain import Step as Step
@@ -71,7 +71,7 @@ from .silhouettes.contours import TraceContours as TraceContours
 from .silhouettes.find import FindSilhouettes as FindSilhouettes
 from .single_view.integration import integrate_normal_map as integrate_normal_map
 from .single_view.photometric_stereo.stereo import photometric_stereo as photometric_stereo
-from .size.find import find_scale as find_scale
+from .size.find_scale import find_scale as find_scale
 from .size.given import CameraDistance as CameraDistance
 from .size.given import Mark as Mark
 from .size.given import ScaleBar as ScaleBar
@@ -79,11 +79,11 @@ from .size.scale import Scale as Scale
 from .size.scaled import scaled as scaled
 from .stage import Given as Given
 from .stage import Stage as Stage
-from .store.folders import user_cache as user_cache
+from .store.user_cache import user_cache as user_cache
 from .sweep.sweep import Sweep as Sweep
 from .viewer.show import show as show
-from .viz.patches import by_facet as by_facet
-from .viz.patches import plot_in_view as plot_in_view
-from .viz.patches import plot_patch as plot_patch
+from .viz.patch_figures import by_facet as by_facet
+from .viz.patch_figures import plot_in_view as plot_in_view
+from .viz.patch_figures import plot_patch as plot_patch
 
 __version__: str

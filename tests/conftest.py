@@ -89,8 +89,8 @@ def reconstruction():
     from torch.nn.functional import normalize
 
     from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-    from pimper_torch.geometry.frames import rigid
     from pimper_torch.geometry.projection import project
+    from pimper_torch.geometry.rigid import rigid
     from pimper_torch.geometry.surfaces import vertex_normals
     from pimper_torch.records import (
         CoarseMesh,
@@ -220,7 +220,7 @@ def lift():
     from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.evidence.scenes.scene_lights import wandering_lights
     from pimper_torch.evidence.scenes.textures import random_speckle
-    from pimper_torch.geometry.frames import rotate
+    from pimper_torch.geometry.rigid import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
     from pimper_torch.photometry.harmonics import rotate_lights

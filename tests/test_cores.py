@@ -6,7 +6,7 @@ import pytest
 
 from pimper_torch.cli.main import main
 from pimper_torch.cores import usable_cores
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pimper_torch.asset.atlas import unwrapped
 from pimper_torch.asset.bake import Textured, baked
 from pimper_torch.geometry.surfaces import side_lengths
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 
 # What people can edit, and browsers draw at once.
 _FACES = 50_000

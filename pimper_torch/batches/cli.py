@@ -9,11 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from pimper_torch.batches.lines import Events, Lines, totals
+from pimper_torch.batches.lines import Lines, TryEvents, totals
+from pimper_torch.batches.many_objects import TRIES, batch
 from pimper_torch.batches.objects import CSV, HTML
 from pimper_torch.batches.on_dask import dask_workers, require_dask
 from pimper_torch.batches.on_slurm import SlurmExecutor, require_slurm
-from pimper_torch.batches.run import TRIES, batch
 from pimper_torch.batches.table import terminal
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
@@ -61,7 +61,7 @@ class _Job:
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``batch``: a line an object, and a table at the end."""
     job, settings = checked(command, arguments)
-    shown = Events(output.event) if output.as_json else Lines(output.shows("info"))
+    shown = TryEvents(output.event) if output.as_json else Lines(output.shows("info"))
     try:
         with _engine(job) as executor, shown:
             outcomes = batch(

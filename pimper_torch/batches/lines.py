@@ -21,13 +21,13 @@ def totals(outcomes: Sequence[Outcome]) -> str:
     return ", ".join(f"{count} {status}" for status, count in counts.items())
 
 
-class Events:
+class TryEvents:
     """Writes an event when a try begins and ends, and at every stage of it."""
 
     def __init__(self, write: Callable[..., None]) -> None:
         self._write = write
 
-    def __enter__(self) -> "Events":
+    def __enter__(self) -> "TryEvents":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.errors import InputError, caution, some
-from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.records import Lens
 
 KIND = "a Metashape camera XML"

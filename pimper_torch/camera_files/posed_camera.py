@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Lens, Record
 
 # Files round a rotation to some digits; more than this is a scale or a reflection.

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 
 
 def decompose_projections(

@@ -14,7 +14,7 @@ from pimper_torch.camera_files.posed_camera import (
     rigid_or_refuse,
 )
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Lens
 
 KIND = "a transforms.json set"

@@ -34,10 +34,10 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
-from pimper_torch.silhouettes.settings import SilhouetteConfig
+from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.store import Store, opened
 
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pimper_torch.cli.faults import limit, write_report
+from pimper_torch.cli.crash_report import limit, write_report
 from pimper_torch.cli.output import Output
 from pimper_torch.outputs.stages import kept, resumption
 

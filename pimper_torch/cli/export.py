@@ -11,7 +11,7 @@ from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.exchange.formats import Format, write_formats
+from pimper_torch.exchange.layouts import Format, write_formats
 from pimper_torch.exchange.result import read_result
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.records.priors import Axes
@@ -19,7 +19,7 @@ from pimper_torch.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class ExportJob:
     """Write a result for other programs, each format in a folder of its name in OUT.
 
     All formats but `lights` have maps or photographs as pinholes saw them, undistorted.
@@ -62,9 +62,9 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     output.result({"folder": job.out, **paths}, photographs=result.scene.views.num_views)
 
 
-def checked(command: str, arguments: Sequence[str]) -> Job:
+def checked(command: str, arguments: Sequence[str]) -> ExportJob:
     """Read the arguments, and check what can be checked without reading RESULT."""
-    job = read_arguments(Job, command, arguments)
+    job = read_arguments(ExportJob, command, arguments)
     require(len(job.formats) > 0, "--format", "nothing", "one format or more")
     require_apart(job.out, {"RESULT": job.result, "--photos": job.photos})
     prepare_output(job.out, "data set", job.overwrite)

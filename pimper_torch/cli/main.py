@@ -23,7 +23,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from typing import TextIO
 
-from pimper_torch.cli.faults import limit, write_report
+from pimper_torch.cli.crash_report import limit, write_report
 from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import exit_code, stoppable

@@ -12,7 +12,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.size.sheet import SIDE_MM, Paper, layout
-from pimper_torch.viz.sheet import TITLE, write_sheet
+from pimper_torch.viz.marker_sheet import TITLE, write_sheet
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

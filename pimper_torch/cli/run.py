@@ -35,7 +35,7 @@ from pimper_torch.reporting import accounted, reported, stage
 from pimper_torch.size.given import measured_in
 from pimper_torch.size.scale import Scale
 from pimper_torch.store import Store
-from pimper_torch.viewer.results import COARSE, add_found, add_outcome
+from pimper_torch.viewer.live_results import COARSE, add_found, add_outcome
 from pimper_torch.viewer.viewer import Viewer, opened
 from pimper_torch.viz.overview import headline
 from pimper_torch.viz.preview import draw_preview

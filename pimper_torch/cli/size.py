@@ -6,7 +6,7 @@ from pimper_torch.cli.options import Job
 from pimper_torch.io.decode import read_header
 from pimper_torch.io.photographs import image_name, list_images
 from pimper_torch.records import Reconstruction, Views
-from pimper_torch.size.find import find_scale
+from pimper_torch.size.find_scale import find_scale
 from pimper_torch.size.given import Mark, Pointer, ScaleBar, number_of, require_inside
 from pimper_torch.size.scale import Scale
 from pimper_torch.size.scaled import scaled

@@ -11,7 +11,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, normalize
 
-from pimper_torch.coarse.matching import Level, Matcher, Pairing, Windows, level_of, pair, shifted
+from pimper_torch.coarse.window_matching import (
+    Matcher,
+    MatchingLevel,
+    Pairing,
+    Windows,
+    level_of,
+    pair,
+    shifted,
+)
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import grid_from_pixels
@@ -75,7 +83,7 @@ class DepthMaps(Record):
     """
 
     factor: int
-    level: Level
+    level: MatchingLevel
     inverse_depth: Float[Tensor, "view height width"]
     agreed: Int[Tensor, "view height width"]
     valid: Bool[Tensor, "view height width"]
@@ -119,7 +127,7 @@ class _Found(Record):
 
 
 def _search_or_nothing(
-    search: Callable[[int], _Found], names: Sequence[str], level: Level, view: int
+    search: Callable[[int], _Found], names: Sequence[str], level: MatchingLevel, view: int
 ) -> _Found:
     blank = torch.zeros_like(level.tone[view])
     none = torch.zeros(0, dtype=torch.long, device=blank.device)
@@ -135,7 +143,7 @@ def _search_or_nothing(
 def _search(
     scene: SparseScene,
     points: Int[Tensor, " chosen"],
-    level: Level,
+    level: MatchingLevel,
     config: DensifyConfig,
     before: DepthMaps | None,
     view: int,
@@ -223,7 +231,7 @@ def sweep(
 
 def _checked(
     factor: int,
-    level: Level,
+    level: MatchingLevel,
     fields: Float[Tensor, "2 view height width"],
     found: Sequence[_Found],
 ) -> DepthMaps:
@@ -250,7 +258,7 @@ def _checked(
 
 
 def agreeing(
-    level: Level,
+    level: MatchingLevel,
     inverse_depth: Float[Tensor, "view height width"],
     good: Bool[Tensor, "view height width"],
     view: int,
@@ -280,7 +288,7 @@ def agreeing(
 
 
 def _pixels_per_inverse_depth(
-    level: Level,
+    level: MatchingLevel,
     view: int,
     others: Int[Tensor, " other"],
     pixels: Float[Tensor, "other 2 point"],

@@ -12,7 +12,6 @@ from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.matched import matched_cloud, pixel_size_at
-from pimper_torch.coarse.matching import level_of
 from pimper_torch.coarse.oriented import OrientedPoints, no_points
 from pimper_torch.coarse.trim import (
     ViewCounts,
@@ -23,6 +22,7 @@ from pimper_torch.coarse.trim import (
     view_counts,
     without_small_holes,
 )
+from pimper_torch.coarse.window_matching import level_of
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.pixels import crop_intrinsics
@@ -33,7 +33,7 @@ from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.records import Cameras, ContourPoints, Record, Silhouettes, SparseScene, Support
-from pimper_torch.sfm.surfaces import poisson_surface
+from pimper_torch.sfm.colmap_surfaces import poisson_surface
 from pimper_torch.silhouettes.contours import Contours
 
 # Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,

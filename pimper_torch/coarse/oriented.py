@@ -11,7 +11,7 @@ from torch.linalg import cross
 from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.coarse.matching import shifted
+from pimper_torch.coarse.window_matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.ledger import leave_out

@@ -23,7 +23,7 @@ from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.coarse.matching import Level
+from pimper_torch.coarse.window_matching import MatchingLevel
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import component_areas, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import dilated, face_components, face_pairs, graph_components
@@ -49,7 +49,7 @@ class ViewCounts(Record):
 def view_counts(
     vertices: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"],
-    level: Level,
+    level: MatchingLevel,
     maps: DepthMaps | None,
     matched_world: Float[Tensor, "point 3"],
     reach: float,

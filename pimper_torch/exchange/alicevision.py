@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.exchange.map_files import colours, with_axes
 from pimper_torch.exchange.openexr import write_exr
-from pimper_torch.exchange.pictures import file_names, write_mask, write_picture
+from pimper_torch.exchange.picture_files import file_names, write_mask, write_picture
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.records import Cameras

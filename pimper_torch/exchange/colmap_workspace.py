@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.exchange.pictures import file_names, refuse_skew, write_mask, write_picture
+from pimper_torch.exchange.picture_files import file_names, refuse_skew, write_mask, write_picture
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses, undistort_pixels, write_binary
 from pimper_torch.sfm.model import SparseModel, select_views
-from pimper_torch.sfm.scene import model_of_scene, point_colors
+from pimper_torch.sfm.sparse_scene import model_of_scene, point_colors
 from pimper_torch.viz.maps import view_maps
 
 _PARTNERS = 20  # views that one is compared with; what COLMAP's own undistorter writes

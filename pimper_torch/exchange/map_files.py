@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.exchange.openexr import write_exr
-from pimper_torch.exchange.pictures import file_names
+from pimper_torch.exchange.picture_files import file_names
 from pimper_torch.exchange.result import Result
 from pimper_torch.io.decode import write_deep_png
 from pimper_torch.records.priors import AXES, Axes

@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.camera_files.transforms_json import FLIP
-from pimper_torch.exchange.pictures import file_names, refuse_skew, write_mask, write_picture
+from pimper_torch.exchange.picture_files import file_names, refuse_skew, write_mask, write_picture
 from pimper_torch.exchange.result import Result
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Cameras, Mesh, Views
 

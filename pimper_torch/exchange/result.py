@@ -19,7 +19,7 @@ from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.sparse_scene import assemble_scene
 from pimper_torch.sfm.undistort import pinholes_for
 
 _KIND = "a result of `pimper reconstruct`"

@@ -17,8 +17,8 @@ from torch.nn.functional import normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from pimper_torch.failures import over_patches
-from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
+from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ledger import leave_out

@@ -21,7 +21,7 @@ from pimper_torch.failures import reason_of, skipped
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.linalg.equations import compressed_equations, normal_equations
+from pimper_torch.linalg.least_squares import compressed_equations, normal_equations
 from pimper_torch.linalg.singular import SingularSystemError
 from pimper_torch.linalg.sums import total
 from pimper_torch.linalg.systems import solutions, solve_compressed
@@ -214,7 +214,7 @@ def _evaluated(
     """
     parts = kind.coefficients, kind.targets, kind.information, kind.correlated
     if compiled_for(*parts, weight, heights, answer):
-        from pimper_torch.kernels import equations as kernels
+        from pimper_torch.kernels import normal_equations as kernels
 
         square = torch.empty_like(weight)
         real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)

@@ -281,7 +281,7 @@ class CloudPoints(Term):
         return Passing(None if cloud is None else cloud_points(cloud, problem.surface))
 
 
-class ContourRays(Term):
+class TouchedRays(Term):
     """The surface touches the rays through the silhouettes, to the silhouettes' variance."""
 
     position = True
@@ -367,7 +367,7 @@ class KeptSlopes(Term):
 TERMS: dict[str, type[Term]] = {
     "kept_slopes": KeptSlopes,
     "cloud_points": CloudPoints,
-    "contour_rays": ContourRays,
+    "contour_rays": TouchedRays,
     "swept_heights": SweptHeights,
     "normals": Normals,
     "prior_normals": PriorNormals,

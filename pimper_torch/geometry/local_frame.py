@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 
 Offset = tuple[float, float, float]
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras
 
 

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import homogeneous
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras
 
 _POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Record, SparseScene
 
 _TRIALS = 2000  # three good points of fifteen in a hundred are missed with probability 0.001

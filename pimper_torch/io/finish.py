@@ -9,7 +9,7 @@ from pimper_torch.io.meshes import written_channels
 from pimper_torch.meshing.closing import Closed, closed
 from pimper_torch.meshing.simplify import simplify
 from pimper_torch.records import Mesh, Record
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 
 # Caps are added after a mesh was reduced, so that it is reduced again by as much; their number
 # hardly changes after the second time.

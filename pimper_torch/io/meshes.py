@@ -15,14 +15,14 @@ from torch.nn.functional import normalize
 
 from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import rotate, transform
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
+from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import corners_of
 from pimper_torch.io.mesh_headers import RAW_COLORS, impossible, with_raw_colors
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
-from pimper_torch.records.faults import beyond, not_finite
+from pimper_torch.records.value_checks import beyond, not_finite
 from pimper_torch.viz.maps import base_color
 
 # One number a vertex, written and read under the names of the record's fields.

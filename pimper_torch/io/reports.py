@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.io.version import installed_version
 from pimper_torch.records import Failure, Reconstruction
 

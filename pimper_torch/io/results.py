@@ -26,11 +26,11 @@ from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
 from pimper_torch.relighting.held_out import Relighting, relight
-from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import asset_within, write_page
 from pimper_torch.report.predictions import predictions
+from pimper_torch.report.vertex_layers import surface_layers
 from pimper_torch.reporting import reported
-from pimper_torch.sfm.scene import write_model
+from pimper_torch.sfm.sparse_scene import write_model
 from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.overview import draw_overview, headline
 from pimper_torch.viz.turn import draw_turn

@@ -26,10 +26,16 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 # The kernels of each part of a run, in the order of need.
 SFM = ("line_matches", "patch_alignment")
-COARSE = ("windows",)
-PHOTOMETRY = ("resample", "lights", "factorization")
-SWEEP = ("sweep",)
-SURFACE = ("equations", "sparse", "conjugate_gradients", "aggregation", "decimation")
+COARSE = ("window_scores",)
+PHOTOMETRY = ("resampling", "lights_and_albedo", "factorization")
+SWEEP = ("sweep_costs",)
+SURFACE = (
+    "normal_equations",
+    "sparse_products",
+    "vector_updates",
+    "multigrid_levels",
+    "decimation",
+)
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
-from pimper_torch.kernels.cone import TILE, update_shading, whitening
 from pimper_torch.kernels.robust_scale import robust_variance
+from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

@@ -60,7 +60,7 @@ def prolongation(matrix: csr_array) -> csr_array:
         One column per coarse unknown, not negative. Rows of isolated unknowns are empty; the
         others add up to the near-kernel vector where there is no anchor (excess of the diagonal).
     """
-    from pimper_torch.kernels import aggregation as kernels
+    from pimper_torch.kernels import multigrid_levels as kernels
 
     parts, size = parts_of(matrix), matrix.shape[0]
     dominant, scale = dominant_diagonal(matrix), np.ones(size)
@@ -94,7 +94,7 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
     It is the matrix's own wherever that is diagonally dominant.
     """
-    from pimper_torch.kernels import aggregation as kernels
+    from pimper_torch.kernels import multigrid_levels as kernels
 
     own, dominant = np.empty((2, matrix.shape[0]))
     over_rows(kernels.diagonals, len(own), *parts_of(matrix), own, dominant)
@@ -107,7 +107,7 @@ def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_a
     Args:
         prolong: From :func:`prolongation`.
     """
-    from pimper_torch.kernels import aggregation as kernels
+    from pimper_torch.kernels import multigrid_levels as kernels
 
     parts = [part for each in (matrix, prolong, restrict) for part in parts_of(each)]
     return _concatenated(over_rows(kernels.coarser, restrict.shape[0], *parts), restrict.shape[0])

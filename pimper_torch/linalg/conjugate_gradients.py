@@ -92,8 +92,8 @@ def compressed_gradients(
         start: Where to begin; zero if not given.
         dtype: Of the vectors of ``precondition``.
     """
-    from pimper_torch.kernels import conjugate_gradients as kernels
-    from pimper_torch.kernels import sparse
+    from pimper_torch.kernels import sparse_products
+    from pimper_torch.kernels import vector_updates as kernels
 
     count, sides = rhs.shape
     blocks = -(-count // kernels.BLOCK)
@@ -106,7 +106,7 @@ def compressed_gradients(
 
     def product(vectors: Tensor, base: Tensor, found: Tensor, keep: float, gain: float) -> None:
         arrays = as_array(vectors), as_array(base), as_array(found)
-        over_rows(sparse.product, count, *parts_of(matrix), *arrays, keep, gain)
+        over_rows(sparse_products.product, count, *parts_of(matrix), *arrays, keep, gain)
 
     found, residual = torch.zeros_like(rhs), rhs.clone()
     if start is not None:

@@ -129,7 +129,7 @@ class CompiledLevel(Level):
         start: Float[Tensor, "unknown ..."] | None = None,
     ) -> Float[Tensor, "unknown ..."]:
         """Smooth in three passes; see :meth:`Level.smoothed`."""
-        from pimper_torch.kernels import sparse
+        from pimper_torch.kernels import sparse_products
 
         remaining, size = residual, len(residual)
         step, found = (self._buffer(name, residual) for name in ("step", "found"))
@@ -137,13 +137,17 @@ class CompiledLevel(Level):
             remaining = self._buffer("left", residual)
             with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, found=remaining)
         diagonal = self.inverse_diagonal.numpy()
-        over_rows(sparse.scaled, size, diagonal, _columns(remaining), _columns(step), 1 / _CENTER)
+        over_rows(
+            sparse_products.scaled, size, diagonal, _columns(remaining), _columns(step), 1 / _CENTER
+        )
         vectors = [
             _columns(each) for each in (remaining, step, step if start is None else start, found)
         ]
         of_step = _OF_STEP - 1 if start is None else _OF_STEP
         parts = parts_of(self._matrix)
-        over_rows(sparse.corrected, size, *parts, diagonal, *vectors, of_step, _OF_CORRECTION)
+        over_rows(
+            sparse_products.corrected, size, *parts, diagonal, *vectors, of_step, _OF_CORRECTION
+        )
         return found
 
     def coarse_residual(
@@ -266,12 +270,12 @@ def with_product(
     found: Float[Tensor, "row ..."] | None = None,
 ) -> Float[Tensor, "row ..."]:
     """Return ``keep * start + gain * matrix @ vectors`` by compiled kernels, into ``found``."""
-    from pimper_torch.kernels import sparse
+    from pimper_torch.kernels import sparse_products
 
     if found is None:
         found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
     columns = [_columns(each) for each in (vectors, found if start is None else start, found)]
-    over_rows(sparse.product, len(found), *parts_of(matrix), *columns, keep, gain)
+    over_rows(sparse_products.product, len(found), *parts_of(matrix), *columns, keep, gain)
     return found
 
 

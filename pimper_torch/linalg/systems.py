@@ -95,7 +95,7 @@ def solve_compressed(
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
     """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""
-    from pimper_torch.kernels import aggregation as kernels
+    from pimper_torch.kernels import multigrid_levels as kernels
 
     diagonal = torch.from_numpy(matrix.diagonal())
     if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS:

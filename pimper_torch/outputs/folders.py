@@ -18,8 +18,8 @@ from pimper_torch.errors import InputError, OutputError, some
 from pimper_torch.outputs.marker import (
     MARKER,
     STAGES,
+    FileList,
     Kind,
-    Marker,
     foreign,
     read_marker,
     remove_written,
@@ -200,7 +200,7 @@ def _refused_by_the_disk(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _markers(folder: Path) -> list[Marker]:
+def _markers(folder: Path) -> list[FileList]:
     """Read the lists of a result, of one that is being removed, and of a new one."""
     places = (folder, folder / STAGES, folder / STAGES / NEW)
     return [marker for place in places if (marker := read_marker(place)) is not None]
@@ -221,7 +221,7 @@ def _require_replaceable(folder: Path, kind: Kind, present: list[str]) -> None:
     _require_ours(folder, markers)
 
 
-def _require_ours(folder: Path, markers: list[Marker]) -> None:
+def _require_ours(folder: Path, markers: list[FileList]) -> None:
     strangers = foreign(folder, *markers)
     if strangers:
         raise OutputError(

@@ -39,7 +39,7 @@ class Written(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Marker:
+class FileList:
     """The list of a folder.
 
     Attributes:
@@ -68,7 +68,7 @@ def seal(folder: Path, kind: Kind) -> None:
         fresh.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def read_marker(folder: Path) -> Marker | None:
+def read_marker(folder: Path) -> FileList | None:
     """Read a folder's marker; ``None`` where there is none, or none that can be believed.
 
     Its names are only compared with those in the folder: a name that leads elsewhere is harmless.
@@ -83,10 +83,10 @@ def read_marker(folder: Path) -> Marker | None:
         kind = next((one for one in get_args(Kind) if one == content["kind"]), None)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    return Marker(kind=kind, files=files) if known and kind is not None else None
+    return FileList(kind=kind, files=files) if known and kind is not None else None
 
 
-def foreign(folder: Path, *markers: Marker) -> list[str]:
+def foreign(folder: Path, *markers: FileList) -> list[str]:
     """Name what is in a folder but in none of the lists, or was changed since it was written.
 
     The folder of kept stages and the marker are left out.
@@ -103,7 +103,7 @@ def foreign(folder: Path, *markers: Marker) -> list[str]:
     return found
 
 
-def remove_written(folder: Path, marker: Marker) -> None:
+def remove_written(folder: Path, marker: FileList) -> None:
     """Remove the files that the list names, and nothing else.
 
     A folder inside that holds anything else stays.
@@ -129,7 +129,7 @@ def _is_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink()
 
 
-def _is_written(path: Path, name: str, marker: Marker) -> bool:
+def _is_written(path: Path, name: str, marker: FileList) -> bool:
     """Return whether a file is one that the list names, with the same contents."""
     about = path.lstat()
     if not stat.S_ISREG(about.st_mode):

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.linalg.sums import average
 from pimper_torch.paper.seams import (
     Pulls,

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import slopes_from_normals
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches

@@ -12,9 +12,9 @@ from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import smoothed_normals
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.ledger import leave_out

@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.failures import skipped_patches
-from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
 from pimper_torch.patches.transfer import transfer
 from pimper_torch.patches.view_choice import view_blocks

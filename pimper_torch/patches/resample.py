@@ -5,7 +5,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
@@ -29,7 +29,7 @@ def resampled(
         min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
-    from pimper_torch.kernels import resample
+    from pimper_torch.kernels import resampling
 
     patch_from_world = templates.patch_from_world.double()
     exact = cameras.to(torch.float64)
@@ -42,7 +42,7 @@ def resampled(
     height, width = templates.depth.shape[1:]
     radiance = torch.empty(*shape, sources.images.finest.shape[1], height, width)
     valid = torch.empty(*shape, height, width, dtype=torch.bool)
-    resample.register(
+    resampling.register(
         *sources.images.arrays,
         *sources.unusable.arrays,
         as_array(sources.images.table),

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.parallel import side_by_side

@@ -12,15 +12,15 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.priors import merged
 from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.resample import occluded, resampled
 from pimper_torch.patches.sources import LEVELS, PriorMaps, Sources, prepare
+from pimper_torch.patches.template_priors import merged
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,

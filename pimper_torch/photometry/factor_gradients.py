@@ -80,15 +80,15 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Step(Record):
+class FactorStep(Record):
     """A step of all unknowns: of the lights, and of the samples along their tangents."""
 
     lights: Float[Tensor, "patch view rank"]
     along_tangents: Float[Tensor, "patch tangent sample"]
 
-    def moved(self, factor: Float[Tensor, " patch"], other: "Step") -> "Step":
+    def moved(self, factor: Float[Tensor, " patch"], other: "FactorStep") -> "FactorStep":
         """Add a multiple of another step."""
-        return Step(
+        return FactorStep(
             lights=self.lights + factor[:, None, None] * other.lights,
             along_tangents=self.along_tangents + factor[:, None, None] * other.along_tangents,
         )
@@ -147,7 +147,7 @@ def _gradient_size(problem: Bilinear, hessian: Hessian) -> Float[Tensor, " patch
     return on_lights.square().sum(dim=(1, 2)) + on_samples.square().sum(dim=(1, 2))
 
 
-def _newton_step(problem: Bilinear, hessian: Hessian) -> Step:
+def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
     r"""Return Newton's step; differentiable in the data, the Hessian constant.
 
     The scale of the robust weights is a multiple of the residuals' deviation :math:`d`, which
@@ -168,13 +168,13 @@ def _solved(
     hessian: Hessian,
     on_lights: Float[Tensor, "patch view rank"],
     on_samples: Float[Tensor, "patch tangent sample"],
-) -> Step:
+) -> FactorStep:
     """Apply the Hessian's inverse, samples eliminated."""
     inner = _apply(hessian.inverse, on_samples)
     slope = on_lights - _apply_mixed(hessian, inner)
     flat = slope.reshape(len(slope), -1, 1)
     lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
-    return Step(
+    return FactorStep(
         lights=lights,
         along_tangents=inner - _apply(hessian.inverse, _apply_mixed_transpose(hessian, lights)),
     )
@@ -204,7 +204,7 @@ def _by_deviation(
 
 
 def _change_of(
-    deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: Step
+    deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: FactorStep
 ) -> Float[Tensor, " patch"]:
     """Return the directional derivative of the deviation along a step."""
     samples = step.lights @ hessian.shading

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize, pad
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped_patches, solved_or
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
@@ -21,12 +21,7 @@ from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.factor_gradients import differentiable
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.learned import LearnedPrior
-from pimper_torch.photometry.light_field import LightField, faces_light, is_strong
-from pimper_torch.photometry.lights import light_of_mesh
-from pimper_torch.photometry.manifolds import Cone
-from pimper_torch.photometry.priors import (
+from pimper_torch.photometry.factor_priors import (
     RELATIVE_NOISE,
     FactorPrior,
     FieldLights,
@@ -38,6 +33,11 @@ from pimper_torch.photometry.priors import (
     PatchSamples,
     SurfaceNormals,
 )
+from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.light_field import LightField, faces_light, is_strong
+from pimper_torch.photometry.lights import light_of_mesh
+from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.rows import Rows, in_row, on_raster, rows_of
 from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold

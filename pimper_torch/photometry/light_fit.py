@@ -81,7 +81,7 @@ def _minimize(
     min_gain: float,
 ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
     """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
-    from pimper_torch.kernels.lights import TILE, fit
+    from pimper_torch.kernels.lights_and_albedo import TILE, fit
 
     count, device = len(albedo), albedo.device
     lights, found = lights.cpu().clone(memory_format=torch.contiguous_format), albedo.cpu()

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.photometry.harmonics import harmonics, second_harmonics
 from pimper_torch.photometry.image_samples import ImageSamples
 from pimper_torch.photometry.left_out import left_out, predicts_better

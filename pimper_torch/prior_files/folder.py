@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, some
 from pimper_torch.file_names import match_files
-from pimper_torch.prior_files.layers import FORMATS, VARIANCE, read_layers
+from pimper_torch.prior_files.map_file import FORMATS, VARIANCE, read_layers
 from pimper_torch.priors.from_maps import Maps, stacked
 from pimper_torch.records import Views
 

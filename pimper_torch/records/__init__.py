@@ -1,6 +1,6 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.contours import ContourPoints, ContourRays
+from pimper_torch.records.contour_rays import ContourPoints, ContourRays
 from pimper_torch.records.failure import Failure, LeftOut
 from pimper_torch.records.patches import (
     AlignStatus,

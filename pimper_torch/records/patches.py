@@ -18,9 +18,16 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.records.faults import beyond, not_finite, not_unit, once, outside, turned_away
 from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
+from pimper_torch.records.value_checks import (
+    beyond,
+    not_finite,
+    not_unit,
+    once,
+    outside,
+    turned_away,
+)
 
 AnyPatches = TypeVar("AnyPatches", bound="OverPatches")
 

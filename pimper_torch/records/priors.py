@@ -13,8 +13,8 @@ from typing import Literal
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.records.faults import not_finite, not_unit, once, outside
 from pimper_torch.records.record import Record
+from pimper_torch.records.value_checks import not_finite, not_unit, once, outside
 
 Axes = Literal["opengl", "opencv", "lub"]
 AXES: dict[Axes, tuple[tuple[int, int, int], str]] = {

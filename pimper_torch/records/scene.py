@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.records.faults import beyond, not_finite, once
 from pimper_torch.records.record import Record
+from pimper_torch.records.value_checks import beyond, not_finite, once
 from pimper_torch.records.views import Cameras, Views
 
 

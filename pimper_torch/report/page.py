@@ -13,10 +13,10 @@ from typing import Any
 from pimper_torch.asset.bake import Textured
 from pimper_torch.asset.write import write_asset
 from pimper_torch.records import Silhouettes, SparseScene
-from pimper_torch.report.layers import Layer
 from pimper_torch.report.predictions import Prediction
 from pimper_torch.report.sections import section_entries
-from pimper_torch.report.views import view_entries
+from pimper_torch.report.vertex_layers import VertexLayer
+from pimper_torch.report.view_entries import view_entries
 from pimper_torch.viz.turn import up_world
 
 HEAD = "<title>pimper_torch report</title>"
@@ -39,7 +39,7 @@ def write_page(
     silhouettes: Silhouettes,
     reference: int,
     predictions: Sequence[Prediction | None],
-    layers: Sequence[Layer],
+    layers: Sequence[VertexLayer],
     summary: Mapping[str, Any],
     settings: str,
 ) -> None:

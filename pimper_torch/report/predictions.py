@@ -12,7 +12,7 @@ from pimper_torch.records import Cameras, Mesh, Record, SparseScene
 from pimper_torch.relighting.fit_lights import ViewLights
 from pimper_torch.relighting.held_out import Relighting, predict
 from pimper_torch.relighting.lit_surface import LitSurface
-from pimper_torch.report.pictures import longest_px
+from pimper_torch.report.page_pictures import longest_px
 
 # Predictions have half as many pixels a side as photographs: rays are what they cost.
 _COARSER = 2

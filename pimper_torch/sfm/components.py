@@ -7,8 +7,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from pimper_torch.errors import ReconstructionError, some
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import triangulation_angles
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.static_background import StaticBackground
 

@@ -12,7 +12,7 @@ from pimper_torch.file_names import match_files
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.conventions.pictures import (
+from pimper_torch.sfm.conventions.resized_pictures import (
     REACHES,
     Ways,
     allowed_turns,

@@ -10,7 +10,7 @@ import numpy as np
 from pimper_torch.progress import track
 from pimper_torch.records import Views
 from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs in which a thread finds features between two reports of progress.

@@ -19,7 +19,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.matching import PhotographPair, photograph_numbers
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Length of COLMAP's SIFT descriptors, in units of their bytes.

@@ -20,7 +20,7 @@ from pimper_torch.sfm.camera_in_place import (
     shift_px,
     still_length_px,
 )
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.static_background import (
     Keypoints,
     Pair,

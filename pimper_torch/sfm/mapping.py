@@ -8,7 +8,7 @@ from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of
 from pimper_torch.sfm.matching import MOST_PAIRED
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.settings import MIN_POINTS
+from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 from pimper_torch.sfm.workspace import Workspace
 
 # Growth of a model between two adjustments of all of it. COLMAP's own 1.1 suits models that are

@@ -16,7 +16,7 @@ from torch import Tensor
 from pimper_torch.progress import track
 from pimper_torch.records import Record
 from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace
 
 # Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;

@@ -30,8 +30,8 @@ from pimper_torch.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
+from pimper_torch.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.settings import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.tie_series import tie_series
 from pimper_torch.sfm.workspace import Workspace

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
 

@@ -20,7 +20,7 @@ from pimper_torch.sfm.leave_out import (
 )
 from pimper_torch.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.sfm.moved_object import MovedObject, Rows, find_moved_object
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.static_background import Pair
 
 

@@ -25,7 +25,7 @@ from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
-from pimper_torch.sfm.tangents import Tangents, plane_homographies
+from pimper_torch.sfm.tangent_planes import Tangents, plane_homographies
 
 # Fraction of the median radiance below which the logarithm fades: darker is noise.
 _DARK = 0.02
@@ -75,7 +75,7 @@ class SightingSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pictures(Record):
+class LogPictures(Record):
     """Photographs in which patches are looked up.
 
     Attributes:
@@ -89,7 +89,7 @@ class Pictures(Record):
 def log_pictures(
     photographs: Iterable[tuple[Float[Tensor, "_ _ _"], Bool[Tensor, "_ _"]]],
     raster: tuple[int, int, int],
-) -> Pictures:
+) -> LogPictures:
     """Take logarithms of photographs one by one, so that no others are held.
 
     Args:
@@ -111,7 +111,7 @@ def log_pictures(
     some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
     some = some[some > 0]
     floor = _DARK * some.median() if len(some) else torch.ones(())
-    return Pictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
+    return LogPictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -162,7 +162,7 @@ class _Window:
 
 
 def sight(
-    pictures: Pictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
 ) -> TrackObservations:
     """Find points in all views that may show them.
 
@@ -181,7 +181,7 @@ def sight(
 
 
 def _sight(
-    pictures: Pictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
 ) -> TrackObservations:
     """Find so many points that their templates fit in memory."""
     with torch.no_grad():
@@ -214,7 +214,7 @@ def _sight(
 
 
 def _templates(
-    pictures: Pictures,
+    pictures: LogPictures,
     cameras: Cameras,
     tangents: Tangents,
     window: _Window,
@@ -245,7 +245,7 @@ def _templates(
 
 
 def _aligned(
-    pictures: Pictures,
+    pictures: LogPictures,
     view: int,
     homographies: Float[Tensor, "point 3 3"],
     chosen: Int[Tensor, " point"],

@@ -22,7 +22,7 @@ from pimper_torch.sfm.agreement import (
 from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.colmap import model_of, reconstruction_of
 from pimper_torch.sfm.conventions.by_matches import choose_way, explained
-from pimper_torch.sfm.conventions.pictures import Ways
+from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.features import find_features, too_small
 from pimper_torch.sfm.guided import Near, guided_matches, read_features
 from pimper_torch.sfm.leave_out import enter_room, leave_out_room
@@ -35,10 +35,10 @@ from pimper_torch.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.workspace import Workspace, workspace
 
 # Observed points of the median view below which points are triangulated, and below which depth maps

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.geometry.supporting_plane import fixation, supporting_plane
 from pimper_torch.sfm.model import SparseModel, select_views
 

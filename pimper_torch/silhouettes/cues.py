@@ -20,10 +20,10 @@ from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, Record, SparseScene
 from pimper_torch.silhouettes.opencv import convex_hull_of
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
-from pimper_torch.silhouettes.pictures import Pictures, of_views, working_pictures
 from pimper_torch.silhouettes.seeds import MIN_POINTS
-from pimper_torch.silhouettes.settings import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.silhouettes.soft_masks import FEW, SoftMasks, soft_masks_of
+from pimper_torch.silhouettes.working_size import WorkingPictures, of_views, working_pictures
 
 _PROBES = 5  # places along each side of a region that photographs are asked for
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
@@ -41,7 +41,7 @@ class Cues(Record):
         soft: Masks that the photographs come with as priors.
     """
 
-    pictures: Pictures
+    pictures: WorkingPictures
     object_px: tuple[Float[Tensor, "_ 2"], ...]
     background_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None

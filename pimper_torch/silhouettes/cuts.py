@@ -19,7 +19,6 @@ from pimper_torch.silhouettes.opencv import (
     signed_distance,
     without_specks,
 )
-from pimper_torch.silhouettes.pictures import of_views
 from pimper_torch.silhouettes.seeds import (
     DISPUTED,
     exposed_fraction,
@@ -35,8 +34,9 @@ from pimper_torch.silhouettes.seeds import (
     off_plane,
     surely_on_plane,
 )
-from pimper_torch.silhouettes.settings import SilhouetteDetails
+from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 from pimper_torch.silhouettes.soft_masks import FEW, pointed_at
+from pimper_torch.silhouettes.working_size import of_views
 
 _WELL = 2.0  # times as deep as is_deep asks for
 _CUTS = 2  # rounds of mixtures and cut inside GrabCut

@@ -19,8 +19,8 @@ from pimper_torch.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record
 from pimper_torch.silhouettes.opencv import warped, window_means
-from pimper_torch.silhouettes.pictures import Pictures, of_views
 from pimper_torch.silhouettes.seeds import DISPUTED
+from pimper_torch.silhouettes.working_size import WorkingPictures, of_views
 
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
@@ -51,7 +51,7 @@ class Raster(Record):
 
 
 def plane_agreement(
-    pictures: Pictures,
+    pictures: WorkingPictures,
     plane: Plane,
     fixation: Fixation,
     hidden: Bool[Tensor, "view height width"] | None = None,
@@ -68,7 +68,7 @@ def plane_agreement(
 
 
 def room_agreement(
-    pictures: Pictures,
+    pictures: WorkingPictures,
     background_from_view: Float[Tensor, "view 3 3"],
     hidden: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "view height width"]:
@@ -84,7 +84,7 @@ def room_agreement(
 
 
 def texture_agreement(
-    pictures: Pictures,
+    pictures: WorkingPictures,
     near: Raster,
     far: Raster,
     hidden: Bool[Tensor, "view height width"] | None = None,
@@ -188,7 +188,9 @@ def _plane_raster(
     return Raster(pixels_from_raster=cameras.intrinsics @ cam_from_raster, size_px=(size, size))
 
 
-def _room_raster(pictures: Pictures, background_from_view: Float[Tensor, "view 3 3"]) -> Raster:
+def _room_raster(
+    pictures: WorkingPictures, background_from_view: Float[Tensor, "view 3 3"]
+) -> Raster:
     """Lay a raster over the room, of working pixels where it is at rest, as far as views see."""
     height, width = pictures.grey.shape[1:]
     scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())

@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate, normalize
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Record, SilhouettePrior, Views
 from pimper_torch.silhouettes.hull import Hull
-from pimper_torch.silhouettes.pictures import Pictures
+from pimper_torch.silhouettes.working_size import WorkingPictures
 
 FEW = 3  # soft masks: fewer have no majority
 _SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
@@ -48,7 +48,7 @@ class SoftMasks(Record):
         return self.inside > 0.5
 
 
-def soft_masks_of(views: Views, pictures: Pictures) -> SoftMasks | None:
+def soft_masks_of(views: Views, pictures: WorkingPictures) -> SoftMasks | None:
     """Merge the silhouettes that views carry as priors; ``None`` without any.
 
     Log odds of several maps of one view add up. A map that nowhere says that the object is not

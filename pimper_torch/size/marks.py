@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.geometry.supporting_plane import (
     Plane,
     fixation,

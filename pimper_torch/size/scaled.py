@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from pimper_torch.config import require
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

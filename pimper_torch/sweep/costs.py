@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import Cameras, Observations, Photometry, Templates
@@ -50,7 +50,7 @@ def compiled_costs(
         min_views: Least number of them for a sample that is swept.
         min_facing: Cosine of the angle from which on footprints shrink no more.
     """
-    from pimper_torch.kernels import sweep
+    from pimper_torch.kernels import sweep_costs
 
     patch_from_world = templates.patch_from_world.double()
     exact = cameras.to(torch.float64)
@@ -60,7 +60,7 @@ def compiled_costs(
     shape = templates.depth.shape
     cost = torch.zeros(shape[0], len(ladder), *shape[1:])
     swept = torch.zeros(shape)
-    sweep.costs(
+    sweep_costs.costs(
         *sources.gray.arrays,
         as_array(sources.gray.table),
         as_array(rows),

@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped_patches
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Cameras, Mesh, Record
 
 _DISTANCE = 3.0

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pimper_torch.exchange.result import Result
 from pimper_torch.records import Mesh, Reconstruction
-from pimper_torch.viewer.folder import add_folder, add_result
-from pimper_torch.viewer.results import COARSE, add_found, add_outcome
+from pimper_torch.viewer.live_results import COARSE, add_found, add_outcome
+from pimper_torch.viewer.result_folder import add_folder, add_result
 from pimper_torch.viewer.server import HOST, PORT, open_server
 from pimper_torch.viewer.viewer import Viewer
 

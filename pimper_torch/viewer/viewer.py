@@ -15,8 +15,8 @@ from pimper_torch.errors import InputError
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
-from pimper_torch.viewer.photographs import small_pictures
 from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server
+from pimper_torch.viewer.small_pictures import small_pictures
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer

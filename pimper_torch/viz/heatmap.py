@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.visibility import Hits
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viz.maps import normal_colors, view_maps

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Record

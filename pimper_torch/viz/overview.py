@@ -8,10 +8,10 @@ from torch import Tensor
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Reconstruction
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.render import bounding_box, crop, rotation, shade
-from pimper_torch.viz.silhouettes import RELIABLE, border, thumbnails
+from pimper_torch.viz.silhouette_figures import RELIABLE, border, thumbnails
 from pimper_torch.viz.tiles import (
     TALLEST,
     Picture,

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from pimper_torch.geometry.frames import rigid, rotate, transform
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import rigid, rotate, transform
 from pimper_torch.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.geometry.visibility import cast_view
 from pimper_torch.records import Cameras, Mesh

@@ -9,8 +9,8 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.parallel import side_by_side

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Cameras, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.existing import existing_ways

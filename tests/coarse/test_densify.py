@@ -10,7 +10,6 @@ from pimper_torch.coarse.densify import (
     sweep,
 )
 from pimper_torch.coarse.fine_surface import near_points
-from pimper_torch.coarse.matching import Matcher, Windows, level_of, pair
 from pimper_torch.coarse.oriented import (
     OrientedPoints,
     no_points,
@@ -24,6 +23,7 @@ from pimper_torch.coarse.trim import (
     supported_components,
     without_small_holes,
 )
+from pimper_torch.coarse.window_matching import Matcher, Windows, level_of, pair
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
 from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
@@ -31,7 +31,7 @@ from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.records import Mesh, Support
-from pimper_torch.sfm.surfaces import poisson_surface, reduced
+from pimper_torch.sfm.colmap_surfaces import poisson_surface, reduced
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 

@@ -2,8 +2,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.coarse.matching import Level
 from pimper_torch.coarse.oriented import denied, fitted_planes
+from pimper_torch.coarse.window_matching import MatchingLevel
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 
@@ -60,7 +60,7 @@ def test_points_are_denied_by_the_views_that_look_through_them():
     tone = torch.ones(5, 30, 40)
     maps = DepthMaps(
         factor=1,
-        level=Level(tone=tone, usable=tone > 0, cameras=cameras),
+        level=MatchingLevel(tone=tone, usable=tone > 0, cameras=cameras),
         inverse_depth=0.25 + 0.02 * torch.randn(5, 30, 40, generator=generator),
         agreed=tone.long(),
         valid=torch.rand(5, 30, 40, generator=generator) > 0.2,

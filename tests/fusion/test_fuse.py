@@ -13,7 +13,7 @@ from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.terms import ContourRays, KeptSlopes, Normals, SweptHeights, Term
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
 from pimper_torch.reporting import figures

@@ -11,7 +11,7 @@ from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.problem import pose
 from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.transfer import transferred_normals

@@ -43,8 +43,8 @@ from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.exchange.openexr import write_exr
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.decode import decode, write_deep_png
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.io.photographs import load_views

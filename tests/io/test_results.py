@@ -14,9 +14,9 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import OutputError
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
 from pimper_torch.io.finish import MeshFiles

@@ -123,7 +123,7 @@ def test_a_kernel_gives_the_same_bits_compiled_and_from_disk(fresh):
     """The kernel calls many functions: its machine code has their copies, optimized again."""
     code = (
         "import numpy as np\n"
-        "from pimper_torch.kernels import lights\n"
+        "from pimper_torch.kernels import lights_and_albedo as lights\n"
         "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
         "normals = random.normal(size=(3, samples))\n"
         "normals /= np.linalg.norm(normals, axis=0)\n"

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.patches.decompose import (
     Decompose,
     DecomposeConfig,

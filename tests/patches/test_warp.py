@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.frames import invert_rigid, transform
+from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.pyramid import look_up, pyramid_level
 from pimper_torch.patches.warp import Warp, WarpConfig, missing_fraction

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import invert_rigid, rigid, transform
+from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
 from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry.harmonics import harmonics, rotate_lights

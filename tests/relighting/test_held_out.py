@@ -8,7 +8,7 @@ from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.errors import ConfigError
 from pimper_torch.records import Silhouettes
 from pimper_torch.relighting.held_out import relight
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 from tests.relighting.ball import ball_mesh, photographed
 
 GLOSSY = (0.0, 0.3, 1.0)

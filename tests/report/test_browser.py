@@ -15,9 +15,9 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes
 from pimper_torch.relighting.held_out import Judged, Relighting, predict
 from pimper_torch.relighting.lit_surface import Materials
-from pimper_torch.report.layers import surface_layers
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
+from pimper_torch.report.vertex_layers import surface_layers
 from pimper_torch.viz.maps import base_color, view_maps
 from tests.relighting.ball import SIDE, ball_mesh, photographed
 

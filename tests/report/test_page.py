@@ -14,12 +14,12 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.relighting.fit_lights import ViewLights
 from pimper_torch.relighting.held_out import Judged, Relighting
 from pimper_torch.relighting.lit_surface import Materials
-from pimper_torch.report.layers import Layer
 from pimper_torch.report.page import write_page
-from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
+from pimper_torch.report.page_pictures import jpeg, longest_px, outline, shrunk
 from pimper_torch.report.predictions import Prediction, predictions
 from pimper_torch.report.sections import section_entries
-from pimper_torch.report.views import view_entries
+from pimper_torch.report.vertex_layers import VertexLayer
+from pimper_torch.report.view_entries import view_entries
 
 MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
 SUMMARY = {
@@ -68,7 +68,7 @@ def data_of(page):
 
 
 def test_a_page_holds_what_it_is_told_and_needs_nothing_else(reconstruction, tmp_path):
-    layer = Layer(attribute="_support", title="support", about="views", low=0, high=1,
+    layer = VertexLayer(attribute="_support", title="support", about="views", low=0, high=1,
                   low_text="none", high_text="full")  # fmt: skip
     page = written(reconstruction, tmp_path / "report.html", layers=[layer])
     data = data_of(page)

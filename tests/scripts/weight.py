@@ -18,8 +18,8 @@ PACKAGE = Path(__file__).parents[2] / "pimper_torch"
 
 BARS = {
     "docstrings that begin with Give, Tell, Say, Mark, What or How": 0,
-    "file names that occur twice or more": 34,
-    "public class names that occur twice or more": 8,
+    "file names that occur twice or more": 0,
+    "public class names that occur twice or more": 0,
     "numeric module constants": 608,
 }
 

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras, Lens, Views
 from pimper_torch.sfm.model import SparseModel
 

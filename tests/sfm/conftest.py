@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Lens, SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.sparse_scene import assemble_scene
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.colmap import pinhole_of, write_binary
 from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.ball import (
     FOCAL,
     HEIGHT,

@@ -7,7 +7,7 @@ from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.doubt import count_views_with_depth, doubt, following_fraction
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.scene import assemble_scene, write_model
+from pimper_torch.sfm.sparse_scene import assemble_scene, write_model
 from tests.sfm.captured import FOCAL, HEIGHT, UP, WIDTH, orbit, seen_of_ball
 
 LENS = Lens(

@@ -18,7 +18,7 @@ from pimper_torch.sfm.guided import (
     match_guided,
 )
 from pimper_torch.sfm.matching import match_pairs
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.sfm.workspace import workspace
 
 CONFIG = ReconstructConfig(threads=1)

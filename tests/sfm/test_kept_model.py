@@ -10,7 +10,7 @@ from pimper_torch.failures import collecting
 from pimper_torch.ledger import leave_out, left_out_of
 from pimper_torch.sfm import reconstruct
 from pimper_torch.sfm.reconstruct import Reconstruct, find_model
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.store import Store, digest
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")

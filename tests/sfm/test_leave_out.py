@@ -5,7 +5,7 @@ import torch
 from pimper_torch.sfm.binding import loaded
 from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.leave_out import leave_out_room
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
 SETTINGS = ReconstructConfig(threads=1)

@@ -11,7 +11,7 @@ from pimper_torch.sfm.lenses import choose_lenses, group_lenses, sensor_turns
 from pimper_torch.sfm.one_lens import doubt_one_lens
 from pimper_torch.sfm.quarter_turns import turned_pixels, turned_views, turning
 from pimper_torch.sfm.reconstruct import structure_from_motion
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.ball import (
     HEIGHT,
     WIDTH,

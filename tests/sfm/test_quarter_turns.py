@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Lens
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.model_files import CAMERA_MODELS

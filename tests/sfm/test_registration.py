@@ -11,8 +11,8 @@ from pimper_torch.sfm.agreement import Judgement
 from pimper_torch.sfm.doubt import count_views_with_depth
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.registration import register
-from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground
 from pimper_torch.sfm.workspace import Workspace
 

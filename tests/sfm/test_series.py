@@ -5,8 +5,8 @@ import torch
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.scenes.whole_scene import upside_down
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Lens
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel

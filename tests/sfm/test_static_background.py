@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.sfm.static_background import (
     fundamental_matrix,
     is_still,

@@ -5,7 +5,7 @@ import torch
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.sfm import track_observations
-from pimper_torch.sfm.tangents import tangents
+from pimper_torch.sfm.tangent_planes import tangents
 from pimper_torch.sfm.track_observations import SightingSettings, log_pictures, sight
 from tests.sfm import ball
 

@@ -7,11 +7,11 @@ from pimper_torch.evidence.scenes.procedural_meshes import potato
 from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Views
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 QUICK = ReconstructConfig(
     peak_threshold=0.0067,

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Silhouettes
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.size.distances import scale_of_bars, scale_of_cameras

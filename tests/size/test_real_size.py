@@ -8,9 +8,9 @@ import torch
 
 from pimper_torch.cli.main import main
 from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.sfm.colmap import read_model
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ import torch
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
 from pimper_torch.exchange.colmap_workspace import write_pinholes
-from pimper_torch.exchange.pictures import write_picture
+from pimper_torch.exchange.picture_files import write_picture
 from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.progress import report

@@ -34,7 +34,7 @@ from pimper_torch.sfm.reconstruct import (
     find_model,
     placed_scene,
 )
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.store import opened
 
 SCENES = ("mug", "jar", "balls", "potatoes")

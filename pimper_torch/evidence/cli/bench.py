@@ -14,7 +14,7 @@ from pimper_torch.evidence.bench.bench_inputs import BenchConfig
 from pimper_torch.evidence.bench.bench_table import terminal
 from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, run_bench
 from pimper_torch.outputs.folders import prepare_output, require_apart
-from pimper_torch.store.folders import user_cache
+from pimper_torch.store.user_cache import user_cache
 
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 

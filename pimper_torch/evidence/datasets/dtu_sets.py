@@ -13,7 +13,7 @@ from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.sampling import LightOptions, Shot, read_shots
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Capture, DtuProtocol, Truth
 

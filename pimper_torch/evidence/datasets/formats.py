@@ -22,7 +22,7 @@ from pimper_torch.evidence.datasets.posed import (
     image_files,
     mask_finder,
 )
-from pimper_torch.geometry.frames import invert_rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.decode import SUFFIXES, read_header
 from pimper_torch.numpy_files import read_npy
 from pimper_torch.records import Capture, Lens

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.exchange.pictures import write_mask, write_picture
+from pimper_torch.exchange.picture_files import write_mask, write_picture
 from pimper_torch.geometry.pixels import indices_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Views

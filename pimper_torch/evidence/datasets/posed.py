@@ -18,7 +18,7 @@ from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
 from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
-from pimper_torch.sfm.conventions.pictures import resize_fits
+from pimper_torch.sfm.conventions.resized_pictures import resize_fits
 from pimper_torch.sfm.undistort import pinhole_for, undistort
 
 

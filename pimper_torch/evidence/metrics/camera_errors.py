@@ -16,8 +16,8 @@ from pimper_torch.evidence.metrics.similarity import (
     split_similarity,
 )
 from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project, triangulate_rays
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras, Mesh, Record
 
 

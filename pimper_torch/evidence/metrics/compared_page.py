@@ -17,9 +17,9 @@ from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import unit_face_normals
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.held_out import relight
-from pimper_torch.report.layers import length_layer, surface_layers
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
+from pimper_torch.report.vertex_layers import length_layer, surface_layers
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
 

@@ -1,7 +1,7 @@
 """Similarities that put a result in the frame of the truth.
 
 They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
-:func:`pimper_torch.geometry.frames.transform` applies them.
+:func:`pimper_torch.geometry.rigid.transform` applies them.
 """
 
 from collections import Counter
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.surface_distances import joined, sample_surface, true_surface
-from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
 

@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import homogeneous
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras
 
 # Of scenes on a table, whose world has z up.

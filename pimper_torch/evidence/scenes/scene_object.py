@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import require
-from pimper_torch.geometry.frames import invert_rigid, rotate, transform
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.lit_surface import facet_density, masking

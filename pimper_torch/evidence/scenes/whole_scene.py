@@ -37,8 +37,8 @@ from pimper_torch.evidence.scenes.scene_object import (
 from pimper_torch.evidence.scenes.scene_objects import RECIPES, TABLES
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.textures import Uniform, random_speckle
-from pimper_torch.geometry.frames import invert_rigid, rigid, transform
 from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Mesh

@@ -24,7 +24,7 @@ from pimper_torch.sfm.agreement import (
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.camera_mistakes import camera_readings
 from pimper_torch.sfm.conventions.choice import far_better, surely_better
-from pimper_torch.sfm.conventions.pictures import (
+from pimper_torch.sfm.conventions.resized_pictures import (
     Ways,
     around,
     cut,
@@ -34,7 +34,7 @@ from pimper_torch.sfm.conventions.pictures import (
 )
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.settings import MIN_MATCHES
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES
 from pimper_torch.sfm.static_background import sampson_errors
 
 # Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the

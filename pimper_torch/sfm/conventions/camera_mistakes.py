@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import torch
 
-from pimper_torch.geometry.frames import invert_rigid, rigid
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.records import Cameras
 
 _OTHER_SIZE = 0.2  # principal points stray by less than this fraction of half the image

@@ -6,8 +6,8 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
 from pimper_torch.evidence.baselines.openmvs import OpenMvs
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.sfm.colmap import distort, read_model

@@ -21,7 +21,7 @@ from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import wandering_lights
 from pimper_torch.evidence.scenes.textures import random_speckle
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.outputs.marker import MARKER
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth

@@ -11,7 +11,7 @@ from pimper_torch.cli.main import main
 from pimper_torch.evidence.cli import convert
 from pimper_torch.evidence.cli.convert import Source, cloud, readers
 from pimper_torch.evidence.datasets import read_colmap, read_idr, read_transforms
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Mesh, Truth
 

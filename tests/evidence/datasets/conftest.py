@@ -9,8 +9,8 @@ from PIL import Image
 
 from pimper_torch.evidence.datasets import posed
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import rigid
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Cameras, Capture, Truth, Views
 from pimper_torch.sfm.colmap import distort

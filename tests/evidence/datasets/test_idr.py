@@ -7,7 +7,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_idr, write_idr
 from pimper_torch.evidence.datasets.idr import unit_sphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 
 # K [R t] of `hand_camera`, K = [[20, 5, 6.5], [0, 30, 4.5], [0, 0, 1]], worked out by hand:
 # the rows of R pick y, z, x; t = (-2, -3, 4).

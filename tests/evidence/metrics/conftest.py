@@ -5,7 +5,7 @@ import torch
 
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
 
 

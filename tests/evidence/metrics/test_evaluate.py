@@ -6,7 +6,7 @@ import torch
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.metrics import EvaluateConfig, evaluate, report, rows
 from pimper_torch.evidence.metrics.evaluation import chosen_views
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import DtuProtocol, Estimate, Truth
 
 FEW = {"samples": 3000}

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics import align_estimate, trimmed_icp
 from pimper_torch.evidence.metrics.similarity import rotation_angles_deg, split_similarity
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Estimate, Mesh, Truth
 
 FEW = {"count": 800}

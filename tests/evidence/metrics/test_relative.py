@@ -9,7 +9,7 @@ from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
 from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Sphere, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import rigid, transform
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Mesh
 
 IDENTITY = torch.eye(4, dtype=torch.float64)

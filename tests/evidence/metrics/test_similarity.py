@@ -9,8 +9,8 @@ from pimper_torch.evidence.metrics import (
     similarity_between_points,
 )
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.frames import rigid, transform
 from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras
 
 

@@ -9,9 +9,9 @@ from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.whole_scene import build_scene
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 

@@ -18,9 +18,9 @@ from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.evidence.scenes.textures import marked, painted
 from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.directions import even_directions
-from pimper_torch.geometry.frames import rotate
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 

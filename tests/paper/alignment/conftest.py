@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,

@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.frames import invert_rigid, rigid
+from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.records import Mesh
 

@@ -7,7 +7,7 @@ from pimper_torch.errors import caution
 from pimper_torch.records import Reconstruction
 from pimper_torch.size.distances import scale_of_bars, scale_of_cameras
 from pimper_torch.size.given import CameraDistance, ScaleBar, Unit
-from pimper_torch.size.markers import scale_of_markers
+from pimper_torch.size.marker_scale import scale_of_markers
 from pimper_torch.size.scale import Scale, compare_with_units, most_accurate
 
 

@@ -3,7 +3,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch.testing import assert_close
 
-from pimper_torch.coarse.matching import Level, Matcher, Windows, pair
+from pimper_torch.coarse.window_matching import Matcher, MatchingLevel, Windows, pair
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 
 OFFSETS = [-0.2, -0.003, 0.0, 0.004, 0.05]
@@ -19,7 +19,7 @@ def textured(width=61, height=47, dtype=torch.float32):
     cameras = arc_cameras(
         5, width=width, height=height, focal_px=90.0, distance=4.0, sway_deg=0.0
     ).to(dtype)
-    return Level(tone=tone.to(dtype), usable=usable, cameras=cameras)
+    return MatchingLevel(tone=tone.to(dtype), usable=usable, cameras=cameras)
 
 
 def field(level):

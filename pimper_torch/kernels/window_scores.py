@@ -147,7 +147,7 @@ def window_scores(
     Args:
         field: Inverse depths, ``height width``.
         offsets: Added to the field, the sum clamped to the smallest positive float.
-        ray: See :class:`~pimper_torch.coarse.matching.Pairing`, ``source 3 height width``.
+        ray: See :class:`~pimper_torch.coarse.window_matching.Pairing`, ``source 3 height width``.
         shift: Of the same, ``source 3``.
         tone: Of the sources, ``source height width``.
         usable: Valid pixels of the sources.

@@ -21,7 +21,7 @@ _DARK = 0.005  # of white; logarithms of what is darker tell noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pictures(Record):
+class WorkingPictures(Record):
     """Photographs in display colours, reduced.
 
     Attributes:
@@ -38,7 +38,7 @@ class Pictures(Record):
     factors: tuple[float, float]
 
 
-def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
+def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPictures:
     """Shrink photographs so that the longer side of the raster is at most so long."""
     height, width = views.images.shape[-2:]
     factor = min(1.0, size_px / max(height, width))
@@ -58,7 +58,7 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> Pictures:
     for view, layers in enumerate(side_by_side(shown, images, tracked=False)):
         colours[view], opponent[view], grey[view] = layers
     scale = torch.tensor(factors)
-    return Pictures(
+    return WorkingPictures(
         colours=colours,
         opponent=opponent,
         grey=grey,

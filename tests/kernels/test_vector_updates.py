@@ -5,7 +5,7 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
 from torch.testing import assert_close
 
-from pimper_torch.kernels import conjugate_gradients as kernels
+from pimper_torch.kernels import vector_updates as kernels
 from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
 from pimper_torch.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles

@@ -13,7 +13,7 @@ from pimper_torch.outputs.marker import STAGES
 from pimper_torch.records import CoarseMesh, Mesh, Surface
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.store import Store
-from pimper_torch.viewer.results import COARSE, RESULT, add_lights
+from pimper_torch.viewer.live_results import COARSE, RESULT, add_lights
 from pimper_torch.viewer.viewer import Viewer
 
 _KEPT: Mapping[str, type[CoarseMesh] | type[Surface]] = {

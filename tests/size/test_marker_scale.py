@@ -13,13 +13,13 @@ from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.silhouettes.opencv import shrunk, warped
-from pimper_torch.size import markers
+from pimper_torch.size import marker_scale
 from pimper_torch.size.aruco import find_squares
-from pimper_torch.size.find import find_scale
+from pimper_torch.size.find_scale import find_scale
 from pimper_torch.size.given import CameraDistance
-from pimper_torch.size.markers import Marker, find_markers, scale_of_markers
+from pimper_torch.size.marker_scale import Marker, find_markers, scale_of_markers
 from pimper_torch.size.sheet import MAX_SIDE_MM, MIN_SIDE_MM, PAPERS_MM, layout, side_of
-from pimper_torch.viz.sheet import draw_sheet
+from pimper_torch.viz.marker_sheet import draw_sheet
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 FINE = 4  # of the pictures that are averaged
@@ -196,14 +196,14 @@ def square(code, side):
 @pytest.mark.parametrize(("wrong", "known"), [(1, True), (2, False)])
 def test_the_size_is_that_of_most_markers_or_none(scene, monkeypatch, wrong, known):
     found = [square(320 + number, 2.0 if number < wrong else 3.0) for number in range(4)]
-    monkeypatch.setattr(markers, "find_markers", lambda _: found)
+    monkeypatch.setattr(marker_scale, "find_markers", lambda _: found)
     scale = scale_of_markers(scene)
     assert (scale is not None) == known
     assert scale is None or scale.factor == pytest.approx(10)
 
 
 def test_a_marker_that_is_on_no_sheet_tells_a_size_only_if_its_side_is_told(scene, monkeypatch):
-    monkeypatch.setattr(markers, "find_markers", lambda _: [square(586, 2.0)])
+    monkeypatch.setattr(marker_scale, "find_markers", lambda _: [square(586, 2.0)])
     assert scale_of_markers(scene) is None
     assert scale_of_markers(scene, side_mm=50.0).factor == pytest.approx(25)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Silhouettes, SparseScene
 from pimper_torch.relighting.fit_lights import ViewLights
-from pimper_torch.report.pictures import jpeg, longest_px, outline, shrunk
+from pimper_torch.report.page_pictures import jpeg, longest_px, outline, shrunk
 from pimper_torch.report.predictions import Prediction
 
 Json = dict[str, object]

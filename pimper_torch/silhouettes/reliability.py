@@ -14,7 +14,7 @@ from pimper_torch.records import Record, Silhouettes, Views
 from pimper_torch.silhouettes.cuts import Cuts
 from pimper_torch.silhouettes.opencv import blind_holes, components_of, signed_distance
 from pimper_torch.silhouettes.seeds import is_deep
-from pimper_torch.silhouettes.settings import SilhouetteDetails
+from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 
 # On rendered scenes, 99 in 100 pixels of a median view's cut lie less than 0.4 pixels of 640
 # outside; one of 16 to 30 views holds a shadow of 2 to 9 % of its cut.

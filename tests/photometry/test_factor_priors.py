@@ -8,8 +8,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.priors import (
+from pimper_torch.photometry.factor_priors import (
     FactorPrior,
     FieldLights,
     GuessedAlbedo,
@@ -20,6 +19,7 @@ from pimper_torch.photometry.priors import (
     SurfaceNormals,
     views_worth,
 )
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.records import PatchPriors
 from tests.photometry.test_factorize import median_error
 

@@ -12,7 +12,7 @@ _BEYOND = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layer:
+class VertexLayer:
     """One number a vertex, shown in colours from ``low`` to ``high``.
 
     Attributes:
@@ -29,7 +29,7 @@ class Layer:
     high_text: str
 
 
-def surface_layers(mesh: Mesh) -> list[Layer]:
+def surface_layers(mesh: Mesh) -> list[VertexLayer]:
     """Return the layers of what a result's surface says of itself."""
     layers = []
     if mesh.expected_error is not None:
@@ -37,7 +37,7 @@ def surface_layers(mesh: Mesh) -> list[Layer]:
         layers.append(length_layer("_expected_error", "expected error", about, mesh.expected_error))
     if mesh.confidence is not None:
         layers.append(
-            Layer(
+            VertexLayer(
                 attribute="_support",
                 title="support",
                 about="Confidence of the normals: how many lights told them, and how well",
@@ -52,12 +52,12 @@ def surface_layers(mesh: Mesh) -> list[Layer]:
 
 def length_layer(
     attribute: str, title: str, about: str, values: Float[Tensor, " vertex"], unit: str = "units"
-) -> Layer:
+) -> VertexLayer:
     """Return a layer of lengths, from 0 to what nearly all are below."""
     known = values[values.isfinite()]
     rank = max(1, len(known) - len(known) // _BEYOND)
     high = float(known.kthvalue(rank).values) if len(known) else 0.0
-    return Layer(
+    return VertexLayer(
         attribute=attribute,
         title=title,
         about=about,

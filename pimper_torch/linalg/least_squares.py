@@ -63,7 +63,7 @@ def compressed_equations(
     Returns:
         The matrix, columns in order, and the right-hand side. A constant to autograd.
     """
-    from pimper_torch.kernels import equations as kernels
+    from pimper_torch.kernels import normal_equations as kernels
 
     size = len(damping)
     each = torch.arange(size)[:, None]

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras, Record
 from pimper_torch.sfm.matching import MOST_PAIRED
 

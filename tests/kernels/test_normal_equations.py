@@ -5,7 +5,7 @@ from twins import using
 
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import _evaluated
-from pimper_torch.linalg.equations import compressed_equations, normal_equations
+from pimper_torch.linalg.least_squares import compressed_equations, normal_equations
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])

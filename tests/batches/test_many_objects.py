@@ -14,7 +14,7 @@ from platform import node
 
 import pytest
 
-from pimper_torch.batches import run, task
+from pimper_torch.batches import many_objects, task
 from pimper_torch.batches.task import carry_out, is_whole
 from pimper_torch.errors import ConfigError, OutputError
 
@@ -117,7 +117,7 @@ def test_results_inside_the_list_are_no_objects(world):
     world.add("ball")
     out = world.folder / "scans" / "results"
     for status in ("ended", "kept"):
-        (one,) = run.batch(world.folder / "scans", out)
+        (one,) = many_objects.batch(world.folder / "scans", out)
         assert (one.name, one.status) == ("ball", status)
 
 
@@ -135,8 +135,8 @@ def test_a_result_is_whole_for_its_arguments_and_files_and_after_its_run_began(w
         path = photos / "0.png" if change == "photographs" else world.out / "ball" / ".pimper.json"
         path.write_bytes(b"changed")
         os.utime(path, (0, 0))
-    (again,) = run.planned_batch(
-        run.read_objects(world.folder / "scans"), world.out, settings, overwrite=False
+    (again,) = many_objects.planned_batch(
+        many_objects.read_objects(world.folder / "scans"), world.out, settings, overwrite=False
     ).settled
     assert again.status == "failed"
 
@@ -174,7 +174,7 @@ def test_an_executor_that_breaks_leaves_what_ended_and_says_so(world):
 def test_a_worker_that_does_not_answer_is_given_up_and_its_late_answer_is_ignored(
     world, monkeypatch
 ):
-    monkeypatch.setattr(run, "_SILENCE_SECONDS", 0.2)
+    monkeypatch.setattr(many_objects, "_SILENCE_SECONDS", 0.2)
     world.add("ball")
     late = []
 
@@ -263,7 +263,7 @@ def test_ctrl_c_ends_the_runs_and_the_same_command_goes_on(world):
 
     began = time.monotonic()
     with pytest.raises(Pressed):
-        run.batch(world.folder / "scans", world.out, jobs=1, listener=Presses())
+        many_objects.batch(world.folder / "scans", world.out, jobs=1, listener=Presses())
     assert time.monotonic() - began < 20
     rows = {row["name"]: row for row in csv.DictReader((world.out / "batch.csv").open())}
     assert rows["ball"]["status"] == rows["cup"]["status"] == "waiting"
@@ -282,7 +282,7 @@ def test_a_table_that_is_not_ours_is_not_replaced(world):
 def test_two_batches_do_not_write_to_one_folder(world):
     world.add("ball")
     with (
-        run.locked(world.out.resolve(), world.out),
+        many_objects.locked(world.out.resolve(), world.out),
         pytest.raises(OutputError, match="another run writes there"),
     ):
         world.batch()

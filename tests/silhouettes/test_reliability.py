@@ -3,9 +3,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.silhouettes.agreement import agreement_of, repaired
 from pimper_torch.silhouettes.cuts import Cuts
-from pimper_torch.silhouettes.settings import SilhouetteDetails
+from pimper_torch.silhouettes.reliability import agreement_of, repaired
+from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 
 VIEWS = 8
 

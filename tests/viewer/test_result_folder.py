@@ -19,7 +19,7 @@ from pimper_torch.io import results
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh, StageReport
 from pimper_torch.store import Store
-from pimper_torch.viewer.folder import add_folder, passes_kept
+from pimper_torch.viewer.result_folder import add_folder, passes_kept
 from pimper_torch.viewer.show import show
 
 pytest.importorskip("viser")

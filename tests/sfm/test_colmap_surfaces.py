@@ -6,7 +6,7 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.surfaces import reduced
+from pimper_torch.sfm.colmap_surfaces import reduced
 
 
 def ball(level: int = 5) -> Mesh:

@@ -29,7 +29,7 @@ _BRIGHT = 0.98
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Level(Record):
+class MatchingLevel(Record):
     """All photographs at one resolution.
 
     Attributes:
@@ -44,7 +44,7 @@ class Level(Record):
     cameras: Cameras
 
 
-def level_of(scene: SparseScene, factor: int) -> Level:
+def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
     """Reduce the photographs by a whole factor; remainders at the right and the bottom are cut."""
     views, cameras = scene.views, scene.cameras
     usable = views.inside
@@ -63,7 +63,7 @@ def level_of(scene: SparseScene, factor: int) -> Level:
     rank = min(len(shown), int(_BRIGHT * len(shown)) + 1)
     level = np.partition(shown.cpu().numpy(), rank - 1)[rank - 1]
     bright = max(float(level), torch.finfo(gray.dtype).tiny)
-    return Level(
+    return MatchingLevel(
         tone=by_view(lambda one: (one / bright + _PEDESTAL).sqrt(), gray),
         usable=usable,
         cameras=Cameras(
@@ -100,7 +100,7 @@ class Pairing(Record):
         return at[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
 
 
-def pair(level: Level, view: int, sources: Int[Tensor, " source"]) -> Pairing:
+def pair(level: MatchingLevel, view: int, sources: Int[Tensor, " source"]) -> Pairing:
     """Prepare the lookup of a view's pixels in others."""
     cameras = level.cameras
     height, width = level.tone.shape[-2:]
@@ -143,7 +143,7 @@ class Matcher:
     Schönberger et al., Pixelwise view selection, ECCV 2016, for correlation with them.
     """
 
-    def __init__(self, level: Level, pairing: Pairing, windows: Windows) -> None:
+    def __init__(self, level: MatchingLevel, pairing: Pairing, windows: Windows) -> None:
         radius, tone = windows.radius, level.tone[pairing.view].detach().float()
         here = level.usable[pairing.view]
         around = torch.stack(shifted(tone, radius, "replicate"))
@@ -170,7 +170,7 @@ class Matcher:
         The score is the mean correlation of the best sources, 0 where none sees the pixel:
         computed on the CPU in single precision, a constant to autograd.
         """
-        from pimper_torch.kernels.windows import window_scores
+        from pimper_torch.kernels.window_scores import window_scores
 
         found = torch.empty(len(offsets), *field.shape)
         window_scores(

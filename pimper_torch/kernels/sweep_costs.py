@@ -1,6 +1,6 @@
 """Costs of all height hypotheses of a bucket's samples: twin of ``sweep.sweep``.
 
-Arguments are documented there; images are laid out as in ``kernels.resample``.
+Arguments are documented there; images are laid out as in ``kernels.resampling``.
 """
 
 import math

@@ -8,7 +8,7 @@ from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.frames import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.patches.decompose import Decompose
 from pimper_torch.patches.warp import Warp
 from pimper_torch.records import DepthPrior, InlierPrior, LightPrior, NormalPrior

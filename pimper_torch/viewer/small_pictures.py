@@ -5,7 +5,7 @@ import numpy as np
 from pimper_torch.mapped import each
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
-from pimper_torch.report.pictures import shrunk
+from pimper_torch.report.page_pictures import shrunk
 
 # Longest side: a hundred of them have one megabyte as JPEG.
 _SIDE_PX = 256

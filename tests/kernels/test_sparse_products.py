@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pimper_torch.kernels import sparse
+from pimper_torch.kernels import sparse_products
 from pimper_torch.linalg.aggregation import parts_of
 from tests.linalg.laplacians import triangles
 
@@ -30,7 +30,7 @@ def test_products_are_scipys(system, sides):
     matrix, generator, rounding = system
     given, start = (vectors(generator, sides, matrix) for _ in range(2))
     found = np.full_like(start, 7)
-    sparse.product(*parts_of(matrix), given, start, found, 0.5, -2.0, FIRST, LAST)
+    sparse_products.product(*parts_of(matrix), given, start, found, 0.5, -2.0, FIRST, LAST)
     agree(found, 0.5 * start - 2 * (matrix @ given), rounding)
 
 
@@ -40,10 +40,10 @@ def test_a_step_is_scaled_and_corrected_as_written_out(system, sides):
     residual, step, start = (vectors(generator, sides, matrix) for _ in range(3))
     inverse = generator.random(1600).astype(matrix.dtype)
     found = np.full_like(step, 7)
-    sparse.scaled(inverse, residual, found, 0.4, FIRST, LAST)
+    sparse_products.scaled(inverse, residual, found, 0.4, FIRST, LAST)
     agree(found, 0.4 * inverse[:, None] * residual, rounding)
     found = np.full_like(step, 7)
     parts = parts_of(matrix)
-    sparse.corrected(*parts, inverse, residual, step, start, found, 1.3, 0.6, FIRST, LAST)
+    sparse_products.corrected(*parts, inverse, residual, step, start, found, 1.3, 0.6, FIRST, LAST)
     expected = start + 1.3 * step + 0.6 * inverse[:, None] * (residual - matrix @ step)
     agree(found, expected, rounding)
