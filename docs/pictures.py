@@ -1,15 +1,20 @@
-"""Draw the pictures of the documentation: ``python docs/pictures.py [captures] [stages]``.
+"""Draw the pictures of the documentation: ``python docs/pictures.py [captures] [stages] [walk]``.
 
 Captures are sheets of photographs that ``pimper render`` makes; each stands in
-``docs/photographs.md`` under its command. Stages are drawn from the bundled skull.
+``docs/photographs.md`` under its command. Stages are drawn from the bundled skull, and so is the
+walk of the photographs through the rooms of the package.
 """
 
 import re
 import subprocess
 import sys
 import tempfile
+import threading
+from collections import defaultdict
 from pathlib import Path
+from types import CodeType, FrameType
 
+import matplotlib.pyplot as plt
 import torch
 from PIL import Image
 
@@ -22,6 +27,7 @@ from pimper_torch.viz.render import bounding_box, frame, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
+PACKAGE = Path(pt.__file__).parent
 CAPTURE = re.compile(r"^    pimper render (.+) -o ([\w-]+)$", flags=re.MULTILINE)
 
 # Of a sheet: photographs side by side, and the width of each.
@@ -30,6 +36,24 @@ COLUMNS, WIDTH_PX, GAP_PX = 4, 236, 4
 # Of the pictures of stages: the longer side of a panel, the photograph that they look from, and
 # room round the object.
 PANEL_PX, REFERENCE, MARGIN = 320, "37", 0.02
+
+# Of the walk: what a stage's functions are called in, and the size of the photographs.
+STAGES = {
+    "load_views": "load_views",
+    "Reconstruct.": "reconstruct",
+    "FindSilhouettes.": "silhouettes",
+    "TraceContours.": "contours",
+    "CoarseSurface.": "coarse_surface",
+    "Decompose.": "decompose",
+    "Warp.": "warp",
+    "Factorize.": "factorize",
+    "Sweep.": "sweep",
+    "Fuse.": "fuse",
+    "Repair.": "repair",
+    "Remesh.": "remesh",
+    "Extract.": "extract",
+}
+WALK_PX = 600
 
 # The files stay below 80 kB.
 QUALITY = 82
@@ -74,6 +98,85 @@ def draw_stages() -> None:
             pt.plot_patch(step.heights[largest(step)]).savefig(IMAGES / "patch.png", dpi=70)
         passes += [normals(surface, around), picture(shade(surface, around))]
     sheet(passes[::2] + passes[1::2], PANEL_PX, 3).save(IMAGES / "passes.jpg", quality=QUALITY)
+
+
+def draw_walk() -> None:
+    """Reconstruct the bundled skull, and count the functions that stages enter in rooms."""
+    walk = Walk()
+    walk.begin()
+    chain = pt.load_chain("default")
+    chain(pt.load_views(bundled_photographs(), max_size_px=WALK_PX))
+    walk.end()
+    counts = {place: len(functions) for place, functions in walk.entered.items()}
+    stages = list(STAGES.values())
+    first = {room: min(stages.index(s) for s, r in counts if r == room) for _, room in counts}
+    many = {room: sum(r == room for _, r in counts) for room in first}
+    rooms = sorted(first, key=lambda room: (many[room] > 5, first[room], many[room]))
+    figure, axes = plt.subplots(figsize=(9, 0.27 * len(rooms) + 1.2), layout="constrained")
+    for (stage, room), count in counts.items():
+        x, y = stages.index(stage), rooms.index(room)
+        axes.scatter(x, y, s=3.0 * count + 60, color="#9ecae1")
+        axes.text(x, y, str(count), ha="center", va="center", fontsize=7)
+    axes.set_xticks(range(len(stages)), stages, rotation=45, ha="left")
+    axes.set_yticks(range(len(rooms)), rooms)
+    axes.xaxis.tick_top()
+    axes.invert_yaxis()
+    axes.grid(visible=True, color="#eeeeee")
+    axes.set_axisbelow(True)
+    figure.savefig(IMAGES / "walk.png", dpi=90)
+
+
+class Walk:
+    """The functions of the package that are called, by the stage that runs and their room.
+
+    A function belongs to the innermost stage that called it; in a thread of a stage, to that stage.
+    """
+
+    def __init__(self) -> None:
+        self.entered: dict[tuple[str, str], set[CodeType]] = defaultdict(set)
+        self._known: dict[CodeType, tuple[str | None, str | None]] = {}
+        self._main = threading.get_ident()
+        self._stages: dict[int, list[str | None]] = defaultdict(list)
+
+    def begin(self) -> None:
+        """Watch the calls of this thread and of those that it starts."""
+        threading.setprofile(self._watch)
+        sys.setprofile(self._watch)
+
+    def end(self) -> None:
+        """Watch no longer."""
+        sys.setprofile(None)
+        threading.setprofile(None)
+
+    def _watch(self, frame: FrameType, event: str, _: object) -> None:
+        stack = self._stages[threading.get_ident()]
+        if event == "return" and stack:
+            stack.pop()
+        if event != "call":
+            return
+        code = frame.f_code
+        if code not in self._known:
+            self._known[code] = stage_of(code), room_of(code)
+        stage, room = self._known[code]
+        above = stack or self._stages[self._main]
+        stack.append(stage or (above[-1] if above else None))
+        if room and stack[-1]:
+            self.entered[stack[-1], room].add(code)
+
+
+def stage_of(code: CodeType) -> str | None:
+    """Return the stage that a function is a method of."""
+    found = (stage for start, stage in STAGES.items() if code.co_qualname.startswith(start))
+    return next(found, None) if "pimper_torch" in code.co_filename else None
+
+
+def room_of(code: CodeType) -> str | None:
+    """Return the room of the package that a function stands in."""
+    try:
+        path = Path(code.co_filename).relative_to(PACKAGE)
+    except ValueError:
+        return None
+    return path.parts[0] if len(path.parts) > 1 else "(modules beside the rooms)"
 
 
 def largest(step: pt.Step) -> int:
@@ -130,8 +233,10 @@ def sheet(images: list[Image.Image], width: int, columns: int = COLUMNS) -> Imag
 
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
-    wanted = sys.argv[1:] or ["captures", "stages"]
+    wanted = sys.argv[1:] or ["captures", "stages", "walk"]
     if "captures" in wanted:
         draw_captures()
     if "stages" in wanted:
         draw_stages()
+    if "walk" in wanted:
+        draw_walk()
