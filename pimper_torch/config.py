@@ -22,8 +22,6 @@ from pimper_torch.errors import ConfigError
 
 Config = TypeVar("Config")
 
-_MAX_BYTES = 1_000_000  # all settings with comments take 20 kB
-
 
 def require(ok: bool, field: str, value: object, needed: str) -> None:
     """Refuse an impossible setting."""
@@ -175,7 +173,7 @@ def read_mapping(path: Path | str) -> dict[str, object]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        if path.stat().st_size > 1_000_000:  # all settings with comments take 20 kB
             raise ConfigError(
                 f"{path}: has {path.stat().st_size} bytes; needed: a file of settings."
             )

@@ -37,8 +37,6 @@ _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 # Torch's own name for it is not typed.
 _LinAlgError: type[Exception] = getattr(torch.linalg, "LinAlgError")  # noqa: B009
 
-# Names that a warning lists at most: a choice; `summary.json` has all.
-_LISTED = 5
 
 
 @contextmanager
@@ -120,7 +118,7 @@ def warn_of(entries: Sequence[object]) -> None:
     for (stage, what, done), some in groupby(distinct(entries), key=_kind):
         kind = list(some)
         names = list(dict.fromkeys(failure.name for failure in kind))
-        listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         caution(
             f"{stage}: {len(names)} failed ({what} {listed}): {kind[0].reason}. {done}. "
             "`failures` in summary.json lists all; `--on-failure fail` ends the run instead.",

@@ -22,10 +22,6 @@ _BYTES_PER_VERTEX = 1200
 # of 1.06 million in 8 blocks.
 _BYTES_BY_BLOCKS, _BYTES_KEPT, _BYTES_OF_BLOCK = 750, 300, 1400
 
-# Halvings of the limit that a block may take at most: a choice. A few hundred facets are the least
-# that is worth a block.
-_HALVINGS = 6
-
 # Vertices of the surface for each square of their spacing: 1.6 in the demo. Equilateral triangles
 # have 1.15, but an edge is cut as the finer of its facets asks for.
 _PER_SQUARE = 1.6
@@ -70,7 +66,7 @@ def largest_problem(limit: float, patches: PatchSet, scale: float, last: float) 
     if held + _BYTES_PER_VERTEX * vertices <= limit:
         return math.inf
     room = limit - held - _BYTES_KEPT * vertices
-    parts = [limit / 2**power for power in range(1, _HALVINGS + 1)]
+    parts = [limit / 2**power for power in range(1, 7)]
     part = next((part for part in parts if part <= room), None)
     needed = held + _BYTES_BY_BLOCKS * vertices
     if part is None or needed > limit:

@@ -58,10 +58,6 @@ def side_by_side(
                 report(done, len(items))
 
 
-# Fewer rows than these are not worth a second thread: they take it some 50 microseconds.
-_WORTHWHILE_ROWS = 20_000
-
-
 def over_rows(
     kernel: Callable[..., Result], rows: int, *arguments: object, size: int = 1
 ) -> list[Result]:
@@ -71,7 +67,8 @@ def over_rows(
         kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
         size: How many rows of usual work one of them is.
     """
-    workers = num_workers() if rows * size >= _WORTHWHILE_ROWS else 1
+    # Fewer rows take a second thread some 50 microseconds, which it is not worth.
+    workers = num_workers() if rows * size >= 20_000 else 1
     bounds = [rows * part // workers for part in range(workers + 1)]
     others = [
         _idle(workers - 1).submit(kernel, *arguments, first, last)

@@ -30,14 +30,10 @@ from pimper_torch.outputs.stages import locked
 
 TRIES = 3
 """Default number of tries of an object."""
-AT_ONCE = 100
-"""Most objects that an engine is handed at once, unless another number is given."""
 
 _LOOK_SECONDS = 0.5
 # A try ends itself at its limit; a worker that has not by then hangs.
 _SILENCE_SECONDS = 60.0
-# Of what engines say, in characters: a choice.
-_LONGEST = 300
 # What engines raise where a worker is gone, by name: none of them need be installed.
 _LOST = ("KilledWorker", "UncompletedJobError", "CommClosedError")
 
@@ -78,6 +74,7 @@ def batch(
         out: Folder for a folder of each object's name, ``batch.csv`` and ``batch.html``; workers
             must reach it, and the photographs, under the same path.
         executor: What carries out the tasks; by default processes of this machine.
+        jobs: Objects at once: what fits this machine, or 100 of an engine, unless given.
         settings: Options of ``pimper reconstruct`` for every object.
         overwrite: Replace results of other settings or files.
         tries: How often an object is begun whose worker is lost.
@@ -116,7 +113,7 @@ def batch(
     with locked(own, out):
         for name, sign in SIGNS.items():
             prepare_file(out / name, overwrite=True, sign=sign)
-        driver = _Driver(executor or ThreadPoolExecutor(jobs), jobs or AT_ONCE, tries, listener)
+        driver = _Driver(executor or ThreadPoolExecutor(jobs), jobs or 100, tries, listener)
         for outcome in plan.settled:
             driver.settle(outcome)
         try:
@@ -278,5 +275,5 @@ def _on(one: _Try) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    text = shorten(str(error), _LONGEST, placeholder=" ...").rstrip(".")
+    text = shorten(str(error), 300, placeholder=" ...").rstrip(".")
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -17,10 +17,6 @@ from pimper_torch.errors import ConfigError
 if TYPE_CHECKING:
     from submitit import Job
 
-# Between two looks at jobs: a choice; submitit asks Slurm once a minute.
-_LOOK_SECONDS = 1.0
-# Of a job beyond its task, which ends by itself at its limit.
-_MORE_MINUTES = 5
 
 
 class SlurmExecutor(Executor):
@@ -48,7 +44,8 @@ class SlurmExecutor(Executor):
         """Submit a job, not to nodes where the task was lost."""
         self._executor.update_parameters(
             name="pimper",
-            timeout_min=math.ceil(task.limit_s / 60) + _MORE_MINUTES,
+            # The task ends by itself at its limit.
+            timeout_min=math.ceil(task.limit_s / 60) + 5,
             mem_gb=math.ceil(task.mem_gb),
             cpus_per_task=task.threads,
             slurm_partition=self._partition or None,
@@ -65,7 +62,7 @@ class SlurmExecutor(Executor):
         self._closed.set()
 
     def _watch(self) -> None:
-        while not self._closed.wait(_LOOK_SECONDS):
+        while not self._closed.wait(1.0):
             with self._lock:
                 jobs = [*self._jobs.items()]
             for future, job in jobs:

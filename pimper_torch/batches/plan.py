@@ -17,10 +17,6 @@ from pimper_torch.cores import usable_cores
 from pimper_torch.errors import ConfigError, PimperError
 
 _REPLACES = "--overwrite"
-# Of photographs that Pillow cannot read, as camera raw: a choice.
-_MEGAPIXELS = 24.0
-# Share of the free memory that runs are given: a choice, for what else runs.
-_SHARE = 0.8
 # A try may take so many times the estimate, and an hour in any case: a choice. What a slower
 # machine has finished by then is kept for the next try.
 _PATIENCE, _LEAST_S = 10.0, 3600.0
@@ -106,7 +102,8 @@ def runs_at_once(gigabytes: Sequence[float]) -> int:
         from pimper_torch.doctor.machine import available_gb
     most = available_gb()
     together = accumulate(sorted(gigabytes, reverse=True)[: usable_cores()])
-    return max(1, sum(most is None or held <= _SHARE * most for held in together))
+    # A fifth is left to what else runs.
+    return max(1, sum(most is None or held <= 0.8 * most for held in together))
 
 
 def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
@@ -120,7 +117,7 @@ def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
             continue
         shrunk = min(1.0, max_size_px / max(width, height)) if max_size_px else 1.0
         return len(files) * width * height * shrunk**2 / 1e6, len(files)
-    return len(files) * _MEGAPIXELS, len(files)
+    return 24.0 * len(files), len(files)  # Pillow reads none of them, as camera raw
 
 
 def _key(words: Sequence[str], inputs: Iterable[Path | None]) -> str:

@@ -31,9 +31,6 @@ from pimper_torch.records import (
 )
 from pimper_torch.reporting import called, figures, stage
 
-# Priors that are so many times further off than claimed are warned of.
-_DOUBTED = 3.0
-
 
 @runtime_checkable
 class InParts(Protocol):
@@ -172,7 +169,7 @@ def warn_of_priors(told: Mapping[str, int | float]) -> None:
     """
     for what in ("normals", "depths"):
         over = told.get(f"prior_{what}_over_claim", 0.0)
-        if over > _DOUBTED:
+        if over > 3:
             caution(
                 f"Prior {what} are {over:.1f} times as far from what the photographs tell as both "
                 "claim: they count for less. Look whether they are of these photographs, and how "

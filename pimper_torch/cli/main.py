@@ -94,7 +94,6 @@ _COMMANDS = {
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _LIGHT = ("config",)  # carried out without torch, too
-_ARENAS = -8  # M_ARENA_MAX of malloc.h
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 # What no program can help.
@@ -168,7 +167,7 @@ def _limit_arenas() -> None:
     fourth run in one process memory grew by 2.0 %, with two of them by 0.2.
     """
     with suppress(OSError, AttributeError):  # other systems have no such function
-        ctypes.CDLL("libc.so.6").mallopt(_ARENAS, usable_cores())
+        ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
 
 def _run(command: str, arguments: list[str], output: Output, supervised: bool) -> int:

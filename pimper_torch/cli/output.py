@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
 _QUIET = ("-q", "--quiet")
-# Progress is told at most so often, in seconds: enough for a bar that moves.
-_PROGRESS_SECONDS = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +111,7 @@ class Output:
         forecast = forecast or Forecast()
         shown: AbstractContextManager[Observer] = nullcontext(Silent())
         if self.as_json:
-            shown = nullcontext(Events(self.event, _PROGRESS_SECONDS, forecast))
+            shown = nullcontext(Events(self.event, 0.5, forecast))
         elif self.shows("info"):
             figures = None if self.shows("debug") else 3
             shown = Bars(Console(stderr=True), forecast, figures)

@@ -18,8 +18,6 @@ from pimper_torch.cli.output import Output
 from pimper_torch.config import presets, to_mapping, written
 from pimper_torch.errors import ConfigError
 
-_WIDTH = 96
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
@@ -111,7 +109,7 @@ def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str
 
 def _comment(text: str, indent: str) -> list[str]:
     start = f"{indent}# "
-    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=start)
+    return textwrap.wrap(text, 96, initial_indent=start, subsequent_indent=start)
 
 
 def _explained(job: _Job, owner: object) -> str:

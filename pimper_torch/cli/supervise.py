@@ -14,12 +14,6 @@ from contextlib import suppress
 
 from pimper_torch.cli.stopping import SIGNALS, heed, leave_at_once, say
 
-_PR_SET_PDEATHSIG = 1  # Linux: sys/prctl.h
-# One press of Ctrl-C reaches both processes, one of them twice; nobody presses so fast.
-_SAME_PRESS_SECONDS = 0.3
-_PATIENCE_SECONDS = 2.0
-_TAIL_BYTES = 100_000
-
 
 def main() -> int:
     """Run the command line in a process of its own, and give its exit code.
@@ -75,12 +69,13 @@ class _Watch:
     def heard(self, number: int, frame: types.FrameType | None) -> None:
         """Pass a signal on; a second one ends the worker at once."""
         now = time.monotonic()
-        if self.first and now - self.since > _SAME_PRESS_SECONDS:
+        # One press of Ctrl-C reaches both processes, one of them twice; nobody presses so fast.
+        if self.first and now - self.since > 0.3:
             self.killed = True
             number = signal.SIGKILL
         elif not self.first:
             self.first, self.since = number, now
-            signal.setitimer(signal.ITIMER_REAL, _PATIENCE_SECONDS)
+            signal.setitimer(signal.ITIMER_REAL, 2.0)
         with suppress(ProcessLookupError):  # it has just ended
             os.kill(self.worker, number)
 
@@ -114,7 +109,7 @@ def die_with(watcher: int) -> None:
     if sys.platform == "linux":
         import ctypes
 
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
         if os.getppid() != watcher:  # killed already
             os._exit(128 + signal.SIGKILL)
         return
@@ -160,6 +155,6 @@ def _hidden_file() -> int | None:
 def _tail(said: int | None) -> str:
     if said is None:
         return ""
-    size = os.fstat(said).st_size
-    os.lseek(said, max(0, size - _TAIL_BYTES), os.SEEK_SET)
-    return os.read(said, _TAIL_BYTES).decode("utf-8", "replace")
+    most = 100_000
+    os.lseek(said, max(0, os.fstat(said).st_size - most), os.SEEK_SET)
+    return os.read(said, most).decode("utf-8", "replace")

@@ -17,7 +17,6 @@ from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.sparse_scene import model_of_scene, point_colors
 from pimper_torch.viz.maps import view_maps
 
-_PARTNERS = 20  # views that one is compared with; what COLMAP's own undistorter writes
 _KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
 
 
@@ -112,7 +111,7 @@ def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
     """
     for kind in _KINDS:
         (folder / kind).mkdir(parents=True)
-    pairs = "".join(f"{name}\n__auto__, {_PARTNERS}\n" for name in names)
+    pairs = "".join(f"{name}\n__auto__, 20\n" for name in names)
     (folder / "patch-match.cfg").write_text(pairs, encoding="utf-8")
     (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
 

@@ -14,8 +14,6 @@ from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Cameras, Mesh, Views
 
-# Enough to start from or to see the object's extent, and no more than viewers like.
-_MAX_POINTS = 100_000
 
 
 def write_transforms(
@@ -83,7 +81,7 @@ def write_nerfstudio(result: Result, folder: Path) -> None:
 
 def thinned(count: int) -> Int[Tensor, " point"]:
     """Choose at most a hundred thousand of so many points, evenly."""
-    return torch.linspace(0, count - 1, min(count, _MAX_POINTS), dtype=torch.float64).round().long()
+    return torch.linspace(0, count - 1, min(count, 100_000), dtype=torch.float64).round().long()
 
 
 def _said(cameras: Cameras, index: int) -> dict[str, float | int]:

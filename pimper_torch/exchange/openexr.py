@@ -10,9 +10,7 @@ import numpy as np
 _START = b"\x76\x2f\x31\x01" + struct.pack("<I", 2)  # magic number, version
 _ZIP, _LINES = 3, 16  # method of packing, and how many lines it packs together
 _LINES_OF = {0: 1, 2: 1, _ZIP: _LINES}  # of all methods that are read: none, ZIPS and ZIP
-_FLOAT = 2
-_KINDS = {0: "<u4", 1: "<f2", _FLOAT: "<f4"}
-_TILES_OR_PARTS = 0x1A00  # bits of the version
+_KINDS = {0: "<u4", 1: "<f2", 2: "<f4"}
 _NAMES = {1: ("Y",), 3: ("R", "G", "B")}
 
 
@@ -26,7 +24,7 @@ def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
     channels = sorted(zip(_NAMES[count], range(count), strict=True))
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     listed = b"".join(
-        name.encode() + struct.pack("<BIIII", 0, _FLOAT, 0, 1, 1) for name, _ in channels
+        name.encode() + struct.pack("<BIIII", 0, 2, 0, 1, 1) for name, _ in channels
     )
     header = _START
     for name, kind, data in (
@@ -72,7 +70,7 @@ def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
 def _channels(data: bytes, max_samples: int) -> dict[str, np.ndarray]:
     if data[:4] != _START[:4]:
         raise ValueError("it is no OpenEXR file")
-    if struct.unpack_from("<I", data, 4)[0] & _TILES_OR_PARTS:
+    if struct.unpack_from("<I", data, 4)[0] & 0x1A00:
         raise ValueError("it has tiles or several parts; needed: scan lines in one part")
     header, at = {}, 8
     while data[at] != 0:

@@ -11,8 +11,6 @@ from pimper_torch.errors import InputError, some
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Views
 
-# Less than this moves no pixel by an amount that calibration knows.
-_MIN_SKEW_PX = 0.01
 
 
 def write_picture(views: Views, index: int, path: Path) -> None:
@@ -71,9 +69,8 @@ def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
     K = cameras.intrinsics.detach().cpu().double()
     height = cameras.sizes_px[:, 1].cpu().double()
     moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * height / 2
-    sheared = [
-        name for name, shift in zip(names, moved.tolist(), strict=True) if shift > _MIN_SKEW_PX
-    ]
+    # Less is below what calibration knows.
+    sheared = [name for name, shift in zip(names, moved.tolist(), strict=True) if shift > 0.01]
     if sheared:
         raise InputError(
             f"the cameras of {some(sheared)} have a skew that moves pixels by up to "

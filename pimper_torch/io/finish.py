@@ -11,9 +11,6 @@ from pimper_torch.meshing.simplify import simplify
 from pimper_torch.records import Mesh, Record
 from pimper_torch.sfm.colmap_surfaces import reduced
 
-# Caps are added after a mesh was reduced, so that it is reduced again by as much; their number
-# hardly changes after the second time.
-_ATTEMPTS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +82,7 @@ def _few_enough(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed 
     if not watertight:
         return few, None
     whole, wanted = closed(few), faces
-    for _ in range(_ATTEMPTS):
+    for _ in range(4):  # caps hardly change after the second time
         excess = len(whole.mesh.faces) - faces
         wanted -= excess
         if excess <= 0 or wanted < 4:

@@ -18,8 +18,6 @@ from pimper_torch.records import Record
 # Diagonal of the 36 mm x 24 mm frame, to which CIPA DCG-001 relates the 35 mm equivalent.
 _FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's FocalPlaneResolutionUnit
-# Equivalents are whole millimetres: of 13 mm, zooms nearer to each other may give the same.
-_SAME_ZOOM = 1.08
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -81,7 +79,8 @@ def focals_px(focals: Sequence[FocalLength]) -> list[float]:
     contained = {}
     for lens, several in zooms.items():
         least, most = min(several), max(several)
-        contained[lens] = math.sqrt(least * most) if most < _SAME_ZOOM * least else 1.0
+        # Of whole millimetres: at 13, zooms nearer to each other may have the same equivalent.
+        contained[lens] = math.sqrt(least * most) if most < 1.08 * least else 1.0
     return [focal.px * focal.zoom / contained[focal.lens] for focal in focals]
 
 

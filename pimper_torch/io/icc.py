@@ -19,14 +19,10 @@ from pimper_torch.radiometry.primaries import srgb_from_primaries
 # Choices: printers' profiles have 2 MB, and some 20 tags.
 _MAX_BYTES, _MAX_TAGS = 2**22, 100
 _HEADER, _ENTRY = 128, 12
-_MAX_ENTRIES = 65536  # of a sampled curve
 _STEPS = 4097  # of a parametric curve
-_MAX_NAME = 60
 _CAMERAS_AND_SPACES = (b"scnr", b"mntr", b"prtr", b"spac")
 # Number of parameters of each function of a `para` curve.
 _PARAMETERS = (1, 3, 4, 5, 7)
-# Added along a curve so that levels of one radiance do not make it stand still.
-_RISE = 1e-6
 # Choices: numbers of a profile are rounded, and two pieces of a curve meet up to that; one that
 # rises by less over all levels is no photograph's.
 _MAX_FALL, _MIN_RISE = 1e-3, 0.5
@@ -81,10 +77,10 @@ def _name(tags: dict[bytes, bytes]) -> str:
     tag = tags.get(b"desc", b"")
     if tag[:4] == b"desc" and len(tag) >= 12:
         (length,) = struct.unpack_from(">I", tag, 8)
-        return _text(tag[12 : 12 + min(length, _MAX_NAME)])
+        return _text(tag[12 : 12 + min(length, 60)])
     if tag[:4] == b"mluc" and len(tag) >= 28:
         length, at = struct.unpack_from(">II", tag, 20)
-        return _shown(tag[at : at + min(length, 2 * _MAX_NAME)].decode("utf-16-be", "ignore"))
+        return _shown(tag[at : at + min(length, 120)].decode("utf-16-be", "ignore"))
     return ""
 
 
@@ -106,7 +102,7 @@ def _curve(tag: bytes) -> Response:
 
 def _sampled(tag: bytes) -> Response:
     (count,) = struct.unpack_from(">I", tag, 8)
-    if count > _MAX_ENTRIES or 12 + 2 * count > len(tag):
+    if count > 65536 or 12 + 2 * count > len(tag):
         raise InputError("has a tone curve that is cut short")
     if count == 0:
         return Linear()
@@ -148,7 +144,7 @@ def table(radiance: Float[Tensor, " entry"]) -> Curve:
     if not sound or float(highest[-1] - highest[0]) < _MIN_RISE:
         raise InputError("has a tone curve that does not rise")
     level = torch.linspace(0, 1, len(radiance), dtype=torch.float64)
-    rising = highest + _RISE * level
+    rising = highest + 1e-6 * level  # levels of one radiance do not make it stand still
     return Curve(encoded=level, radiance=(rising / rising[-1])[None])
 
 

@@ -37,7 +37,6 @@ def impossible(data: bytes, suffix: str) -> str:
 # glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of
 # the first it rounds to 8 bits, or cuts to them.
 COLORS, RAW_COLORS = "COLOR_0", "_COLOR_0"
-_POINTS = 0
 
 
 def with_raw_colors(data: bytes) -> bytes:
@@ -46,7 +45,7 @@ def with_raw_colors(data: bytes) -> bytes:
     tree = json.loads(data[20 : 20 + size])
     for mesh in tree.get("meshes", []):
         for part in mesh["primitives"]:
-            if COLORS in part["attributes"] and part.get("mode") != _POINTS:
+            if COLORS in part["attributes"] and part.get("mode") != 0:
                 part["attributes"][RAW_COLORS] = part["attributes"].pop(COLORS)
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)

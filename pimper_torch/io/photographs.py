@@ -25,14 +25,7 @@ from pimper_torch.records import Views
 from pimper_torch.sfm.conventions.masks import drawn_as_stored, object_is_dark
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
-# A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
-_BLACK = 1e-3
 _LIT_FRACTION = 1e-3  # more than hot pixels
-# Less of the object than this is left of a photograph that is mostly saturated.
-_MIN_USABLE = 0.1
-# Levels below which masks hold labels, and from which on edges are soft: a choice. Masks stored as
-# 0 and 1 are labels, too.
-_MOST_LABELS = 32
 # What programs add to the name of a mask.
 _MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
 # What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
@@ -458,7 +451,7 @@ def _brightness(path: Path) -> Float[Tensor, "height width"]:
     """Read how bright a mask is; 1 on the object where labels or transparency tell it."""
     decoded = decode(path)
     brightest = decoded.samples.amax(dim=0)
-    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < _MOST_LABELS
+    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < 32
     coloured = (brightest > 0).float()
     if decoded.alpha is None or bool((decoded.alpha >= OPAQUE).all()):
         return coloured if labelled else brightest
@@ -481,8 +474,9 @@ def _refuse_black(
     names: tuple[str, ...],
     folder: Path,
 ) -> None:
+    # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
     lit = [
-        float((image[:, :high, :wide] > _BLACK).float().mean()) > _LIT_FRACTION
+        float((image[:, :high, :wide] > 1e-3).float().mean()) > _LIT_FRACTION
         for (image,), (wide, high) in zip(each(images), sizes, strict=True)
     ]
     black = [name for name, one in zip(names, lit, strict=True) if not one]
@@ -516,7 +510,7 @@ def _judge_saturation(
     scant = [
         f"{name} ({fraction:.1%} left)"
         for name, fraction in zip(names, usable, strict=True)
-        if fraction < _MIN_USABLE
+        if fraction < 0.1
     ]
     if scant:
         caution(

@@ -29,12 +29,9 @@ _CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"sBIT", b"tRNS")
 _SRGB_GAMMA, _NEAR = 2.2, 0.02
 _ICC_PROFILE, _TRANSFER_FUNCTION = 34675, 301  # tags of TIFF
 _EXIF_GAMMA, _UNCALIBRATED, _ADOBE = 0xA500, 65535, "R03"
-_ADOBE_GAMMA = 563 / 256  # Adobe RGB (1998)
 # Of ITU-T H.273, as cICP and HEIC have them.
 _PRIMARIES: Mapping[int, Chromaticities] = {1: REC_709, 9: REC_2020, 12: DISPLAY_P3}
-_UNTOLD = 2
 _REC_709_CURVE = (1, 6, 14, 15)
-_STEPS = 4097
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,10 +123,10 @@ def colour_of_codes(primaries: int, curve: int, source: str, *, narrow: bool = F
     response: Response | None
     if narrow:
         return Colour(source=source, trouble="tells of samples that are no RGB of full range")
-    if curve == _UNTOLD:
+    if curve == 2:
         response = None
     elif curve in _REC_709_CURVE:
-        level = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
+        level = torch.linspace(0, 1, 4097, dtype=torch.float64)
         curved = ((level + 0.099) / 1.099) ** (1 / 0.45)
         response = table(torch.where(level < 0.081, level / 4.5, curved))
     elif curve in (4, 5):
@@ -138,7 +135,7 @@ def colour_of_codes(primaries: int, curve: int, source: str, *, narrow: bool = F
         response = Linear() if curve == 8 else Srgb()
     else:
         return Colour(source=source, trouble=f"names transfer {curve}, of HDR or film")
-    if primaries == _UNTOLD:
+    if primaries == 2:
         return Colour(source=source, response=response)
     if primaries not in _PRIMARIES:
         return Colour(source=source, response=response, trouble=f"names primaries {primaries}")
@@ -175,7 +172,7 @@ def colour_of_exif(exif: Image.Exif) -> Colour:
         return SILENT
     index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
     if str(index).strip("\0 ") == _ADOBE:
-        return _with_primaries("EXIF (Adobe RGB)", Gamma(exponent=_ADOBE_GAMMA), ADOBE_RGB)
+        return _with_primaries("EXIF (Adobe RGB)", Gamma(exponent=563 / 256), ADOBE_RGB)
     return SILENT
 
 

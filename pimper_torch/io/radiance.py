@@ -22,9 +22,6 @@ from pimper_torch.radiometry.saturation import PIXELS
 from pimper_torch.records import Record
 
 OPAQUE = 0.5
-# Saturated light in a pixel's footprint counts from this fraction on; below is the rounding of the
-# filter's weights.
-_TOUCHED = 1e-3
 # What sensors digitize to; 16 bits hold all of it.
 _SENSOR_BITS = (10, 12, 14)
 # Choices: photographs share one raster, and one that makes it so many times as large as all are
@@ -149,7 +146,8 @@ def resized_radiance(
     """
     if tuple(radiance.shape[-2:]) == (height, width):
         return radiance
-    touched = resized((radiance >= SATURATED).to(radiance), width, height) > _TOUCHED
+    # Less is rounding of the filter's weights.
+    touched = resized((radiance >= SATURATED).to(radiance), width, height) > 1e-3
     return torch.where(touched, 1.0, resized(radiance, width, height))
 
 

@@ -40,9 +40,7 @@ _XYZ_FROM_SRGB = torch.tensor(
     ],
     dtype=torch.float64,
 )
-_EXIF_IFD = 0x8769
 _UNKNOWN_CAMERA = "is of a camera whose colours nobody tells; albedo keeps them as they are"
-_OFF_WHITE = 0.1  # by which rows of a matrix to sRGB may sum to something else than 1
 
 
 def read_raw_header(path: Path | str) -> Header:
@@ -67,7 +65,7 @@ def read_raw_header(path: Path | str) -> Header:
         if orientation >= 5:
             width, height = height, width
         # Digital zoom crops what a camera develops, not what its sensor sees.
-        tags = _exif(path, raw).get_ifd(_EXIF_IFD) | {ExifTags.Base.DigitalZoomRatio: 1}
+        tags = _exif(path, raw).get_ifd(ExifTags.IFD.Exif) | {ExifTags.Base.DigitalZoomRatio: 1}
         return Header(
             width=width,
             height=height,
@@ -184,8 +182,9 @@ def _srgb_from_sensor(raw: Any) -> Float[Tensor, "3 3"] | None:  # noqa: ANN401 
 
 
 def _keeps_white(matrix: Float[Tensor, "3 3"]) -> bool:
+    """Return whether rows of a matrix to sRGB sum to about 1."""
     white = (matrix.sum(dim=1) - 1).abs().max()
-    return bool(matrix.isfinite().all()) and float(white) < _OFF_WHITE
+    return bool(matrix.isfinite().all()) and float(white) < 0.1
 
 
 def _white_balance(raw: Any) -> Float[Tensor, " 3"]:  # noqa: ANN401 - as above
@@ -202,7 +201,7 @@ def _exif(path: Path, raw: Any) -> Image.Exif:  # noqa: ANN401 - as above
     try:
         with path.open("rb") as file:
             exif.load_from_fp(file)
-            if exif.get_ifd(_EXIF_IFD):
+            if exif.get_ifd(ExifTags.IFD.Exif):
                 return exif
     except Exception:  # Pillow's parser raises whatever a file leads to: no TIFF, then
         exif = Image.Exif()

@@ -15,9 +15,6 @@ from pimper_torch.records import Failure, Reconstruction
 # What JSON can hold.
 Report = dict[str, object]
 
-# Directions of a light that all samples together see with less than this fraction of the best seen
-# one are left open.
-_UNDETERMINED = 1e-6
 
 
 def lights_report(result: Reconstruction) -> Report:
@@ -79,7 +76,8 @@ def common_lights(
     weight = _determined_by(result)
     known = torch.einsum("pij,pv->vij", weight, counted)
     regularization = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
-    step = torch.linalg.pinv(known, rtol=_UNDETERMINED, hermitian=True) @ regularization[..., None]
+    # What samples see with a millionth of the best seen direction is left open.
+    step = torch.linalg.pinv(known, rtol=1e-6, hermitian=True) @ regularization[..., None]
     return (mean + step[..., 0]).to(lights_world), counts.long()
 
 

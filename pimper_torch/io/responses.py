@@ -13,8 +13,6 @@ from pimper_torch.numpy_files import read_npy
 from pimper_torch.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
 from pimper_torch.radiometry.response import curve_from_table
 
-# A table of 65536 levels in three colours takes 5 MB as text.
-_LARGEST_BYTES = 20_000_000
 _LAYOUT = (
     "a column of radiance, or red, green and blue, for the levels 0, 1, 2 and on; or two or four "
     "columns, of which the first is the level"
@@ -70,7 +68,7 @@ def read_curve(path: Path | str) -> Curve:
             f"{path}: is no response of photographs ({found}); needed: srgb, linear, the exponent "
             f"of a gamma curve, or a file ending in {', '.join(readers)}."
         )
-    if path.stat().st_size > _LARGEST_BYTES:
+    if path.stat().st_size > 20_000_000:  # 65536 levels in three colours take 5 MB as text
         raise InputError(f"{path}: has {path.stat().st_size} bytes; needed: a small table.")
     try:
         table = reader(path)

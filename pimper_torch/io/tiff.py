@@ -31,7 +31,6 @@ _NAMES = {
     32845: "LogLuv",
 }
 _SENSOR = (32803, 34892)  # a colour filter array, or linear raw: DNG
-_MAX_PAGES = 100  # a choice: stacks of microscopes have more, and are no photographs
 CMYK_CAUTION = (
     "is CMYK, made for printing, and is turned into RGB without its profile; saved as RGB it would "
     "keep the camera's colours"
@@ -104,14 +103,13 @@ def layout_of(path: Path | str, image: TiffImagePlugin.TiffImageFile) -> Layout:
 
 def _picture(path: Path, image: TiffImagePlugin.TiffImageFile) -> tuple[int, list[str]]:
     """Go to the largest page that is no reduced copy and no mask; of equals the first."""
-    count = min(getattr(image, "n_frames", 1), _MAX_PAGES + 1)
+    most = 100  # stacks of microscopes have more, and are no photographs
+    count = min(getattr(image, "n_frames", 1), most + 1)
     if count == 1:
         _refuse_thumbnail(path, image)
         return 0, []
-    if count > _MAX_PAGES:
-        raise InputError(
-            f"{path}: has more than {_MAX_PAGES} pages; needed: one photograph a file."
-        )
+    if count > most:
+        raise InputError(f"{path}: has more than {most} pages; needed: one photograph a file.")
     sizes = []
     for page in range(count):
         try:

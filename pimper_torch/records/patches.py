@@ -315,9 +315,6 @@ class PatchStatus(IntEnum):
     """The solver's answer is not finite or has no albedo anywhere."""
 
 
-# Standard error of a normal of confidence 1/2, for people: a choice.
-_HALF_CONFIDENCE_DEG = 8.0
-
 
 def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     r"""Return a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
@@ -325,7 +322,7 @@ def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch
     >>> confidence_of(1 / torch.tensor([8.0, 24.0]).deg2rad().square())
     tensor([0.5000, 0.1000])
     """
-    half = math.radians(_HALF_CONFIDENCE_DEG) ** 2 * information
+    half = math.radians(8) ** 2 * information
     return half / (1 + half)
 
 

@@ -8,13 +8,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-# Normals that stages make are unit to rounding; those of a file of 8 bits to 0.4 per cent a part.
-_UNIT = 0.02
-# Of a rotation, entry by entry: files with six digits reach 1e-6.
-_RIGID = 1e-3
-
-_ROUNDING = 1e-5  # of shares in single precision
-
 _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
 
@@ -58,7 +51,8 @@ def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None =
 
 def outside(values: Float[Tensor, "..."], high: float) -> str:
     """State how many values are not finite, below 0 or above ``high``."""
-    bad = ~((values >= -_ROUNDING) & (values <= high + _ROUNDING) & values.isfinite())
+    rounding = 1e-5
+    bad = ~((values >= -rounding) & (values <= high + rounding) & values.isfinite())
     count = int(bad.sum())
     if count == 0:
         return ""
@@ -69,7 +63,7 @@ def outside(values: Float[Tensor, "..."], high: float) -> str:
 def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] | None) -> str:
     """State how many normals are not of unit length, and what they look like."""
     length = normals.norm(dim=-1)
-    bad = ~((length - 1).abs() <= _UNIT)  # NaN is bad
+    bad = ~((length - 1).abs() <= 0.02)  # NaN is bad; parts of 8 bits are 0.4 % off
     if where is not None:
         bad = bad & where
     count = int(bad.sum())
@@ -106,7 +100,7 @@ def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
     eye = torch.eye(3, dtype=torch.float64, device=rotation.device)
     off = (rotation @ rotation.mT - eye).abs().amax(dim=(1, 2))
     last = cam_from_world.new_tensor([0.0, 0.0, 0.0, 1.0])
-    bad = ~(off <= _RIGID) | (cam_from_world[:, 3] != last).any(dim=1)
+    bad = ~(off <= 1e-3) | (cam_from_world[:, 3] != last).any(dim=1)
     mirrored = torch.linalg.det(rotation) < 0
     if bool((mirrored & ~bad).any()):
         return f"has {int(mirrored.sum())} matrices that mirror: their determinant is -1"

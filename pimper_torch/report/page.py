@@ -25,8 +25,6 @@ HEAD = "<title>pimper_torch report</title>"
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
-# Of a page of 15 MB, whose pictures and scripts take 2 MB; text takes a third more than bytes.
-_MAX_ASSET_BYTES = 7_500_000
 
 
 def write_page(
@@ -74,7 +72,8 @@ def write_page(
 
 def asset_within(asset: Textured, path: Path) -> bytes:
     """Read an asset's file, or make one with coarser textures where it is too large for a page."""
-    if path.stat().st_size <= _MAX_ASSET_BYTES or min(asset.base_color.shape[:2]) < 2:
+    # Of a page of 15 MB; text takes a third more than bytes.
+    if path.stat().st_size <= 7_500_000 or min(asset.base_color.shape[:2]) < 2:
         return path.read_bytes()
     with TemporaryDirectory(prefix="pimper_page_") as folder:
         smaller, coarser = Path(folder) / path.name, asset.halved()

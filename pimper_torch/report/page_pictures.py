@@ -14,8 +14,6 @@ from pimper_torch.radiometry import to_bytes
 # The demo's 24 photographs and their predictions take 1.1 MB of its page; more photographs share
 # the room that so many take. Fewer pixels than the least show nothing.
 _LONGEST_PX, _SHORTEST_PX, _VIEWS = 800, 120, 24
-_QUALITY = 80
-_OUTLINE_PX = 0.7  # most that an outline is off, in pixels of the picture shown
 
 
 def longest_px(num_views: int) -> int:
@@ -37,7 +35,7 @@ def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
     """Return a picture of linear radiance, cut off at 1, as a data address of a JPEG."""
     colors = to_bytes(radiance.detach().cpu().clamp(0, 1).movedim(0, -1)).expand(-1, -1, 3)
     file = BytesIO()
-    Image.fromarray(colors.numpy()).save(file, "JPEG", quality=_QUALITY)
+    Image.fromarray(colors.numpy()).save(file, "JPEG", quality=80)
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
@@ -52,7 +50,7 @@ def outline(inside: Float[Tensor, "height width"], scale: float) -> str:
     from skimage.measure import approximate_polygon, find_contours
 
     values = inside.detach().float().cpu().numpy()
-    lines = [approximate_polygon(line, _OUTLINE_PX) for line in find_contours(values, 0.5)]
+    lines = [approximate_polygon(line, 0.7) for line in find_contours(values, 0.5)]
     return "".join(
         "M" + "L".join(f"{scale * (x + 0.5):.0f} {scale * (y + 0.5):.0f}" for y, x in line)
         for line in lines

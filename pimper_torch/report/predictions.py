@@ -14,8 +14,6 @@ from pimper_torch.relighting.held_out import Relighting, predict
 from pimper_torch.relighting.lit_surface import LitSurface
 from pimper_torch.report.page_pictures import longest_px
 
-# Predictions have half as many pixels a side as photographs: rays are what they cost.
-_COARSER = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -39,7 +37,7 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
         mesh: In the scene's frame, with albedo.
     """
     surface, judged = LitSurface(mesh), relighting.judged
-    longest = longest_px(scene.views.num_views) // _COARSER
+    longest = longest_px(scene.views.num_views) // 2  # rays are what they cost
     worth = dict(zip(judged.names, judged.psnr_db.tolist(), strict=True))
 
     def one(view: int) -> Prediction:

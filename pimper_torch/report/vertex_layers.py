@@ -7,8 +7,6 @@ from torch import Tensor
 
 from pimper_torch.records import Mesh
 
-# Colours end where one vertex in so many is beyond: a few would take all colours.
-_BEYOND = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +53,7 @@ def length_layer(
 ) -> VertexLayer:
     """Return a layer of lengths, from 0 to what nearly all are below."""
     known = values[values.isfinite()]
-    rank = max(1, len(known) - len(known) // _BEYOND)
+    rank = max(1, len(known) - len(known) // 50)  # a few would take all colours
     high = float(known.kthvalue(rank).values) if len(known) else 0.0
     return VertexLayer(
         attribute=attribute,

@@ -8,13 +8,8 @@ from torch.nn.functional import grid_sample
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.size.aruco import CELLS
 
-_ITERATIONS = 4
-_ALONG = 24  # profiles across each side
-_ENDS = 0.1  # of a side, at either corner, where the other side is near
-_STEP_PX = 0.25
 # Reach of a profile: of a cell, as the border is one cell of black; at least pixels' own blur.
 _REACH, _MIN_REACH_PX = 0.6, 1.5
-_OUTLIER_PX = 0.3  # scale of Cauchy's weights
 
 
 def refined_corners(
@@ -34,7 +29,7 @@ def refined_corners(
         The same corners; NaN where most profiles of a side have no step.
     """
     found = corners.double()
-    for _ in range(_ITERATIONS):
+    for _ in range(4):
         found = _refined_once(picture.double(), found)
     return found
 
@@ -46,8 +41,8 @@ def _refined_once(
     length = along.norm(dim=-1, keepdim=True)
     outward = torch.stack([along[..., 1], -along[..., 0]], dim=-1) / length
     reach = (_REACH * length.mean(dim=(1, 2)) / CELLS).nan_to_num(0).clamp_min(_MIN_REACH_PX)
-    share = torch.linspace(_ENDS, 1 - _ENDS, _ALONG).to(corners)
-    count = 2 * int((reach.max() / _STEP_PX).ceil()) + 1 if len(reach) else 3
+    share = torch.linspace(0.1, 0.9, 24).to(corners)  # near a corner the other side is near
+    count = 2 * int((4 * reach.max()).ceil()) + 1 if len(reach) else 3
     across = reach[:, None] * torch.linspace(-1, 1, count).to(corners)
     base = corners[:, :, None] + share[:, None] * along[:, :, None]
     places = base[:, :, :, None] + across[:, None, None, :, None] * outward[:, :, None, None]
@@ -81,7 +76,7 @@ def _line(
     middle = torch.where(known, off, torch.nan).nanmedian(dim=-1, keepdim=True).values
     predicted = middle.expand_as(off)
     for _ in range(3):
-        weight = known / (1 + ((values - predicted) / _OUTLIER_PX).square())
+        weight = known / (1 + ((values - predicted) / 0.3).square())
         total = weight.sum(dim=-1)
         mean_share = (weight * share).sum(dim=-1) / total
         mean = (weight * values).sum(dim=-1) / total

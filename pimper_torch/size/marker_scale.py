@@ -20,13 +20,6 @@ from pimper_torch.size.sheet import side_of
 # How far corners may be from where other photographs place them: pixels, or a fraction of the
 # photograph's longer side. Choices: cameras are found to a pixel, corners to a tenth.
 _OFF_PX, _OFF = 2.0, 0.002
-# Of the photographs that show a marker, those that have to agree where it is: fewer do where it
-# stands still before an object that turns.
-_AGREEING_VIEWS = 0.6
-_MIN_ANGLE_DEG = 2.0  # between some two of the rays to it
-# Most that sides, and diagonals over the root of two, differ from their mean. A choice: paper that
-# lies in waves; corners of a false marker are off by more.
-_SQUARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -144,12 +137,13 @@ def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> M
     pair = torch.zeros(len(first), count, dtype=torch.bool)
     pair[torch.arange(len(first)), first] = True
     pair[torch.arange(len(first)), second] = True
-    pair = pair[_widest(rays, pair) >= math.radians(_MIN_ANGLE_DEG)]
+    pair = pair[_widest(rays, pair) >= math.radians(2)]
     if len(pair) == 0:
         return None
     near = _near(_triangulated(rays, cameras, pair), cameras, pixels)
     best = near[near.sum(dim=1).argmax()]
-    if not int(best.sum()) >= max(2, _AGREEING_VIEWS * count):
+    # Fewer agree where a marker stands still before an object that turns.
+    if not int(best.sum()) >= max(2, 0.6 * count):
         return None
     corners = _triangulated(rays, cameras, best[None])
     agreeing = _near(corners, cameras, pixels)[0]
@@ -192,4 +186,5 @@ def _is_square(corners: Float[Tensor, "4 3"]) -> bool:
     sides = (corners - corners.roll(1, dims=0)).norm(dim=1)
     diagonals = (corners[:2] - corners[2:]).norm(dim=1) / math.sqrt(2)
     lengths = torch.cat([sides, diagonals])
-    return bool((lengths / sides.mean() - 1).abs().max() <= _SQUARE)
+    # Paper lies in waves; corners of a false marker are off by more.
+    return bool((lengths / sides.mean() - 1).abs().max() <= 0.05)

@@ -20,12 +20,6 @@ from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.sfm.colmap import undistort_pixels
 from pimper_torch.size.given import Mark, Pointer, number_of, require_inside
 
-# A surface ends a little inside of the object that it shows. So many pixels beyond its border a ray
-# is taken to touch it; where the silhouette is known and contains the pixel, so many hundredths of
-# the photograph's longer side. Choices.
-_BESIDE_PX = 2.0
-_BESIDE = 0.01
-
 # Confidence of a surface below which a warning says that it may be elsewhere. A choice: a half is
 # that of normals which are 8 degrees off.
 _UNSURE = 0.5
@@ -193,7 +187,8 @@ def _beside(
     within = 0 <= row < drawn.shape[0] and 0 <= column < drawn.shape[1]
     on = silhouettes.source != "everything" and within and bool(drawn[row, column])
     longer = int(cameras.sizes_px[view].max())
-    if float(off[nearest]) > max(_BESIDE_PX, _BESIDE * longer if on else 0.0):
+    # A surface ends a little inside of the object that it shows.
+    if float(off[nearest]) > max(2.0, 0.01 * longer if on else 0.0):
         if on:
             raise InputError(
                 f"{pointer}: the silhouette says that this pixel shows the object, but the surface "

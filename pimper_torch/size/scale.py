@@ -19,10 +19,6 @@ AGREEING = 0.02
 ruler's millimetre in five centimetres."""
 
 
-# From so much on a frame's unit is another one, or none. A choice: between cm and in are 150 %.
-_ANOTHER = 0.15
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale(Record):
     """Factor that brings lengths to a known unit.
@@ -127,7 +123,7 @@ def compare_with_units(scale: Scale) -> None:
     millimetres = scale.factor * MILLIMETRES[scale.unit]
     unit = min(MILLIMETRES, key=lambda one: abs(math.log(millimetres / MILLIMETRES[one])))
     off = MILLIMETRES[unit] / millimetres - 1
-    if AGREEING < abs(off) < _ANOTHER:
+    if AGREEING < abs(off) < 0.15:  # more is another unit, or none
         caution(
             f"By the {scale.source}, lengths in the frame of the cameras that were given are "
             f"{off:+.1%} off, if its unit is {unit}. The frame was kept. Give the sides of the "

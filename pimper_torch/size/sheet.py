@@ -17,8 +17,6 @@ PAPERS_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (
 MIN_SIDE_MM, MAX_SIDE_MM, SIDE_MM = 10, 36, 30
 _NUMBERS = 16  # of one sheet: a frame of 4 by 6
 _ACROSS, _DOWN = 4, 6
-_MARGIN_MM = 12.0  # most printers leave less than 6 blank; a cell of the largest marker has as much
-_GAP_MM = 8.0  # between markers, at least: more than a cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +70,8 @@ def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
 
 def _evenly(extent_mm: float, side_mm: int, most: int) -> list[float]:
     """Spread as many squares as fit between the margins, up to so many."""
-    between = extent_mm - 2 * _MARGIN_MM
-    count = min(most, int((between + _GAP_MM) // (side_mm + _GAP_MM)))
+    margin, gap = 12.0, 8.0  # printers leave less than 6 mm blank; more than a cell of a marker
+    between = extent_mm - 2 * margin
+    count = min(most, int((between + gap) // (side_mm + gap)))
     step = (between - side_mm) / (count - 1)
-    return [_MARGIN_MM + index * step for index in range(count)]
+    return [margin + index * step for index in range(count)]

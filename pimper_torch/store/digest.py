@@ -15,7 +15,6 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from pimper_torch.mapped import LARGE, drop_pages
 from pimper_torch.store.code import code, is_known
 
-_BYTES = 16
 # Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
 # hand on the same tensors, and writing into a tensor counts up its version.
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
@@ -40,7 +39,7 @@ def digest(*values: object) -> str | None:
         text = json.dumps([_described(value) for value in values])
     except _UnknownError:
         return None
-    return hashlib.blake2b(text.encode(), digest_size=_BYTES).hexdigest()
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 class _UnknownError(Exception):
@@ -97,7 +96,7 @@ def _tensor(tensor: Tensor) -> str:
     if known is not None and known[0] == version:
         return known[1]
     about = f"{tensor.dtype} {tuple(tensor.shape)} {tensor.device.type}"
-    hashed = hashlib.blake2b(about.encode(), digest_size=_BYTES)
+    hashed = hashlib.blake2b(about.encode(), digest_size=16)
     flat = tensor.detach().cpu().resolve_conj().resolve_neg().reshape(-1)
     if flat.stride() != (1,):  # one entry may have any stride
         flat = flat.clone(memory_format=torch.contiguous_format)

@@ -24,11 +24,6 @@ AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 _RECORD, _ABOUT = ".safetensors", ".json"
 _FORMAT = 1
-# Seconds after which a file that was never finished belongs to a run that is no more.
-_ABANDONED = 24 * 3600.0
-# Bytes; torch allocates so. Matrix products of other strides or addresses round otherwise: a batch
-# of 3x3 products from a mapped file differed by 5e-15.
-_ALIGNMENT = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +98,7 @@ class Store:
     def _bound(self) -> None:
         """Delete what was used longest ago until the rest is small enough."""
         for path in Path(self.folder).glob(".*.new-*"):
-            if time.time() - path.stat().st_mtime > _ABANDONED:
+            if time.time() - path.stat().st_mtime > 86_400:  # a day: its run is no more
                 path.unlink()
         sizes = self.sizes()
         total = sum(sizes.values())
@@ -127,17 +122,18 @@ def opened(cache: Store | Path | str | None) -> Store | None:
 
 
 def settled(record: AnyRecord) -> AnyRecord:
-    """Copy tensors that are not contiguous at an aligned address; others stay as they are.
+    """Copy tensors that are not contiguous at an address of torch's; others stay as they are.
 
-    Stages compute the same bits from two records of equal values once both are settled. Fields
-    that share a tensor share one still. Differentiable.
+    Stages compute the same bits from two records of equal values once both are settled: products
+    of matrices round otherwise at other strides or addresses. Fields that share a tensor share one
+    still. Differentiable.
     """
     copies: dict[int, Tensor] = {}
 
     def one(value: object) -> object:
         if not isinstance(value, Tensor) or value.layout != torch.strided:
             return value
-        if value.is_contiguous() and value.data_ptr() % _ALIGNMENT == 0:
+        if value.is_contiguous() and value.data_ptr() % 64 == 0:
             return value
         return copies.setdefault(id(value), copied(value))
 

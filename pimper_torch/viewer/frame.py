@@ -11,7 +11,6 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Cameras, Mesh, Record
 
-_DISTANCE = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +98,7 @@ def frame_of_cameras(
     return Frame(
         rotation=torch.stack([x, torch.linalg.cross(up, x), up]),
         center_world=middle,
-        unit=float(away.norm(dim=1).median()) / _DISTANCE,
+        unit=float(away.norm(dim=1).median()) / 3,
     )
 
 
@@ -109,5 +108,5 @@ def frame_of_mesh(mesh: Mesh) -> Frame:
     return Frame(
         rotation=torch.eye(3, dtype=torch.float64),
         center_world=(low + high) / 2,
-        unit=float((high - low).norm()) / _DISTANCE,
+        unit=float((high - low).norm()) / 3,
     )

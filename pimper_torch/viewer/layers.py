@@ -16,9 +16,6 @@ from pimper_torch.viz.maps import base_color, normal_colors
 LAYERS = ("lit", "shape", "albedo", "normals", "expected error", "support")
 _FIELDS = {"lit": "albedo", "albedo": "albedo"}
 _FIELDS |= {"expected error": "expected_error", "support": "confidence"}
-_CLAY = 0.5
-# Share of the vertices whose expected error has a colour of its own; a choice.
-_CLIP = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -57,7 +54,7 @@ def painted(mesh: Mesh, name: str, frame: Frame, unit: str = "scene units") -> L
         colors = base_color(mesh).expand(-1, 3)
         legend = "Albedo under the light." if name == "lit" else "Share of light it reflects."
     elif name == "shape":
-        colors = torch.full_like(own, _CLAY)
+        colors = torch.full_like(own, 0.5)
         legend = "Grey clay: the shape alone, without photometric normals."
     elif name == "normals":
         axes = frame.directions(carried)[:, [1, 2, 0]] * carried.new_tensor([1.0, -1.0, -1.0])
@@ -70,7 +67,7 @@ def painted(mesh: Mesh, name: str, frame: Frame, unit: str = "scene units") -> L
     else:
         assert mesh.expected_error is not None
         known = mesh.expected_error[mesh.expected_error.isfinite()]
-        rank = max(1, round(_CLIP * len(known)))
+        rank = max(1, round(0.95 * len(known)))
         clip = float(known.kthvalue(rank).values) if len(known) else 1.0
         colors = _mapped(mesh.expected_error, ErrorScale(clip=clip, unit=unit))
         legend = f"Standard error across the surface: violet 0 to yellow {clip:.2g} {unit} or more."

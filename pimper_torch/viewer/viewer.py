@@ -25,7 +25,6 @@ NO_PHOTOGRAPH = "none"
 # Longer side of photographs in place, units of the viewer: cameras are three away, and two dozen of
 # them on a ring stand 0.8 apart. None is put farther into the scene than half that way.
 _SIDE, _DEEPEST = 0.35, 1.5
-_POINT_SIZE = 0.004
 _POINT_COLOR = (110, 140, 190)
 # Raking light from up on the left, and how much of it is round about; degrees.
 _AZIMUTH, _ELEVATION, _AMBIENT = -45.0, 40.0, 0.15
@@ -91,7 +90,7 @@ class Viewer:
         frame = self._frame = frame_of_cameras(cameras, reference, points_world)
         scene = self.server.scene
         points = frame.points(points_world).float().numpy()
-        scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=_POINT_SIZE)
+        scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
         self._points.disabled = False
         scene.add_frame("/cameras", show_axes=False)
         scene.add_frame("/photographs", show_axes=False)

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-_SIZE_IN = 4.5
-
 TITLE = "pimper_torch calibration"
 """Of the PNG, by which a former one is known."""
 
@@ -27,7 +25,7 @@ def draw_calibration(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(_SIZE_IN, _SIZE_IN), layout="constrained")
+    figure = Figure(figsize=(4.5, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     ends = [f([*expected, *robust, *root_mean_square]) for f in (min, max)]

@@ -23,8 +23,6 @@ from pimper_torch.viz.tiles import Picture, Tile, array, sheet
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)
-_DARKEST = 0.65  # shading of the steepest height field; darker would hide the colour it tints
-_MARGIN = 0.04
 _PANEL_PX, _HEATMAP_PX = 260, 620
 _BAR_PX = (16, 400)
 
@@ -104,7 +102,7 @@ def error_picture(
     colors = colormaps[_COLORS]((values / scale.clip).clamp(0, 1).nan_to_num(0).numpy())[..., :3]
     if shading is not None:
         tone = shading.detach().cpu().double().mean(dim=-1, keepdim=True).numpy()
-        colors = colors * (_DARKEST + (1 - _DARKEST) * tone)
+        colors = colors * (0.65 + 0.35 * tone)  # darker would hide the colour
     colors[values.isnan().numpy()] = 1
     colors[values.isinf().numpy()] = MISSED
     return np.asarray(colors, dtype=np.float32)
@@ -149,7 +147,7 @@ def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
     for axis, size in ((1, where.shape[0]), (0, where.shape[1])):
         there = torch.nonzero(where.any(dim=axis))[:, 0]
         low, high = int(there[0]), int(there[-1]) + 1
-        room = round(_MARGIN * (high - low)) + 1
+        room = round(0.04 * (high - low)) + 1
         spans.append(slice(max(0, low - room), min(size, high + room)))
     return spans[0], spans[1]
 

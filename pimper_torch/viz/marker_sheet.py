@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 TITLE = "pimper_torch sheet of markers"
 """Of the PDF; tells that a file was written here."""
 
-_MM_PER_INCH = 25.4
 _RULER_MM = 100
 # White cells are drawn along rows and along columns: viewers leave hairlines between shapes that
 # only touch.
@@ -52,7 +51,7 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
 
     markers = layout(side_mm, paper)
     width, height = PAPERS_MM[paper]
-    figure = Figure(figsize=(width / _MM_PER_INCH, height / _MM_PER_INCH))
+    figure = Figure(figsize=(width / 25.4, height / 25.4))
     FigureCanvasPdf(figure)
     axes: Any = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()

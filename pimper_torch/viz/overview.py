@@ -24,13 +24,9 @@ from pimper_torch.viz.tiles import (
     with_triangles,
 )
 
-_MARGIN = 0.05
-_ROTATION_DEG = 40.0
-_DIMMED = 0.45
 _ACROSS, _PANEL_PX = 4, 390
 _FACETS = "#ffd24a"
 _THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
-_MAX_FACES = 200_000  # more than a panel has pixels to show; rays take four times as long at 10^6
 
 
 def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PANEL_PX) -> None:
@@ -57,7 +53,7 @@ def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
     """Make the pictures of the contact sheet."""
     reference = result.coarse.reference
     own = result.cameras.take([reference])
-    shape = reduced(result.mesh, _MAX_FACES)
+    shape = reduced(result.mesh, 200_000)  # more than a panel has pixels to show
     vertices = result.mesh.vertices_world
     camera = _framed(own, vertices, panel_px)
     name = result.scene.views.names[reference]
@@ -66,20 +62,20 @@ def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
     center = vertices.mean(dim=0)
     sides = [
         _framed(rotation(own, center, angle), vertices, panel_px)
-        for angle in (-_ROTATION_DEG, _ROTATION_DEG)
+        for angle in (-40.0, 40.0)
     ]
     coarse = result.coarse.mesh
     shown = {
         f"photograph {name}": outlined,
         f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points": with_triangles(
-            _DIMMED * photograph, corners, _FACETS
+            0.45 * photograph, corners, _FACETS
         ),
         "facets, shaded": array(shade(coarse, camera, flat=True)),
         "surface, shaded": array(shade(shape, camera)),
         "normals": array(normal_colors(maps.normals_cam)),
         "albedo": encoded(albedo_scale(result.mesh) * maps.albedo),
-        f"surface from {_ROTATION_DEG:.0f}° left": array(shade(shape, sides[0])),
-        f"surface from {_ROTATION_DEG:.0f}° right": array(shade(shape, sides[1])),
+        "surface from 40° left": array(shade(shape, sides[0])),
+        "surface from 40° right": array(shade(shape, sides[1])),
     }
     return [Tile(title=title, picture=picture) for title, picture in shown.items()]
 
@@ -111,7 +107,7 @@ def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
 
 def _framed(camera: Cameras, vertices: Float[Tensor, "vertex 3"], width_px: int) -> Cameras:
     """Crop a camera's picture to the object, at the size that its panel has on the sheet."""
-    low, high = bounding_box(camera, vertices, _MARGIN)
+    low, high = bounding_box(camera, vertices, 0.05)
     width, height = (high - low).tolist()
     return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), TALLEST)))
 
@@ -139,7 +135,7 @@ def _photograph(
     """
     reference = result.coarse.reference
     width, height = (int(side) for side in own.sizes_px[0])
-    low, high = bounding_box(own, result.mesh.vertices_world, _MARGIN)
+    low, high = bounding_box(own, result.mesh.vertices_world, 0.05)
     left, top = (max(0, int(corner)) for corner in low.floor())
     right, bottom = (int(corner) for corner in high.ceil())
     box = slice(top, min(bottom, height)), slice(left, min(right, width))

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL_IN = 2.2
-
 AnyPatch = PatchSet | PatchViews | PhotometricPatches | SweptPatches | DepthPatches
 
 
@@ -222,6 +220,6 @@ def _figure(count: int) -> "Figure":
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(_PANEL_IN * max(1, count), _PANEL_IN), layout="constrained")
+    figure = Figure(figsize=(2.2 * max(1, count), 2.2), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

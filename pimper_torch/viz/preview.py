@@ -11,7 +11,6 @@ from pimper_torch.records import CoarseMesh, SparseScene
 from pimper_torch.viz.render import frame, rotation, shade
 
 _SIDES_DEG = (0.0, -40.0, 40.0)
-_MARGIN = 0.05
 
 
 @torch.no_grad()
@@ -34,7 +33,7 @@ def draw_preview(
     center = mesh.vertices_world.mean(dim=0)
     panels = [Image.fromarray(to_bytes(photograph.expand(*size, 3)).numpy())]
     for angle in _SIDES_DEG:
-        camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, _MARGIN)
+        camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, 0.05)
         drawn = (255 * shade(mesh, camera)).round().to(torch.uint8)
         panels.append(Image.fromarray(drawn.numpy()))
     sheet = Image.new("RGB", (sum(one.width for one in panels), panel_px), "white")

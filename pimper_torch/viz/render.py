@@ -17,9 +17,7 @@ from pimper_torch.records import Cameras, Mesh
 # Raking light from up on the left shows height field; a weaker one beside the viewer keeps the far
 # side from drowning.
 _POINT_LIGHTS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
-_AMBIENT = 0.04
 _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
-_OVERSAMPLING = 2
 
 
 def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
@@ -36,9 +34,9 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
         sRGB in [0, 1], white where nothing is seen.
     """
     fine = Cameras(
-        intrinsics=scale_intrinsics(camera.intrinsics, float(_OVERSAMPLING), float(_OVERSAMPLING)),
+        intrinsics=scale_intrinsics(camera.intrinsics, 2.0, 2.0),
         cam_from_world=camera.cam_from_world,
-        sizes_px=camera.sizes_px * _OVERSAMPLING,
+        sizes_px=camera.sizes_px * 2,
     )
     hits = cast_view(mesh, fine, 0)
     seen = hits.face >= 0
@@ -57,7 +55,7 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     blended = (hits.barycentric[seen] * light[face]).sum(dim=-1, keepdim=True)
     radiance = torch.ones_like(hits.barycentric)
     radiance[seen] = blended * tint[face]
-    radiance = avg_pool2d(radiance.movedim(-1, 0)[None], _OVERSAMPLING)[0].movedim(0, -1)
+    radiance = avg_pool2d(radiance.movedim(-1, 0)[None], 2)[0].movedim(0, -1)
     return tone(radiance)
 
 
@@ -75,7 +73,7 @@ def lambertian(normals_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"
     Args:
         normals_cam: Unit, camera frame.
     """
-    light = torch.full_like(normals_cam[..., 0], _AMBIENT)
+    light = torch.full_like(normals_cam[..., 0], 0.04)
     for strength, direction in _POINT_LIGHTS_CAM:
         towards = normalize(normals_cam.new_tensor(direction), dim=0)
         light = light + strength * (normals_cam @ towards).clamp_min(0)

@@ -17,7 +17,6 @@ Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 _GAP_PX, _TITLE_PX, _HEADLINE_PX = 10, 26, 36
 _TEXT_PX, _LARGE_PX, _SMALL_PX = 15, 18, 11
 TALLEST = 1.6  # a picture that is higher for its width is shown narrower
-_SMOOTH = 2  # lines are drawn so many times as large, and averaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,11 +84,11 @@ def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: 
         corners: Pixels.
     """
     large = _image(picture)
-    large = large.resize((_SMOOTH * large.width, _SMOOTH * large.height))
+    large = large.resize((2 * large.width, 2 * large.height))  # lines are smooth
     draw = ImageDraw.Draw(large)
-    for triangle in (_SMOOTH * corners).tolist():
+    for triangle in (2 * corners).tolist():
         draw.line([tuple(corner) for corner in (*triangle, triangle[0])], color)
-    return _picture(large.reduce(_SMOOTH))
+    return _picture(large.reduce(2))
 
 
 def with_color(

@@ -24,8 +24,6 @@ _FRAMES, _FRAME_MS = 30, 100
 _OVERSAMPLING = 2
 _ELEVATION_DEG, _FOV_DEG, _MARGIN = 15.0, 30.0, 1.03
 _QUALITY, _EXPOSURE = 70, 1.4  # the latter takes albedo under the raking light to its own tones
-# Cosine of the angle from y up to which the photographs' upward direction confirms it: a choice.
-_UPRIGHT = 0.5
 
 
 def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
@@ -35,7 +33,7 @@ def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
     the photographs on average.
     """
     mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
-    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > _UPRIGHT else mean
+    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean
 
 
 @torch.no_grad()
