@@ -32,7 +32,7 @@ class ReconstructionError(PimperError):
 
 
 class OutOfMemoryError(ReconstructionError):
-    """Memory that did not suffice, for the smallest parts either."""
+    """Memory that did not suffice."""
 
 
 class NumericalError(PimperError):

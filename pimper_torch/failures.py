@@ -1,7 +1,7 @@
 """One bad patch, view or solver does not end a run: it is left out, and told at the end.
 
-Only what data can cause is left out: numbers that are not finite or matrices that are singular, too
-little memory, and input of one part that cannot be used. Other errors are mistakes in a program,
+Only what data can cause is left out: numbers that are not finite, matrices that are singular, and
+input of one part that cannot be used. Other errors are mistakes in a program, or a lack of memory,
 and end the run.
 """
 
@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
-from traceback import clear_frames
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -36,7 +35,6 @@ _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 # Torch's own name for it is not typed.
 _LinAlgError: type[Exception] = getattr(torch.linalg, "LinAlgError")  # noqa: B009
-
 
 
 @contextmanager
@@ -66,7 +64,7 @@ def collecting(
         warn_of(events)
         if out_of_memory(error):
             raise OutOfMemoryError(
-                f"Memory did not suffice, for the smallest parts either: {reason_of(error)}. "
+                f"Memory did not suffice: {reason_of(error)}. "
                 "Shrink the photographs (`--max-size-px`), take fewer samples "
                 "(`decompose.samples_per_pixel`), or close other programs."
             ) from error
@@ -133,22 +131,19 @@ def solved_or(
     stage: str,
     name: str,
     done: str,
-    memory: bool = False,
 ) -> Result:
     """Solve, or give something else where equations have no solution.
 
     Args:
         otherwise: Gives what stands in for the solution.
-        memory: Whether that also helps where memory does not suffice.
     """
     try:
         return solve()
     except Exception as error:
-        if not (memory if out_of_memory(error) else by_data(error)):
+        if not by_data(error):
             raise
         reason = reason_of(error)
-        what = "memory" if out_of_memory(error) else "solver"  # which another run may have
-        failure = Failure(stage=stage, what=what, name=name, reason=reason, done=done)
+        failure = Failure(stage=stage, what="solver", name=name, reason=reason, done=done)
         skipped(failure, error=error)
     return otherwise()
 
@@ -168,7 +163,8 @@ def by_data(error: BaseException) -> bool:
     """
     numeric = (ArithmeticError, np.linalg.LinAlgError, InputError, NumericalError)
     # Torch's kernels raise RuntimeError itself; its subclasses but one are of other kinds.
-    return isinstance(error, numeric) or type(error) in (RuntimeError, _LinAlgError)
+    of_torch = type(error) in (RuntimeError, _LinAlgError) and not out_of_memory(error)
+    return isinstance(error, numeric) or of_torch
 
 
 def reason_of(error: BaseException) -> str:
@@ -184,11 +180,10 @@ def over_patches(
     lost: Callable[[slice], AnyRecord],
     done: str,
 ) -> AnyRecord:
-    """Work on a batch of patches; on its halves, and theirs, where it fails as a whole.
+    """Work on a batch of patches; where it fails as a whole, on each of them by itself.
 
-    So a patch that cannot be worked on is found and left out, and too little memory for the batch
-    may be enough for its parts. Patches must be independent; those of a batch that was divided are
-    as in the whole one, up to rounding.
+    So a patch that cannot be worked on is found and left out. Patches must be independent; those of
+    a batch that failed are as in a whole one, up to rounding.
 
     Args:
         work: Called with a range of patches; gives their record.
@@ -196,75 +191,29 @@ def over_patches(
         done: What that means, for the warning.
 
     Raises:
-        BaseException: What no data can cause, what all of several patches failed with, or a lack
-            of memory for one patch.
+        BaseException: What no data can cause, or all of several patches failed with.
     """
-    whole = slice(0, len(facets))
     try:
-        return work(whole)
+        return work(slice(0, len(facets)))
     except Exception as error:
-        if not (by_data(error) or out_of_memory(error)) or len(facets) == 0:
+        if not by_data(error) or len(facets) == 0:
             raise
-        first = released(error)
-    failed: list[tuple[int, Exception]] = []
-    parts = _divided(work, whole, first, failed)
-    if len(failed) == len(facets) > 1:
-        raise first
-    numbers = [int(facet) for facet in facets]
-    if out_of_memory(first):
-        name = f"{len(numbers)} patches from facet {numbers[0]} on"
-        skipped(halved(stage, name, first), error=first)
-    for index, cause in failed:
-        reason, name = reason_of(cause), str(numbers[index])
-        failure = Failure(stage=stage, what="patch", name=name, reason=reason, done=done)
-        skipped(failure, error=cause)
-        parts.append((index, lost(slice(index, index + 1))))
-    ordered = [record for _, record in sorted(parts, key=lambda part: part[0])]
-    return type(ordered[0]).cat(ordered)
-
-
-def released(error: Exception) -> Exception:
-    """Let go of what an error's traceback holds, such as the tensors that there was no room for."""
-    clear_frames(error.__traceback__)
-    return error
-
-
-def halved(stage: str, name: str, error: BaseException) -> Failure:
-    """State that work was divided for lack of memory."""
-    return Failure(
-        stage=stage,
-        what="memory",
-        name=name,
-        reason=reason_of(error),
-        done="Memory did not suffice; the work was done again in smaller parts, nothing is missing",
-    )
-
-
-def _divided(
-    work: Callable[[slice], AnyRecord],
-    some: slice,
-    error: Exception,
-    failed: list[tuple[int, Exception]],
-) -> list[tuple[int, AnyRecord]]:
-    """Work on both halves of a range that failed; list the patches that failed by themselves."""
-    if some.stop - some.start == 1:
-        if out_of_memory(error):
-            raise error
-        failed.append((some.start, error))
-        return []
-    middle = (some.start + some.stop) // 2
-    found = []
-    for half in (slice(some.start, middle), slice(middle, some.stop)):
-        again = None
+        first = error
+    parts, failures = [], []
+    for index in range(len(facets)):
+        alone = slice(index, index + 1)
         try:
-            found.append((half.start, work(half)))
-        except Exception as caught:
-            if not (by_data(caught) or out_of_memory(caught)):
+            parts.append(work(alone))
+        except Exception as error:
+            if not by_data(error):
                 raise
-            again = released(caught)
-        if again is not None:
-            found += _divided(work, half, again, failed)
-    return found
+            parts.append(lost(alone))
+            name, reason = str(int(facets[index])), reason_of(error)
+            failures.append(Failure(stage=stage, what="patch", name=name, reason=reason, done=done))
+    if len(failures) == len(facets) > 1:
+        raise first
+    skipped(*failures, error=first)
+    return type(parts[0]).cat(parts)
 
 
 def _kind(failure: Failure) -> tuple[str, str, str]:

@@ -7,7 +7,7 @@ its batch alone: neither the number of workers nor who is first changes it.
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import copy_context
 from dataclasses import replace
@@ -17,7 +17,6 @@ from typing import TypeVar
 
 import torch
 
-from pimper_torch.failures import halved, out_of_memory, released, skipped
 from pimper_torch.journal import current, writing
 from pimper_torch.ledger import added_up
 from pimper_torch.mapped import drop_pages
@@ -38,8 +37,7 @@ def side_by_side(
     """Apply ``work`` to every item, a few at a time, and yield the results in order.
 
     Not more results than workers wait to be taken, so that memory stays bounded. Context variables
-    and whether gradients are recorded are those of the caller. An item that there was too little
-    memory for is worked on again by itself, once the others that had begun are done.
+    and whether gradients are recorded are those of the caller.
 
     Args:
         work: Called in a worker thread.
@@ -101,31 +99,16 @@ def _in_threads(
         with torch.set_grad_enabled(grad), writing(alone):
             return work(item)
 
-    waiting: deque[tuple[Item, Future[Result]]] = deque()
+    waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
     # A worker's setting reaches other threads of the process too: theirs is put back.
     with _threads(torch.get_num_threads()), _closing(pool):
         for item in items:
             if len(waiting) > workers:
-                yield _result(waiting, one)
-            waiting.append((item, pool.submit(copy_context().run, one, item)))
+                yield waiting.popleft().result()
+            waiting.append(pool.submit(copy_context().run, one, item))
         while waiting:
-            yield _result(waiting, one)
-
-
-def _result(waiting: deque[tuple[Item, Future[Result]]], one: Callable[[Item], Result]) -> Result:
-    """Take the first result; where memory did not suffice, repeat it alone."""
-    item, future = waiting.popleft()
-    try:
-        return future.result()
-    except Exception as error:
-        if not out_of_memory(error):
-            raise
-        wait([other for _, other in waiting])
-        failure = halved("parallel", "batches side by side", released(error))
-        skipped(failure, error=error)
-    del future
-    return copy_context().run(one, item)
+            yield waiting.popleft().result()
 
 
 def on_one_thread() -> AbstractContextManager[None]:

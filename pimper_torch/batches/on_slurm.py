@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from submitit import Job
 
 
-
 class SlurmExecutor(Executor):
     """A job for every task, which asks for its time, memory and threads.
 

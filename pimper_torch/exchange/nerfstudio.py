@@ -15,7 +15,6 @@ from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Cameras, Mesh, Views
 
 
-
 def write_transforms(
     views: Views,
     cameras: Cameras,

@@ -23,9 +23,7 @@ def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
     height, width, count = values.shape
     channels = sorted(zip(_NAMES[count], range(count), strict=True))
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    listed = b"".join(
-        name.encode() + struct.pack("<BIIII", 0, 2, 0, 1, 1) for name, _ in channels
-    )
+    listed = b"".join(name.encode() + struct.pack("<BIIII", 0, 2, 0, 1, 1) for name, _ in channels)
     header = _START
     for name, kind, data in (
         ("channels", "chlist", listed + b"\0"),

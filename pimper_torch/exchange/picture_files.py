@@ -12,7 +12,6 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Views
 
 
-
 def write_picture(views: Views, index: int, path: Path) -> None:
     """Write a photograph without its padding as PNG, 8-bit sRGB; more than 1 saturates.
 

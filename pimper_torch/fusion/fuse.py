@@ -357,7 +357,6 @@ class Fuse(Stage):
                 stage="fuse",
                 name="the expected error",
                 done="The surface has no expected errors",
-                memory=True,
             )
         )
 

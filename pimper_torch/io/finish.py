@@ -12,7 +12,6 @@ from pimper_torch.records import Mesh, Record
 from pimper_torch.sfm.colmap_surfaces import reduced
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeshFiles:
     """Form in which the surface is written.

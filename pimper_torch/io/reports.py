@@ -16,7 +16,6 @@ from pimper_torch.records import Failure, Reconstruction
 Report = dict[str, object]
 
 
-
 def lights_report(result: Reconstruction) -> Report:
     """Report the light of every view, for each patch and for all of them together.
 

@@ -13,7 +13,7 @@ class Failure(Record):
     """One patch, view, point or solver that failed, while the rest went on.
 
     Attributes:
-        what: ``view``, ``points``, ``patch``, ``solver`` or ``memory``.
+        what: ``view``, ``points``, ``patch`` or ``solver``.
         name: Of the view, the system or the work; the facet's number for a patch.
         done: What was done in its place.
     """

@@ -315,7 +315,6 @@ class PatchStatus(IntEnum):
     """The solver's answer is not finite or has no albedo anywhere."""
 
 
-
 def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     r"""Return a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
 

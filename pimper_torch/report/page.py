@@ -26,7 +26,6 @@ HEAD = "<title>pimper_torch report</title>"
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
 
-
 def write_page(
     path: Path | str,
     *,

@@ -15,7 +15,6 @@ from pimper_torch.relighting.lit_surface import LitSurface
 from pimper_torch.report.page_pictures import longest_px
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Prediction(Record):
     """A photograph as the surface explains it.

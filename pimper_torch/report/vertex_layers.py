@@ -8,7 +8,6 @@ from torch import Tensor
 from pimper_torch.records import Mesh
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VertexLayer:
     """One number a vertex, shown in colours from ``low`` to ``high``.

@@ -21,8 +21,8 @@ def kept(
 ) -> tuple[AnyRecord, float]:
     """Return a record that an earlier run kept, or make it and keep it.
 
-    What the earlier run reported, skipped and warned of is told again. What was found in smaller
-    batches for lack of memory is not kept. Where a record cannot be kept, a warning says so.
+    What the earlier run reported, skipped and warned of is told again. Where a record cannot be
+    kept, a warning says so.
 
     Args:
         key: A hash of all that the record depends on; ``None`` where that is not known.
@@ -41,9 +41,7 @@ def kept(
     with noted() as events:
         record = settled(make())
     seconds = time.perf_counter() - began
-    # Smaller batches round otherwise.
-    smaller = any(isinstance(event, Failure) and event.what == "memory" for event in events)
-    if store and key and not smaller:
+    if store and key:
         try:
             with aside(KEEP):
                 store.keep(key, record, {"seconds": seconds, "events": list(map(_plain, events))})

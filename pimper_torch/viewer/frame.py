@@ -12,7 +12,6 @@ from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Cameras, Mesh, Record
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame(Record):
     """A rotation, a shift and a scale from the world to the viewer.

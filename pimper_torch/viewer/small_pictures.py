@@ -8,7 +8,6 @@ from pimper_torch.records import Views
 from pimper_torch.report.page_pictures import shrunk
 
 
-
 def small_pictures(views: Views) -> list[np.ndarray]:
     """Shrink photographs, without the padding of the raster, to 8-bit sRGB."""
     pictures = []

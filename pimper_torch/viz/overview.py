@@ -60,10 +60,7 @@ def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
     photograph, outlined, corners = _photograph(result, own, panel_px)
     maps = view_maps(result.mesh, camera, 0)
     center = vertices.mean(dim=0)
-    sides = [
-        _framed(rotation(own, center, angle), vertices, panel_px)
-        for angle in (-40.0, 40.0)
-    ]
+    sides = [_framed(rotation(own, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
     coarse = result.coarse.mesh
     shown = {
         f"photograph {name}": outlined,
