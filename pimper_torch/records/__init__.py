@@ -1,94 +1,47 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.contour_rays import ContourPoints, ContourRays
-from pimper_torch.records.failure import Failure, LeftOut
-from pimper_torch.records.patches import (
-    AlignStatus,
-    Convergence,
-    DepthPatches,
-    Depths,
-    Heights,
-    Observations,
-    PatchPriors,
-    PatchSet,
-    PatchStatus,
-    PatchViews,
-    PhotometricPatches,
-    Photometry,
-    StopCause,
-    Surface,
-    SweptPatches,
-    Templates,
-)
-from pimper_torch.records.priors import (
-    AlbedoPrior,
-    DepthPrior,
-    InlierPrior,
-    LightPrior,
-    MapPrior,
-    NormalPrior,
-    Prior,
-    SilhouettePrior,
-)
-from pimper_torch.records.reconstruction import Reconstruction, StageReport
-from pimper_torch.records.record import Record
-from pimper_torch.records.scene import (
-    CoarseMesh,
-    FacetPoints,
-    Lens,
-    Mesh,
-    SparseScene,
-    Support,
-    pairs_table,
-)
-from pimper_torch.records.silhouettes import Silhouettes
-from pimper_torch.records.truth import Capture, DtuProtocol, Estimate, Truth
-from pimper_torch.records.views import Cameras, Views
-
-__all__ = [
-    "AlbedoPrior",
-    "AlignStatus",
-    "Cameras",
-    "Capture",
-    "CoarseMesh",
-    "ContourPoints",
-    "ContourRays",
-    "Convergence",
-    "DepthPatches",
-    "DepthPrior",
-    "Depths",
-    "DtuProtocol",
-    "Estimate",
-    "FacetPoints",
-    "Failure",
-    "Heights",
-    "InlierPrior",
-    "LeftOut",
-    "Lens",
-    "LightPrior",
-    "MapPrior",
-    "Mesh",
-    "NormalPrior",
-    "Observations",
-    "PatchPriors",
-    "PatchSet",
-    "PatchStatus",
-    "PatchViews",
-    "PhotometricPatches",
-    "Photometry",
-    "Prior",
-    "Reconstruction",
-    "Record",
-    "SilhouettePrior",
-    "Silhouettes",
-    "SparseScene",
-    "StageReport",
-    "StopCause",
-    "Support",
-    "Surface",
-    "SweptPatches",
-    "Templates",
-    "Truth",
-    "Views",
-    "pairs_table",
-]
+from pimper_torch.records.contour_rays import ContourPoints as ContourPoints
+from pimper_torch.records.contour_rays import ContourRays as ContourRays
+from pimper_torch.records.failure import Failure as Failure
+from pimper_torch.records.failure import LeftOut as LeftOut
+from pimper_torch.records.patches import AlignStatus as AlignStatus
+from pimper_torch.records.patches import Convergence as Convergence
+from pimper_torch.records.patches import DepthPatches as DepthPatches
+from pimper_torch.records.patches import Depths as Depths
+from pimper_torch.records.patches import Heights as Heights
+from pimper_torch.records.patches import Observations as Observations
+from pimper_torch.records.patches import PatchPriors as PatchPriors
+from pimper_torch.records.patches import PatchSet as PatchSet
+from pimper_torch.records.patches import PatchStatus as PatchStatus
+from pimper_torch.records.patches import PatchViews as PatchViews
+from pimper_torch.records.patches import PhotometricPatches as PhotometricPatches
+from pimper_torch.records.patches import Photometry as Photometry
+from pimper_torch.records.patches import StopCause as StopCause
+from pimper_torch.records.patches import Surface as Surface
+from pimper_torch.records.patches import SweptPatches as SweptPatches
+from pimper_torch.records.patches import Templates as Templates
+from pimper_torch.records.priors import AlbedoPrior as AlbedoPrior
+from pimper_torch.records.priors import DepthPrior as DepthPrior
+from pimper_torch.records.priors import InlierPrior as InlierPrior
+from pimper_torch.records.priors import LightPrior as LightPrior
+from pimper_torch.records.priors import MapPrior as MapPrior
+from pimper_torch.records.priors import NormalPrior as NormalPrior
+from pimper_torch.records.priors import Prior as Prior
+from pimper_torch.records.priors import SilhouettePrior as SilhouettePrior
+from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
+from pimper_torch.records.reconstruction import StageReport as StageReport
+from pimper_torch.records.record import Record as Record
+from pimper_torch.records.scene import CoarseMesh as CoarseMesh
+from pimper_torch.records.scene import FacetPoints as FacetPoints
+from pimper_torch.records.scene import Lens as Lens
+from pimper_torch.records.scene import Mesh as Mesh
+from pimper_torch.records.scene import SparseScene as SparseScene
+from pimper_torch.records.scene import Support as Support
+from pimper_torch.records.scene import pairs_table as pairs_table
+from pimper_torch.records.silhouettes import Silhouettes as Silhouettes
+from pimper_torch.records.truth import Capture as Capture
+from pimper_torch.records.truth import DtuProtocol as DtuProtocol
+from pimper_torch.records.truth import Estimate as Estimate
+from pimper_torch.records.truth import Truth as Truth
+from pimper_torch.records.views import Cameras as Cameras
+from pimper_torch.records.views import Views as Views

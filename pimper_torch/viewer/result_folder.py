@@ -100,7 +100,7 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
             continue
         record, about = read
         mesh = record.mesh
-        for place in _places(stages, about["reports"]):
+        for place in _places(stages, about["events"]):
             error = mesh.expected_error
             found[place] = mesh.replace(
                 vertices_world=factor * mesh.vertices_world,
@@ -113,8 +113,9 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
             yield name, found[place]
 
 
-def _places(stages: list[Mapping[str, Any]], reports: list[Mapping[str, Any]]) -> list[int]:
+def _places(stages: list[Mapping[str, Any]], events: list[Any]) -> list[int]:
     """Return where in a summary the reports of a record stand."""
+    reports = [one for one in events if isinstance(one, Mapping) and one["kind"] == "StageReport"]
     told = {(one["name"], one["seconds"], one["peak_memory_mb"]) for one in reports}
     return [
         place

@@ -17,8 +17,9 @@ from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io import results
 from pimper_torch.io.meshes import write_ply
+from pimper_torch.journal import Journal, current, writing
 from pimper_torch.records import Mesh, StageReport
-from pimper_torch.store import Store
+from pimper_torch.store import Store, kept
 from pimper_torch.viewer.result_folder import add_folder, passes_kept
 from pimper_torch.viewer.show import show
 
@@ -48,16 +49,24 @@ def folder(reconstruction, tmp_path, small_pictures):
     run = reconstruction.replace(report=tuple(stages))
     about = {"photographs": str(tmp_path / "gone"), "masks": None}
     results.write_result(run, CoarseToFineConfig(), tmp_path / "out", about=about)
-    kept = Store(folder=tmp_path / "out" / ".stages")
-    kept.keep("coarse_surface-a", run.coarse, {"reports": [as_json(stages[0])]})
+    store = Store(folder=tmp_path / "out" / ".stages")
+    keep(store, "coarse_surface-a", run.coarse, stages[0])
     for number, stage in enumerate(stages[1:]):
-        kept.keep(f"fuse-{number}", surface(run, number), {"reports": [as_json(stage)]})
-    kept.keep("fuse-of-another-run", surface(run, 9), {"reports": [as_json(report("fuse", 7.5))]})
+        keep(store, f"fuse-{number}", surface(run, number), stage)
+    keep(store, "fuse-of-another-run", surface(run, 9), report("fuse", 7.5))
     return tmp_path / "out"
 
 
-def as_json(stage):
-    return {"name": stage.name, "seconds": stage.seconds, "peak_memory_mb": stage.peak_memory_mb}
+def keep(store, key, record, stage):
+    """Keep a record as a run does, with its stage's report beside a caution."""
+
+    def make():
+        current().tell("a caution")
+        current().tell(stage)
+        return record
+
+    with writing(Journal(events=[])):
+        kept(store, key, type(record), make)
 
 
 def test_passes_of_this_result_are_read_in_their_order(folder, reconstruction):
