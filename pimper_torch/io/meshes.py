@@ -19,7 +19,7 @@ from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
 from pimper_torch.geometry.topology import corners_of
-from pimper_torch.io.mesh_headers import RAW_COLORS, impossible, with_raw_colors
+from pimper_torch.io.mesh_headers import RAW_COLORS, readable
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.records import Mesh
 from pimper_torch.records.value_checks import beyond, not_finite
@@ -150,30 +150,30 @@ def read_mesh(path: Path | str) -> Mesh:
     if not path.is_file():
         found = "a folder" if path.is_dir() else "nothing"
         raise InputError(f"{path}: found {found}; needed: a mesh file such as .ply or .obj.")
-    suffix, data = path.suffix.lower(), path.read_bytes()
-    why = impossible(data, suffix)
+    suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         why = f"it ends in {suffix}" if suffix else "its name has no ending"
-    if why:
         raise InputError(f"{path}: cannot be read as a mesh, {why}; needed: {_NEEDED}.")
     try:
         # Without a resolver nothing but the file itself is opened.
         scene = trimesh.load_scene(
-            BytesIO(with_raw_colors(data) if suffix == ".glb" else data),
+            BytesIO(readable(path, suffix)),
             file_type=suffix.lstrip("."),
             process=False,
             maintain_order=True,
         )
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise InputError(
-            f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
-        ) from error
-    try:
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        count = sum(len(scene.geometry[name].vertices) for _, name in placed)
+        if count > 100_000_000:  # a scene may place a mesh many times, and each takes memory
+            raise InputError(
+                f"{path}: its scene has {count} vertices; needed: 100,000,000 at most."
+            )
         parts = [
             _mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed
         ]
-    except Exception as error:  # what trimesh made of a damaged file may be anything
+    except InputError:
+        raise
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
         raise InputError(
             f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
         ) from error
