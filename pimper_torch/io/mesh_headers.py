@@ -1,4 +1,4 @@
-"""What trimesh misreads in mesh files; sizes beyond the file it refuses by itself."""
+"""Contents of mesh files that trimesh misreads."""
 
 import json
 import re
