@@ -86,8 +86,8 @@ SOLE_IMPORTERS = {
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
     "onnxruntime": {"priors/network.py"},
-    "distributed": {"batches/on_dask.py"},
-    "submitit": {"batches/on_slurm.py"},
+    "distributed": {"batches/engines.py"},
+    "submitit": {"batches/engines.py"},
 }
 
 # Where a distribution's module has another name.

@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch as pt
-from pimper_torch.chains.hold_out import held_apart
+from pimper_torch.chains.coarse_to_fine import held_apart
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pimper_torch.cli.light import absent
 from pimper_torch.errors import ConfigError, InputError, some
-from pimper_torch.outputs.names import require_name
+from pimper_torch.outputs.files import require_name
 
 # Files of the batch itself in OUT, beside the objects' folders.
 CSV, HTML = "batch.csv", "batch.html"

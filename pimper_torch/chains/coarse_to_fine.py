@@ -1,15 +1,15 @@
 """The chain from coarse to fine: all facets together, each pass on the surface before."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import torch
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
-from pimper_torch.chains.hold_out import held_apart
 from pimper_torch.chains.running import Running
 from pimper_torch.chains.streaming import Factorizing, Sweeping, Warping
 from pimper_torch.coarse.remesh import Remesh, RemeshConfig
@@ -40,11 +40,47 @@ from pimper_torch.reporting import Observer
 from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.sfm.sound_views import with_views
 from pimper_torch.silhouettes.contours import Contours, TraceContours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.store import Store, opened
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
+
+# As many as a surface needs, as everywhere.
+_MIN_VIEWS = 3
+
+
+def held_apart(
+    scene: SparseScene, every: int, needed: Iterable[str] = ()
+) -> tuple[SparseScene, SparseScene | None]:
+    """Divide a scene into views that are used, and every n-th by name that is held out.
+
+    Args:
+        every: Which; 0 for none.
+        needed: Names, with their suffix or without, of views that are used in any case.
+
+    Returns:
+        Both with the whole cloud; the first is the scene itself where no view is held out.
+
+    Raises:
+        ConfigError: Too few views are left.
+    """
+    names, stay = scene.views.names, set(needed)
+    ordered = sorted(range(len(names)), key=names.__getitem__)
+    chosen = ordered[every - 1 :: every] if every else []
+    held = [view for view in chosen if not stay & {names[view], names[view].rsplit(".", 1)[0]}]
+    if not held:
+        return scene, None
+    left = len(names) - len(held)
+    needs = f"a number that leaves {_MIN_VIEWS} views at least; it leaves {left}"
+    require(left >= _MIN_VIEWS, "hold_out", every, needs)
+    out = torch.zeros(len(names), dtype=torch.bool)
+    out[held] = True
+    return (
+        with_views(scene, ~out).replace(unregistered=scene.unregistered),
+        with_views(scene, out).replace(unregistered=()),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -49,7 +49,7 @@ class Running:
     """Calls the stages of a chain in one run: ``run(self.fuse, heights, contours)``.
 
     A stage's record is that of an earlier run where the store has it, and is kept else, see
-    :func:`~pimper_torch.store.kept`. A stage of another package is called every time, as its code
+    :func:`~pimper_torch.store.store`. A stage of another package is called every time, as its code
     is not known, and so is one that gradients are asked of.
 
     Attributes:

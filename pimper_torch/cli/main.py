@@ -23,13 +23,13 @@ from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from typing import TextIO
 
-from pimper_torch.cli.crash_report import limit, write_report
+from pimper_torch.cli.deaths import limit, write_report
 from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
-from pimper_torch.cli.stopping import exit_code, stoppable
+from pimper_torch.cli.supervise import exit_code, stoppable
 from pimper_torch.cores import usable_cores
 from pimper_torch.errors import InputError, PimperError, PimperWarning
-from pimper_torch.outputs.names import require_name
+from pimper_torch.outputs.files import require_name
 
 _HELP = """\
 usage: pimper reconstruct PHOTOS -o OUT [options]

@@ -103,8 +103,7 @@ class Output:
         """
         from rich.console import Console
 
-        from pimper_torch.cli.bars import Bars
-        from pimper_torch.cli.events import Events
+        from pimper_torch.cli.bars import Bars, Events
         from pimper_torch.doctor.forecast import Forecast
         from pimper_torch.reporting import Silent, recorded
 

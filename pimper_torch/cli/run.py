@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,14 +14,14 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output
-from pimper_torch.cli.size import bars_in_files, in_files, sized, told_size
 from pimper_torch.cli.view import tell_place
 from pimper_torch.doctor.checks import examine_views
 from pimper_torch.doctor.cost import planned
 from pimper_torch.doctor.forecast import Forecast
 from pimper_torch.errors import ConfigError, caution, cautioned
+from pimper_torch.io.decode import read_header
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import load_views
+from pimper_torch.io.photographs import image_name, list_images, load_views
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.ledger import closing_line
 from pimper_torch.memory import bytes_of
@@ -32,13 +33,14 @@ from pimper_torch.prior_files.read_normals import read_normals
 from pimper_torch.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage
-from pimper_torch.size.given import measured_in
+from pimper_torch.size.find_scale import find_scale
+from pimper_torch.size.given import Mark, Pointer, ScaleBar, measured_in, number_of, require_inside
 from pimper_torch.size.scale import Scale
+from pimper_torch.size.scaled import scaled
 from pimper_torch.store import Store
-from pimper_torch.viewer.live_results import COARSE, add_found, add_outcome
+from pimper_torch.viewer.show import COARSE, add_found, add_outcome
 from pimper_torch.viewer.viewer import Viewer, opened
-from pimper_torch.viz.overview import headline
-from pimper_torch.viz.preview import draw_preview
+from pimper_torch.viz.overview import draw_preview, headline
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
@@ -218,3 +220,60 @@ def _costs(result: Reconstruction) -> str:
 
 def _text(path: object) -> str | None:
     return None if path is None else str(path)
+
+
+def in_files(job: Job, views: Views, mark: Mark) -> Mark:
+    """Return a place with the sizes of the files, whose pixels it is in.
+
+    People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
+
+    Raises:
+        InputError: A pixel outside of its photograph.
+    """
+    paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
+
+    def sized_pointer(pointer: Pointer) -> Pointer:
+        name = views.names[number_of(pointer.name, views.names)]
+        header = read_header(paths[name])
+        require_inside(pointer, header.width, header.height)
+        return replace(pointer, size_px=(header.width, header.height))
+
+    return Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
+
+
+def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
+    """Return scale bars as :func:`in_files`."""
+    return tuple(
+        replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
+        for bar in job.inputs.scale_bar
+    )
+
+
+def sized(
+    job: Job, bars: tuple[ScaleBar, ...], result: Reconstruction
+) -> tuple[Reconstruction, Scale | None]:
+    """Scale a result to its real size, as far as anything tells it.
+
+    Raises:
+        InputError: A length cannot be found in the result.
+    """
+    inputs = job.inputs
+    scale = find_scale(
+        result,
+        bars=bars,
+        camera_distances=inputs.camera_distance,
+        markers=inputs.markers,
+        unit=inputs.unit,
+        own_frame=inputs.sparse is not None,
+    )
+    return (result, None) if scale is None else (scaled(result, scale.factor), scale)
+
+
+def told_size(scale: Scale) -> str:
+    """State in a sentence what the size was taken from."""
+    if scale.count == 1:
+        return f"Lengths are in {scale.unit}, by one {scale.source.removesuffix('s')}."
+    return (
+        f"Lengths are in {scale.unit}, by {scale.count} {scale.source}, which agree to "
+        f"{scale.residual:.2%}."
+    )

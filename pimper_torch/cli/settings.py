@@ -12,8 +12,7 @@ from typing import Annotated
 import tyro
 
 from pimper_torch.chains.presets import Config, load_config
-from pimper_torch.cli.arguments import read_arguments
-from pimper_torch.cli.option import meanings, summary, value_of
+from pimper_torch.cli.arguments import meanings, read_arguments, summary, value_of
 from pimper_torch.cli.output import Output
 from pimper_torch.config import presets, to_mapping, written
 from pimper_torch.errors import ConfigError

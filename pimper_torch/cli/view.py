@@ -12,8 +12,8 @@ from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.config import require
 from pimper_torch.errors import InputError
-from pimper_torch.viewer.result_folder import add_folder
 from pimper_torch.viewer.server import HOST, PORT, require_viser
+from pimper_torch.viewer.show import add_folder
 from pimper_torch.viewer.viewer import Viewer, opened
 
 

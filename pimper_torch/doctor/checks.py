@@ -13,9 +13,9 @@ from pimper_torch.doctor.pairs import light, match_copies, overlap, variations
 from pimper_torch.doctor.photograph import Photograph, of_views, read_all
 from pimper_torch.errors import InputError, some
 from pimper_torch.io.decode import read_header
-from pimper_torch.io.file_cautions import find_cautions, responses_told
 from pimper_torch.io.header import Header
 from pimper_torch.io.photographs import MIN_PHOTOGRAPHS, list_images
+from pimper_torch.io.responses import find_cautions, responses_told
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 from pimper_torch.sfm.lenses import group_lenses

@@ -16,16 +16,15 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import extra_of, format_of
-from pimper_torch.io.focal_lengths import focal_from_exif
-from pimper_torch.io.header import Header
+from pimper_torch.io.header import Header, focal_from_exif
 from pimper_torch.io.heic import read_heic, read_heic_header
-from pimper_torch.io.icc import read_profile
 from pimper_torch.io.profiles import (
     PngHead,
     colour_of_exif,
     colour_of_png,
     colour_of_tiff,
     png_head,
+    read_profile,
 )
 from pimper_torch.io.raw import read_raw, read_raw_header
 from pimper_torch.io.tiff import (

@@ -9,10 +9,8 @@ from PIL import ExifTags, Image
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import load_extra
-from pimper_torch.io.focal_lengths import focal_from_exif
-from pimper_torch.io.header import Header
-from pimper_torch.io.icc import read_profile
-from pimper_torch.io.profiles import colour_of_codes, colour_of_exif
+from pimper_torch.io.header import Header, focal_from_exif
+from pimper_torch.io.profiles import colour_of_codes, colour_of_exif, read_profile
 from pimper_torch.radiometry.colour import SILENT, Colour
 
 

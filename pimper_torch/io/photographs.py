@@ -15,10 +15,9 @@ from pimper_torch.errors import InputError, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, decode, read_header, rotated
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
-from pimper_torch.io.file_cautions import tell_cautions
-from pimper_torch.io.focal_lengths import focals_px
-from pimper_torch.io.header import Header
+from pimper_torch.io.header import Header, focals_px
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
+from pimper_torch.io.responses import tell_cautions
 from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.extras import load_extra
-from pimper_torch.io.focal_lengths import focal_from_exif
-from pimper_torch.io.header import Header
+from pimper_torch.io.header import Header, focal_from_exif
 from pimper_torch.radiometry import SATURATED, Linear
 from pimper_torch.radiometry.colour import Colour
 

@@ -2,12 +2,13 @@
 
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import fspath
 from pathlib import Path
 
-from pimper_torch.errors import OutputError
-from pimper_torch.outputs.names import require_name
+from pimper_torch.errors import OutputError, PimperError
 
 
 def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
@@ -51,3 +52,22 @@ def file_written_whole(path: Path) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from error
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def require_name(name: Path | str, error: type[PimperError]) -> None:
+    """Refuse, before any work, a name that libraries and files of text cannot hold.
+
+    Args:
+        error: What is raised where it is not UTF-8.
+    """
+    text = fspath(name)
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError as cause:
+        shown = text.encode("utf-8", "backslashreplace").decode()
+        encoding = sys.getfilesystemencoding()
+        reason = f" This system takes names for {encoding}: set LC_ALL=C.UTF-8."
+        raise error(
+            f"{shown}: the name is not UTF-8; needed: one that is. Rename it."
+            f"{'' if encoding.lower() == 'utf-8' else reason}"
+        ) from cause

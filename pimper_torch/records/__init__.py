@@ -1,7 +1,5 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.contour_rays import ContourPoints as ContourPoints
-from pimper_torch.records.contour_rays import ContourRays as ContourRays
 from pimper_torch.records.failure import Failure as Failure
 from pimper_torch.records.failure import LeftOut as LeftOut
 from pimper_torch.records.patches import AlignStatus as AlignStatus
@@ -38,6 +36,8 @@ from pimper_torch.records.scene import Mesh as Mesh
 from pimper_torch.records.scene import SparseScene as SparseScene
 from pimper_torch.records.scene import Support as Support
 from pimper_torch.records.scene import pairs_table as pairs_table
+from pimper_torch.records.silhouettes import ContourPoints as ContourPoints
+from pimper_torch.records.silhouettes import ContourRays as ContourRays
 from pimper_torch.records.silhouettes import Silhouettes as Silhouettes
 from pimper_torch.records.truth import Capture as Capture
 from pimper_torch.records.truth import DtuProtocol as DtuProtocol

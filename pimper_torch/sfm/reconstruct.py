@@ -36,7 +36,7 @@ from pimper_torch.sfm.upright import upright
 from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, kept, opened
-from pimper_torch.store.code import code
+from pimper_torch.store.digest import code
 
 # Fraction of the photographs that the largest component must hold when the model splits.
 _MIN_FRACTION = 0.6

@@ -11,8 +11,7 @@ from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED, to_bytes
 from pimper_torch.records import Cameras, Record, SparseScene
-from pimper_torch.size.aruco import CELLS, Square, find_squares
-from pimper_torch.size.corners import refined_corners
+from pimper_torch.size.aruco import CELLS, Square, find_squares, refined_corners
 from pimper_torch.size.given import MILLIMETRES, Unit
 from pimper_torch.size.scale import AGREEING, Length, Scale, fitted
 from pimper_torch.size.sheet import side_of

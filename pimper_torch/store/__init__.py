@@ -1,7 +1,6 @@
 """Records kept on disk under a hash of all that they depend on."""
 
 from pimper_torch.store.digest import digest
-from pimper_torch.store.kept import kept
-from pimper_torch.store.store import Store, opened, settled
+from pimper_torch.store.store import Store, kept, opened, settled
 
 __all__ = ["Store", "digest", "kept", "opened", "settled"]

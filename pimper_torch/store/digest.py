@@ -3,9 +3,12 @@
 import dataclasses
 import hashlib
 import json
+import re
 import types
 from collections.abc import Mapping
 from enum import Enum
+from functools import cache
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 import torch
@@ -13,7 +16,32 @@ from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.mapped import LARGE, drop_pages
-from pimper_torch.store.code import code, is_known
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+@cache
+def code() -> str:
+    """Hash all source files of the package, and the versions of what it depends on."""
+    hashed = hashlib.blake2b(_versions().encode(), digest_size=16)
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        hashed.update(path.relative_to(_PACKAGE).as_posix().encode() + path.read_bytes())
+    return hashed.hexdigest()
+
+
+def is_known(module: str) -> bool:
+    """Return whether :func:`code` covers a module: one of this package, or of torch's layers."""
+    return module.startswith((f"{_PACKAGE.name}.", "torch.nn."))
+
+
+def _versions() -> str:
+    try:
+        needed = requires(_PACKAGE.name) or []
+    except PackageNotFoundError:  # sources that were not installed
+        needed = ["torch", "numpy", "numba", "pycolmap"]
+    names = {re.split(r"[^\w.-]", one)[0] for one in needed if "extra ==" not in one}
+    return " ".join(f"{name} {version(name)}" for name in sorted(names))
+
 
 # Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
 # hand on the same tensors, and writing into a tensor counts up its version.
@@ -24,7 +52,7 @@ def digest(*values: object) -> str | None:
     """Hash values, so that equal hashes mean equal bits.
 
     A module is what it is made with: its class, attributes and submodules. The code of modules and
-    functions counts, see :func:`~pimper_torch.store.code.code`. A tensor's device counts, its
+    functions counts, see :func:`~pimper_torch.store.digest.code`. A tensor's device counts, its
     memory layout doesn't, nor do fields that are not compared, as where files lie.
 
     Args:

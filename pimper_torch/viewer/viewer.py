@@ -12,11 +12,13 @@ from torch import Tensor
 
 from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.errors import InputError
+from pimper_torch.mapped import each
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Mesh, Views
+from pimper_torch.report.page_pictures import shrunk
 from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server
-from pimper_torch.viewer.small_pictures import small_pictures
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -295,3 +297,12 @@ def opened(host: str = HOST, port: int = PORT) -> Iterator[Viewer]:
         yield viewer
     finally:
         viewer.stop()
+
+
+def small_pictures(views: Views) -> list[np.ndarray]:
+    """Shrink photographs, without the padding of the raster, to 8-bit sRGB."""
+    pictures = []
+    for (image,), (width, height) in zip(each(views.images), views.sizes_px.tolist(), strict=True):
+        small = shrunk(image[:, :height, :width].detach().cpu().clamp(0, 1), 256)
+        pictures.append(to_bytes(small.expand(3, -1, -1)).movedim(0, -1).contiguous().numpy())
+    return pictures

@@ -1,17 +1,28 @@
 """The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
+from PIL import Image
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.records import Cameras, Reconstruction
+from pimper_torch.mapped import drop_pages
+from pimper_torch.radiometry import srgb_from_linear, to_bytes
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    Reconstruction,
+    Silhouettes,
+    SparseScene,
+    Views,
+)
 from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, crop, rotation, shade
-from pimper_torch.viz.silhouette_figures import RELIABLE, border, thumbnails
+from pimper_torch.viz.render import bounding_box, crop, frame, rotation, shade
 from pimper_torch.viz.tiles import (
     TALLEST,
     Picture,
@@ -146,3 +157,79 @@ def _photograph(
     pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
     corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]
     return photograph, outlined, corners * (photograph.shape[1] / image.shape[1])
+
+
+RELIABLE, DOUBTED = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
+
+
+def thumbnails(
+    views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int
+) -> Float[Tensor, "height width 3"]:
+    """Tile small photographs of some views, each with its silhouette as a line of one pixel.
+
+    Args:
+        views: Linear radiance.
+        silhouettes: Of the same views. Lines are yellow, and red where a view is not trusted.
+        shown: Views, in the order of the tiles.
+
+    Returns:
+        sRGB in [0, 1]; tiles that are left over are white.
+    """
+    height, width = views.images.shape[-2:]
+    wide = max(1, width_px // across)
+    high = max(1, round(wide * height / width))
+    rows = -(-len(shown) // across)
+    sheet = torch.ones(rows * high, across * wide, 3)
+    for place, view in enumerate(shown):
+        image = adaptive_avg_pool2d(views.images[view].detach().cpu(), (high, wide))
+        inside = adaptive_avg_pool2d(silhouettes.inside[view].cpu()[None], (high, wide))[0]
+        tile = srgb_from_linear(image.clamp(0, 1)).expand(3, -1, -1).movedim(0, -1).clone()
+        tile[border(inside > 0.5)] = tile.new_tensor(
+            RELIABLE if silhouettes.reliable[view] else DOUBTED
+        )
+        top, left = place // across * high, place % across * wide
+        sheet[top : top + high, left : left + wide] = tile
+        drop_pages()
+    return sheet
+
+
+def border(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find pixels of the mask next to others; the picture's edge is no border."""
+    beside = max_pool2d((~mask)[None].float(), kernel_size=3, stride=1, padding=1)[0] > 0
+    return mask & beside
+
+
+_SIDES_DEG = (0.0, -40.0, 40.0)
+
+
+@torch.no_grad()
+def draw_preview(
+    scene: SparseScene, coarse: CoarseMesh, path: Path | str, panel_px: int = 360
+) -> None:
+    """Draw the reference photograph, and the coarse surface from there, left and right, as PNG.
+
+    Args:
+        path: A former file is replaced when the new one is complete.
+        panel_px: Longer side of a picture of the surface, and height of the photograph.
+    """
+    path = Path(path)
+    own = scene.cameras.take([coarse.reference]).to("cpu")
+    mesh = coarse.mesh.to("cpu")
+    width, height = own.sizes_px[0].tolist()
+    image = scene.views.images[coarse.reference, :, :height, :width].cpu()[None]
+    size = (panel_px, max(1, round(panel_px * width / height)))
+    photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
+    center = mesh.vertices_world.mean(dim=0)
+    panels = [Image.fromarray(to_bytes(photograph.expand(*size, 3)).numpy())]
+    for angle in _SIDES_DEG:
+        camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, 0.05)
+        drawn = (255 * shade(mesh, camera)).round().to(torch.uint8)
+        panels.append(Image.fromarray(drawn.numpy()))
+    sheet = Image.new("RGB", (sum(one.width for one in panels), panel_px), "white")
+    left = 0
+    for panel in panels:
+        sheet.paste(panel, (left, (panel_px - panel.height) // 2))
+        left += panel.width
+    fresh = path.with_name(f"{path.name}.new")
+    sheet.save(fresh, format="PNG")
+    fresh.replace(path)

@@ -8,10 +8,9 @@ from platform import node
 import pytest
 from stand_ins import children_stand_in, write_slurm
 
-from pimper_torch.batches import on_dask, on_slurm
+from pimper_torch.batches import engines
+from pimper_torch.batches.engines import SlurmExecutor, dask_workers
 from pimper_torch.batches.objects import read_objects
-from pimper_torch.batches.on_dask import dask_workers
-from pimper_torch.batches.on_slurm import SlurmExecutor
 from pimper_torch.batches.plan import planned_batch
 from pimper_torch.batches.task import carry_out
 from pimper_torch.cli.main import main
@@ -143,18 +142,16 @@ def test_an_engine_that_is_not_there_is_told(world, given, told, capsys, monkeyp
     import dask
 
     world.add("ball")
-    monkeypatch.setattr(on_slurm.shutil, "which", lambda _: None)
-    monkeypatch.setattr(on_dask, "_TIMEOUT_SECONDS", 1)
+    monkeypatch.setattr(engines.shutil, "which", lambda _: None)
+    monkeypatch.setattr(engines, "_TIMEOUT_SECONDS", 1)
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
         assert main(["batch", str(world.folder / "scans"), "-o", str(world.out), *given]) == 2
     assert told in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.parametrize(
-    ("option", "module", "extra"), [("--dask", on_dask, "dask"), ("--slurm", on_slurm, "slurm")]
-)
-def test_an_engine_that_is_not_installed_is_told(world, option, module, extra, capsys, monkeypatch):
+@pytest.mark.parametrize(("option", "extra"), [("--dask", "dask"), ("--slurm", "slurm")])
+def test_an_engine_that_is_not_installed_is_told(world, option, extra, capsys, monkeypatch):
     world.add("ball")
-    monkeypatch.setattr(module, "find_spec", lambda _: None)
+    monkeypatch.setattr(engines, "find_spec", lambda _: None)
     assert main(["batch", str(world.folder / "scans"), "-o", str(world.out), option, "x"]) == 2
     assert f"pip install 'pimper_torch[{extra}]'" in " ".join(capsys.readouterr().err.split())

@@ -10,7 +10,7 @@ from PIL import Image
 
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
-from pimper_torch.cli.size import bars_in_files, told_size
+from pimper_torch.cli.run import bars_in_files, told_size
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
 from pimper_torch.sfm.colmap import read_model

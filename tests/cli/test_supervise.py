@@ -13,7 +13,7 @@ import pytest
 from pimper_torch.cli import supervise
 from pimper_torch.cli.deaths import folder_of
 from pimper_torch.cli.main import main
-from pimper_torch.cli.stopping import Stopped, stoppable
+from pimper_torch.cli.supervise import Stopped, stoppable
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")
 

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
-from pimper_torch.exchange.light_positions import write_lights
+from pimper_torch.exchange.layouts import write_lights
 
 
 def read_lp(path):

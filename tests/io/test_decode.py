@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.decode import decode, read_header, rotated
-from pimper_torch.io.focal_lengths import focal_from_exif, focals_px
+from pimper_torch.io.header import focal_from_exif, focals_px
 from pimper_torch.sfm.lenses import group_lenses
 
 

@@ -7,7 +7,7 @@ import torch
 from PIL import Image, ImageCms
 from torch.testing import assert_close
 
-from pimper_torch.io.icc import read_profile
+from pimper_torch.io.profiles import read_profile
 from pimper_torch.radiometry import Curve, Gamma, Linear, Srgb, linear_from_srgb
 from pimper_torch.radiometry.primaries import in_srgb_primaries
 

@@ -12,9 +12,14 @@ from pathlib import Path
 import pytest
 
 from pimper_torch.errors import InputError, OutputError
-from pimper_torch.outputs.folders import held_output, prepare_output, require_apart, written_whole
+from pimper_torch.outputs.folders import (
+    clean_output,
+    held_output,
+    prepare_output,
+    require_apart,
+    written_whole,
+)
 from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
-from pimper_torch.outputs.removal import clean_output
 
 
 def held(folder: Path) -> list[str]:

@@ -7,9 +7,8 @@ import pytest
 
 from pimper_torch.cli.main import main
 from pimper_torch.errors import OutputError
-from pimper_torch.outputs.folders import held_output, written_whole
+from pimper_torch.outputs.folders import clean_output, held_output, written_whole
 from pimper_torch.outputs.marker import MARKER, STAGES
-from pimper_torch.outputs.removal import clean_output
 
 KILLED = """
 import os, signal, sys

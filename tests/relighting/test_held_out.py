@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.asset.make import textured
-from pimper_torch.chains.hold_out import held_apart
+from pimper_torch.chains.coarse_to_fine import held_apart
 from pimper_torch.errors import ConfigError
 from pimper_torch.records import Silhouettes
 from pimper_torch.relighting.held_out import relight

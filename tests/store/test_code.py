@@ -1,9 +1,13 @@
 """Which code a record depends on."""
 
+import sys
+
 import pytest
 
-from pimper_torch.store import code as module
-from pimper_torch.store.code import code, is_known
+from pimper_torch.store.digest import code, is_known
+
+# The package's name for the module is its function.
+module = sys.modules[code.__module__]
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,7 @@ from pimper_torch.io.meshes import write_ply
 from pimper_torch.journal import Journal, current, writing
 from pimper_torch.records import Mesh, StageReport
 from pimper_torch.store import Store, kept
-from pimper_torch.viewer.result_folder import add_folder, passes_kept
-from pimper_torch.viewer.show import show
+from pimper_torch.viewer.show import add_folder, passes_kept, show
 
 pytest.importorskip("viser")
 

@@ -12,9 +12,8 @@ from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.fit_lights import fit_lights
 from pimper_torch.viewer import server as server_module
-from pimper_torch.viewer.live_results import add_found, add_outcome
 from pimper_torch.viewer.server import open_server, require_viser
-from pimper_torch.viewer.show import show
+from pimper_torch.viewer.show import add_found, add_outcome, show
 from pimper_torch.viewer.viewer import NO_PHOTOGRAPH, opened
 
 pytest.importorskip("viser")

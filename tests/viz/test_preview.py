@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pimper_torch.viz.preview import draw_preview
+from pimper_torch.viz.overview import draw_preview
 from pimper_torch.viz.render import frame, shade
 
 

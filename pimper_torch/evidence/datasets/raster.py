@@ -10,9 +10,9 @@ from torch import Tensor
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.decode import read_header
-from pimper_torch.io.file_cautions import tell_cautions
 from pimper_torch.io.photographs import read_mask, shrunk_focals, shrunk_size
 from pimper_torch.io.radiance import read_pictures, resized_mask
+from pimper_torch.io.responses import tell_cautions
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Views
 
