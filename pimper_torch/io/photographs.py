@@ -54,23 +54,17 @@ def load_views(
     Of a folder without photographs but with folders of them, three at least, each of these holds
     the photographs of one pose of the camera, each under another light.
 
-    JPEG, PNG and TIFF of 8 or 16 bits, grey, colour or palette, HEIC and camera raw where their
-    extras are installed, of one photograph raw before JPEG; links are followed. Other files,
-    hidden ones and folders inside are passed over, with a warning where they look like
-    photographs. EXIF's orientation is applied, its focal length kept in pixels. The response is
-    undone, so that radiance is linear: the one given, else the one that each file tells by its ICC
-    profile, PNG's gAMA and cICP or EXIF, else sRGB. Colours are turned into the primaries of sRGB.
-    A warning names what files say about their samples that is not followed, or that a given
-    response contradicts. Radiance 1 is saturation, in every colour: the level that is told, or at
+    JPEG, PNG and TIFF of 8 or 16 bits, HEIC and camera raw where their extras are installed; other
+    files are passed over, with a warning where they look like photographs. EXIF's orientation is
+    applied, its focal length kept in pixels. The response is undone, so that radiance is linear:
+    the one given, else the one that each file tells, else sRGB. Colours are turned into the
+    primaries of sRGB. Radiance 1 is saturation, in every colour: the level that is told, or at
     which values pile up, or full scale. Photographs of unlike sizes are padded.
 
     Masks are images of the photographs' sizes, at least half as bright on the object as the
-    brightest pixel of all masks. Files without loss whose levels are all below 32, of 255 or 65535,
-    hold labels: all but 0 is the object. In masks that are somewhere transparent it is what is
-    opaque by half and not black, or all that is opaque if that is nothing. Where all of them
-    together are bright along the border and dark in the middle, they are turned round, and a
-    warning says so. Without a folder of masks, alpha channels that are somewhere transparent are
-    the masks, and a warning says so; a photograph without one shows the object everywhere.
+    brightest pixel of all masks; labels and transparency are followed, and inverted masks turned
+    round. Without a folder of masks, alpha channels that are somewhere transparent are the masks,
+    and a warning says so. The manual has tables of what files tell, and of how masks are read.
 
     Args:
         masks: Folder with one mask for each photograph, of the same name whatever the

@@ -35,7 +35,6 @@ from pimper_torch.viz.maps import ViewMaps, albedo_scale, normal_colors, view_ma
 from pimper_torch.viz.overview import draw_overview, headline
 from pimper_torch.viz.turn import draw_turn
 
-# What a result consists of, and nothing else.
 RESULT_NAMES = (
     "mesh.ply",
     "mesh.glb",
@@ -58,6 +57,7 @@ RESULT_NAMES = (
     "turn.webp",
     "report.html",
 )
+"""What a result consists of, and nothing else; a table in the manual tells what each file holds."""
 _PARTS = 8  # of the bar: simplification, light, meshes, asset, maps, sheet, turning picture, page
 
 
@@ -71,37 +71,7 @@ def write_result(
     files: MeshFiles | None = None,
     report: bool = True,
 ) -> None:
-    """Write everything a run found into a folder.
-
-    ===============  ==============================================================
-    file             what
-    ===============  ==============================================================
-    `mesh.ply`       vertex normals, albedo as sRGB colour, confidence, expected error
-                     in the unit of the vertices; binary
-    `mesh.glb`       the same for viewers, albedo linear as glTF wants it
-    `mesh.stl`       if asked for: triangles alone
-    `mesh.obj`       if asked for: normals, albedo as sRGB colour
-    `asset.glb`      50,000 faces at most, without caps: albedo and normals as textures, baked
-                     from every vertex; ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence) of its
-                     vertices
-    `asset.obj`      if an OBJ is asked for: the same, with `asset.mtl`, `asset_albedo.png` and
-                     `asset_normal.png`
-    `sparse/`        COLMAP model, in the mesh's frame
-    `masks/`         the object's silhouette in every photograph as it was undistorted, PNG of its
-                     name; none where everything is the object
-    `normals.png`    reference view: red right, green up, blue to the viewer
-    `albedo.png`     reference view, sRGB, scaled into [0, 1]
-    `depth.npz`      reference view: depth along z (NaN where the mesh is not seen),
-                     mask, confidence, expected_error if known, intrinsics, cam_from_world
-                     (float64 far from the origin), name
-    `lights.json`    light of every view, averaged and for each patch, world frame
-    `config.yaml`    every setting of the run
-    `summary.json`   counts, times, memory, convergence; materials, and how near the surface comes
-                     to photographs with them and without, in decibels
-    `overview.png`   contact sheet, every photograph with its silhouette below
-    `turn.webp`      the surface turning once round, its shape beside its albedo
-    `report.html`    unless unwanted: all of this to look at in a browser, offline
-    ===============  ==============================================================
+    """Write everything a run found into a folder: the files of :data:`RESULT_NAMES`.
 
     Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
     the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
