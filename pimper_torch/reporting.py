@@ -47,17 +47,8 @@ class Observer(Protocol):
         """Hear that a stage ended, what it cost and what it found."""
 
 
-class Silent:
+class Silent(Observer):
     """An observer that shows nothing."""
-
-    def started(self, stage: str) -> None:
-        """Do nothing."""
-
-    def progressed(self, done: int, total: int) -> None:
-        """Do nothing."""
-
-    def finished(self, report: StageReport) -> None:
-        """Do nothing."""
 
 
 # What neither stages nor other lines of a run's table do.

@@ -136,7 +136,7 @@ def main() -> int:
         if getattr(sys, name) is None:  # closed by whoever started this
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - for good
     heed(leave_at_once)
-    said = _hidden_file()
+    said = os.memfd_create("pimper") if sys.platform == "linux" else None
     hears, tells = os.pipe()
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watcher = os.getpid()
@@ -244,18 +244,6 @@ def _keep_apart(said: int) -> None:
     for name in ("stderr", "__stderr__"):
         setattr(sys, name, stream)
     faulthandler.enable(2)
-
-
-def _hidden_file() -> int | None:
-    """Open a file that has no name any more."""
-    folder = os.environ.get("TMPDIR", "/tmp")
-    path = f"{folder}/.pimper-{os.getpid()}-{time.monotonic_ns()}"
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
-        os.unlink(path)  # noqa: PTH108 - pathlib takes longer to load than all else here
-    except OSError:
-        return None
-    return descriptor
 
 
 def _tail(said: int | None) -> str:

@@ -1,6 +1,5 @@
 """AliceVision's SfMData with maps for every view, as Meshroom and Open-RNb read it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.exchange.picture_files import file_names, write_mask, write_picture
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.pixels import indices_from_pixels
+from pimper_torch.io.reports import write_json
 from pimper_torch.records import Cameras
 from pimper_torch.viz.maps import albedo_scale, view_maps
 
@@ -83,8 +83,7 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
             )
         ],
     }
-    text = json.dumps(whole, indent=4, ensure_ascii=False)
-    Path(file).write_text(text + "\n", encoding="utf-8")
+    write_json(whole, Path(file), indent=4)
 
 
 def _intrinsic(

@@ -1,6 +1,5 @@
 """Results in the layouts of other programs."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -17,6 +16,7 @@ from pimper_torch.exchange.colmap_workspace import write_workspace
 from pimper_torch.exchange.map_files import write_maps
 from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.exchange.result import Result
+from pimper_torch.io.reports import write_json
 from pimper_torch.progress import part
 from pimper_torch.records.priors import Axes
 
@@ -66,8 +66,7 @@ def write_lights(result: Result, folder: Path) -> None:
             for name, light, direction, towards in zip(names, lights, directions, seen, strict=True)
         ],
     }
-    text = json.dumps(about, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "lights.json").write_text(text + "\n", encoding="utf-8")
+    write_json(about, folder / "lights.json")
 
 
 def directions_world(result: Result) -> Float[Tensor, "view 3"]:

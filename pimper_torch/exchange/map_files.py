@@ -1,6 +1,5 @@
 """Normals, depth and albedo of every view as EXR, 16-bit PNG and NPZ."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.exchange.picture_files import file_names
 from pimper_torch.exchange.result import Result
 from pimper_torch.io.decode import write_deep_png
+from pimper_torch.io.reports import write_json
 from pimper_torch.records.priors import AXES, Axes
 from pimper_torch.viz.maps import ViewMaps, view_maps
 
@@ -51,7 +51,7 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
         "cameras": "NPZ: intrinsics count the centre of the top-left pixel as (0.5, 0.5); "
         "cam_from_world has camera axes x right, y down, z into the scene, whatever normals have",
     }
-    (folder / "README.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    write_json(about, folder / "README.json")
 
 
 def with_axes(normals_cam: Float[Tensor, "height width 3"], axes: Axes) -> np.ndarray:

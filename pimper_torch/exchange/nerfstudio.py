@@ -1,6 +1,5 @@
 """NeRF's ``transforms.json``, as nerfstudio, instant-ngp and Brush read it."""
 
-import json
 from pathlib import Path
 
 import torch
@@ -12,6 +11,7 @@ from pimper_torch.exchange.picture_files import file_names, refuse_skew, write_m
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.reports import write_json
 from pimper_torch.records import Cameras, Mesh, Views
 
 
@@ -58,8 +58,7 @@ def write_transforms(
         faces = torch.zeros(0, 3, dtype=torch.long)
         points = Mesh(vertices_world=points_world, faces=faces, albedo=albedo)
         write_ply(points, folder / "sparse_pc.ply")
-    text = json.dumps({**whole, "frames": frames}, indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / "transforms.json").write_text(text + "\n", encoding="utf-8")
+    write_json({**whole, "frames": frames}, folder / "transforms.json")
 
 
 def write_nerfstudio(result: Result, folder: Path) -> None:

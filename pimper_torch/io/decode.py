@@ -114,7 +114,6 @@ def read_header(path: Path | str) -> Header:
             channels=1 if grey else 3,
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
-            significant=_significant(png),
             transparent=_transparent(png) if sixteen else (),
             colour=_colour(image, exif, png),
             cautions=(*cautions, *[CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
@@ -224,11 +223,6 @@ def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:
     return 1, [f"has an EXIF orientation of {found!r:.20}, not of 1 to 8; it is taken as upright"]
 
 
-def _significant(png: PngHead | None) -> int:
-    told = b"" if png is None else png.chunks.get(b"sBIT", b"")
-    return min((*told, 16)) if all(8 < one <= 16 for one in told) else 16
-
-
 def _transparent(png: PngHead | None) -> tuple[int, ...]:
     told = b"" if png is None else png.chunks.get(b"tRNS", b"")
     levels = zip(told[::2], told[1::2], strict=False)
@@ -236,22 +230,9 @@ def _transparent(png: PngHead | None) -> tuple[int, ...]:
 
 
 def _full_scale(array: np.ndarray, header: Header) -> int:
-    """Return the level of full scale, as the file says unless its samples contradict it.
-
-    PNG wants samples of fewer bits shifted up, and filled with zeros or their own highest bits.
-    Those that end where the fewer bits do, and are neither, were not.
-    """
+    """Return the level of full scale, as the file says unless its samples contradict it."""
     most = _FULL_SCALE[array.dtype]
-    if array.dtype != np.uint16:
-        return most
-    highest, bits = int(array.max()), header.significant
-    if highest <= header.full < most:
-        return header.full
-    if bits == 16 or highest >= 2**bits:
-        return most
-    shifted = array >> (16 - bits) << (16 - bits)
-    filled = shifted | (shifted >> bits)
-    return most if bool((array == shifted).all() or (array == filled).all()) else 2**bits - 1
+    return header.full if array.dtype == np.uint16 and int(array.max()) <= header.full else most
 
 
 def _colour(image: Image.Image, exif: Image.Exif, png: PngHead | None) -> Colour:

@@ -106,9 +106,8 @@ class Header(Record):
         focal: See :mod:`pimper_torch.io.header`.
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
-        full: Level that is full scale, 255 or 65535, or less of 16 bits where a TIFF says so.
+        full: Level that is full scale, 255 or 65535, or less where a TIFF has other bits.
         full_told: The file itself says what its full scale is.
-        significant: Bits of 16 that a PNG says are no filling; 16 where it is silent.
         transparent: Levels of the one colour of 16 bits that a PNG calls transparent.
         cautions: What it says and is not followed, each a sentence without its subject.
         layout: Of a TIFF; ``None`` for other files.
@@ -122,7 +121,6 @@ class Header(Record):
     deep: bool
     full: int = 255
     full_told: bool = False
-    significant: int = 16
     transparent: tuple[int, ...] = ()
     colour: Colour = SILENT
     cautions: tuple[str, ...] = ()

@@ -1,8 +1,10 @@
 """Results of a run in numbers: lights and the summary, ready for JSON."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +16,12 @@ from pimper_torch.records import Failure, Reconstruction
 
 # What JSON can hold.
 Report = dict[str, object]
+
+
+def write_json(report: Mapping[str, object], path: Path, indent: int | None = 2) -> None:
+    """Write numbers and texts, none of which may be NaN or infinite."""
+    text = json.dumps(report, indent=indent, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def lights_report(result: Reconstruction) -> Report:

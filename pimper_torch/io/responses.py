@@ -44,15 +44,9 @@ def read_curve(path: Path | str) -> Curve:
     and blue; or two or four, of which the first is the level. Levels go from 0 to 1 (shares
     of full scale), to 255 (files of 8 bits), or to more (of 16). Radiance is in any unit.
 
-    ========  =====================================================================
-    file      table
-    ========  =====================================================================
-    `.csv`    rows of numbers; a first row of names is passed over
-    `.json`   ``{"radiance": [...]}`` or three lists for the colours, and, if levels
-              are given, ``"levels": [...]``
-    `.npy`    rows as above, such as OpenCV's ``CalibrateDebevec`` gives with its
-              colours turned round to red, green, blue
-    ========  =====================================================================
+    ``.csv`` has rows of numbers, a first row of names is passed over; ``.npy`` rows, such as
+    OpenCV's ``CalibrateDebevec`` gives with its colours turned round; ``.json`` is
+    ``{"radiance": [...]}``, or three lists for the colours, and, if given, ``"levels": [...]``.
 
     Raises:
         InputError: No such file, one of another kind, no table of numbers, or no curve:

@@ -1,6 +1,5 @@
 """Results to a folder."""
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.estimates import mask_path
 from pimper_torch.io.finish import Finished, MeshFiles, finished
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
-from pimper_torch.io.reports import lights_report, summary_report
+from pimper_torch.io.reports import lights_report, summary_report, write_json
 from pimper_torch.mapped import each
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
@@ -122,7 +121,7 @@ def write_result(
             "asset": asset.summary,
             "relighting": relighting.report(),
         }
-        _write_json(summary, staging / "summary.json", indent=2)
+        write_json(summary, staging / "summary.json")
         with part(7, _PARTS):
             if report:
                 write_page(
@@ -165,7 +164,7 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
         _write_masks(result.silhouettes, result.scene, folder / "masks")
     with part(4, _PARTS):
         _write_maps(result, folder)
-    _write_json(lights_report(result), folder / "lights.json")
+    write_json(lights_report(result), folder / "lights.json", indent=None)
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     with part(5, _PARTS):
         draw_overview(result, folder / "overview.png")
@@ -213,11 +212,6 @@ def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
 def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Path) -> None:
     array = picture.detach().to(torch.uint8).numpy()
     Image.fromarray(array[..., 0] if array.shape[-1] == 1 else array).save(path)
-
-
-def _write_json(report: Mapping[str, object], path: Path, indent: int | None = None) -> None:
-    text = json.dumps(report, indent=indent, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _array(values: Float[Tensor, "*batch"]) -> np.ndarray:

@@ -14,7 +14,7 @@ from pimper_torch.errors import InputError
 
 Opacity = Literal["none", "alpha", "premultiplied", "unknown"]
 
-_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _MAX_VALUE = 254, 255, 258, 262, 281
+_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC = 254, 255, 258, 262
 _SUB_IFDS, _EXTRA, _FORMAT = 330, 338, 339
 _REDUCED, _MASK = 1, 4  # bits of the subfile's type
 _WHITE_IS_ZERO, _GRAY, _RGB, _PALETTE, _CMYK = 0, 1, 2, 3, 5
@@ -96,7 +96,7 @@ def layout_of(path: Path | str, image: TiffImagePlugin.TiffImageFile) -> Layout:
         deep=len(bits) > 1 and max(bits) > 8,
         inverted=photometric == _WHITE_IS_ZERO and max(bits) > 8,
         opacity=opacity,
-        full=_full(tags, max(bits)),
+        full=2 ** max(8, min(16, int(max(bits)))) - 1,
         cautions=tuple(cautions),
     )
 
@@ -136,19 +136,6 @@ def _refuse_thumbnail(path: Path, image: TiffImagePlugin.TiffImageFile) -> None:
         tags.get(_SUBFILE, 0) & _REDUCED and _SUB_IFDS in tags
     ):
         raise InputError(f"{path}: {_RAW}")
-
-
-def _full(tags: Mapping[int, Any], bits: int) -> int:
-    """Return full scale: less than the samples' bits have where MaxSampleValue says so.
-
-    It may be a mere statistic of the picture; what is 2 to some power minus 1 is none.
-    """
-    full = 2 ** max(8, min(16, int(bits))) - 1
-    told = tags.get(_MAX_VALUE)
-    told = told[0] if isinstance(told, tuple) and told else told
-    if bits == 16 and isinstance(told, int) and 255 < told < full and told & (told + 1) == 0:
-        return told
-    return full
 
 
 def read_deep_tiff(path: Path | str, layout: Layout) -> np.ndarray:

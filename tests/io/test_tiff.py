@@ -155,39 +155,6 @@ def test_lab_of_eight_bits_is_the_colour_that_it_says(tmp_path, pixels):
     assert_close(decode(tmp_path / "a.tif").samples, wanted, rtol=0, atol=0.02)  # 8 bits of a, b
 
 
-def test_full_scale_of_twelve_bits_is_obeyed_where_a_file_says_so(tmp_path, pixels):
-    levels = pixels.astype(np.uint16) * 16
-    levels[0, 0] = 4095
-    for index in range(3):
-        path = tmp_path / f"{index}.tif"
-        tag = [(281, "H", 3, (4095,) * 3, True)]
-        tifffile.imwrite(path, levels, photometric="rgb", extratags=tag)
-    assert decode(path).full == 4095
-    wanted = torch.from_numpy(levels / 4095).movedim(-1, 0)
-    found = load_views(tmp_path, encoding=Encoding(response="linear")).images[0]
-    assert_close(found.double(), wanted, rtol=0, atol=1e-6)
-    assert_close(  # a level of the file is one of its own
-        load_views(tmp_path, encoding=Encoding(response="linear", saturation=2000.0)).images[0],
-        (wanted * 4095 / 2000).clamp(max=1).float(),
-    )
-    with pytest.raises(InputError, match="holds 12 bits, levels 0 to 4095, but a level of 5000"):
-        load_views(tmp_path, encoding=Encoding(saturation=5000.0))
-    curve = np.arange(4096.0)
-    np.save(tmp_path / "curve.npy", curve**1.5)
-    found = load_views(tmp_path, encoding=Encoding(response=tmp_path / "curve.npy")).images[0]
-    assert_close(found.double(), wanted**1.5, rtol=0, atol=1e-5)
-
-
-def test_a_statement_on_full_scale_that_samples_exceed_is_not_believed(tmp_path, pixels):
-    tag = [(281, "H", 3, (4095,) * 3, True)]
-    array = pixels.astype(np.uint16) * 257
-    tifffile.imwrite(tmp_path / "a.tif", array, photometric="rgb", extratags=tag)
-    assert_close(decode(tmp_path / "a.tif").samples, planes(pixels), rtol=0, atol=1e-6)
-    tag = [(281, "H", 3, (60000,) * 3, True)]  # a statistic
-    tifffile.imwrite(tmp_path / "a.tif", array // 2, photometric="rgb", extratags=tag)
-    assert_close(decode(tmp_path / "a.tif").full, 65535)
-
-
 @pytest.mark.parametrize("bits", [10, 14])
 def test_sixteen_bits_that_hold_fewer_are_warned_of(tmp_path, pixels, write_png16, bits):
     levels = (pixels.astype(np.uint16) * 257) >> (16 - bits)
@@ -200,21 +167,6 @@ def test_sixteen_bits_that_hold_fewer_are_warned_of(tmp_path, pixels, write_png1
     found = load_views(tmp_path, encoding=given).images[0]
     assert_close(found.double(), torch.from_numpy(levels / (2**bits - 1)).movedim(-1, 0))
     load_views(tmp_path, encoding=LINEAR)  # full scale is insisted on
-
-
-def test_png_that_says_how_many_bits_are_meant(tmp_path, pixels, write_png16):
-    low = (pixels.astype(np.uint16) * 257) >> 4
-    for name, levels, full in (
-        ("low", low, 4095),  # as a careless program leaves them
-        ("shifted", low << 4, 65535),  # as PNG wants them
-        ("filled", low << 4 | low >> 8, 65535),
-        ("dark", (low >> 5) << 4, 65535),
-    ):
-        path = tmp_path / f"{name}.png"
-        write_png16(path, levels)
-        data = path.read_bytes()
-        path.write_bytes(data[:33] + chunk(b"sBIT", bytes([12] * 3)) + data[33:])
-        assert decode(path).full == full, name
 
 
 @pytest.mark.parametrize("channels", [1, 3])
