@@ -170,7 +170,8 @@ class _Driver:
                 one = self._running.pop(future)
                 self._end(one, _outcome(future, one))
             for future, one in [*self._running.items()]:
-                if one.began is not None and time.monotonic() - one.began > _limit(one.task):
+                limit = one.task.limit_s + _SILENCE_SECONDS
+                if one.began is not None and time.monotonic() - one.began > limit:
                     del self._running[future]
                     future.cancel()
                     told = (
@@ -237,10 +238,6 @@ class _Driver:
             avoid = (*one.task.avoid, outcome.place)
             self._waiting.append((replace(one.task, avoid=avoid), one.number + 1))
         self.settle(replace(outcome, stage=one.stage, tries=one.number), again)
-
-
-def _limit(task: Task) -> float:
-    return task.limit_s + _SILENCE_SECONDS
 
 
 def _outcome(future: Future[Outcome], one: _Try) -> Outcome:

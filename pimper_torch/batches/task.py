@@ -144,7 +144,9 @@ def _result(task: Task, place: str, latest: float) -> tuple[Status, str]:
         if not (key.exists() and key.read_text(encoding="utf-8") == task.key):
             key.write_text(task.key, encoding="utf-8")
         child = _start(task, log)
-        _note(log, event="try", place=place, host=node(), process=child.pid)
+        begins = {"event": "try", "place": place, "host": node(), "process": child.pid}
+        log.write(json.dumps(begins).encode() + b"\n")
+        log.flush()
         try:
             reason = _wait(task, child, latest)
         finally:
@@ -245,8 +247,3 @@ def _is_ours(lock: Path, log: IO[bytes]) -> bool:
             holder.startswith(f"process {one['process']} on {one['host']} ") for one in tries
         )
     return False
-
-
-def _note(log: IO[bytes], **event: object) -> None:
-    log.write(json.dumps(event).encode() + b"\n")
-    log.flush()

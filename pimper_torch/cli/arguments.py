@@ -223,7 +223,7 @@ def page(
 ) -> str:
     """Write the help of a command: of what :func:`read_arguments` reads, or of ``everything``."""
     options = list(options_of(command, "," if levels else " "))
-    shown = [one for one in options if everything or not _hidden(one, rare)]
+    shown = [one for one in options if everything or not (one.is_setting or one.names[-1] in rare)]
     needed = [one for one in options if one.default is REQUIRED or one.names[0][0] != "-"]
     usage = " ".join(f"{one.names[0]} {_value(one, 0)}".strip() for one in needed)
     width = min(shutil.get_terminal_size().columns, _WIDEST)
@@ -239,10 +239,6 @@ def page(
         hidden = len(options) - len(shown)
         lines.append(f"  --help-all              This page with {hidden} more options.")
     return "\n".join(lines) + "\n"
-
-
-def _hidden(option: Option, rare: Collection[str]) -> bool:
-    return option.is_setting or option.names[-1] in rare
 
 
 def _entry(option: Option, width: int) -> list[str]:

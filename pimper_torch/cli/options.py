@@ -12,7 +12,6 @@ import tyro
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
-from pimper_torch.cli.lengths import CameraDistances, Markers, Places, ScaleBars
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import presets, require
 from pimper_torch.errors import ConfigError, InputError
@@ -22,8 +21,65 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.files import require_name
 from pimper_torch.outputs.folders import prepare_output, require_apart
 from pimper_torch.priors.from_maps import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
-from pimper_torch.size.given import Unit, measured_in, number_of
+from pimper_torch.size.given import CameraDistance, Mark, ScaleBar, Unit, measured_in, number_of
 from pimper_torch.viewer.server import require_viser
+
+
+def _number(word: str, option: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ConfigError(f"{option}: the length is {word!r}; needed: a number.") from None
+
+
+def _bar(words: list[str]) -> ScaleBar:
+    first, second, length = words
+    return ScaleBar(
+        first=Mark.read(first), second=Mark.read(second), length=_number(length, "--scale-bar")
+    )
+
+
+def _distance(words: list[str]) -> CameraDistance:
+    first, second, length = words
+    return CameraDistance(first=first, second=second, length=_number(length, "--camera-distance"))
+
+
+_Place = Annotated[
+    Mark,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME,x,y",
+        instance_from_str=lambda words: Mark.read(words[0]),
+        is_instance=lambda one: isinstance(one, Mark),
+        str_from_instance=lambda one: [str(one)],
+    ),
+]
+Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar="NAME,x,y")]
+
+
+def _three_words(read: Any, kind: type) -> Any:  # noqa: ANN401 - of tyro's marks
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=3,
+        metavar="A B LENGTH",
+        instance_from_str=read,
+        is_instance=lambda one: isinstance(one, kind),
+        str_from_instance=lambda one: [str(one.first), str(one.second), str(one.length)],
+    )
+
+
+_Bar = Annotated[ScaleBar, _three_words(_bar, ScaleBar)]
+_Distance = Annotated[CameraDistance, _three_words(_distance, CameraDistance)]
+
+ScaleBars = Annotated[
+    tyro.conf.UseAppendAction[tuple[_Bar, ...]],
+    tyro.conf.arg(metavar="A,x,y B,x,y LENGTH"),
+]
+CameraDistances = Annotated[
+    tyro.conf.UseAppendAction[tuple[_Distance, ...]],
+    tyro.conf.arg(metavar="A B LENGTH"),
+]
+Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
+
 
 # The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
 MAX_KEPT = "8GB"

@@ -77,8 +77,15 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
             )
         ],
         "poses": [
-            {"poseId": str(index), "pose": {"transform": _placed(*one), "locked": "1"}}
-            for index, one in enumerate(
+            {
+                "poseId": str(index),
+                "pose": {
+                    # Column by column.
+                    "transform": {"rotation": _texts(turn.T.flatten()), "center": _texts(center)},
+                    "locked": "1",
+                },
+            }
+            for index, (turn, center) in enumerate(
                 zip(cameras.cam_from_world[:, :3, :3], cameras.centers_world, strict=True), start=1
             )
         ],
@@ -113,11 +120,6 @@ def _intrinsic(
         "undistortionType": "none",
         "locked": "true",
     }
-
-
-def _placed(rotation: Float[Tensor, "3 3"], center: Float[Tensor, "3"]) -> dict[str, list[str]]:
-    """Return a pose: ``cam_from_world``'s rotation column by column, and the camera's place."""
-    return {"rotation": _texts(rotation.T.flatten()), "center": _texts(center)}
 
 
 def _texts(values: Float[Tensor, " value"]) -> list[str]:

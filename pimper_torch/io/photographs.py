@@ -89,7 +89,12 @@ def load_views(
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     paths = list_images(Path(folder))
-    _check_count(Path(folder), paths)
+    if len(paths) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
+            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another viewpoint "
+            "under another light."
+        )
     _tell_passed_over(Path(folder), paths)
     headers = [read_header(path) for path in paths]
     tell_cautions(Path(folder), paths, headers, encoding)
@@ -128,7 +133,7 @@ def load_views(
         focals_px=shrunk_focals(headers, sizes),
         orientations=torch.tensor([header.orientation for header in headers]),
         poses=_poses(paths, Path(folder)),
-        folder=_named_path(folder),
+        folder=Path(os.path.abspath(folder)).as_posix(),  # noqa: PTH100 - follows no links
     )
 
 
@@ -149,11 +154,6 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
 def image_name(path: Path | str, folder: Path | str) -> str:
     """Return the name of an image of a folder, with the folder inside that it lies in."""
     return Path(path).relative_to(folder).as_posix()
-
-
-def _named_path(folder: Path | str) -> str:
-    """Return the whole path under the name that was given: links are not followed."""
-    return Path(os.path.abspath(folder)).as_posix()  # noqa: PTH100 - `resolve` follows links
 
 
 def list_images(folder: Path | str) -> list[Path]:
@@ -180,7 +180,9 @@ def list_images(folder: Path | str) -> list[Path]:
         if len(inside) >= MIN_PHOTOGRAPHS:
             paths = [image for one in inside for image in _readable(_visible(one))]
     if not paths:
-        _refuse_absent(entries)
+        for path in sorted(entries):
+            if path.is_file() and (extra := extra_of(path)):
+                load_extra(extra, path)  # refuses what needs a package that is absent
         _refuse_video(entries)
         content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
         raise InputError(
@@ -222,13 +224,6 @@ def _readable(entries: Sequence[Path]) -> list[Path]:
         best = max(min(twins.values()), _RANKS[""] if developed else 0)
         chosen += [path for path, rank in twins.items() if rank == best]
     return chosen
-
-
-def _refuse_absent(entries: Sequence[Path]) -> None:
-    """Name the package that a folder of nothing but HEIC or camera raw needs."""
-    for path in sorted(entries):
-        if path.is_file() and (extra := extra_of(path)):
-            load_extra(extra, path)
 
 
 def _refuse_video(entries: Sequence[Path]) -> None:
@@ -307,15 +302,6 @@ def _tell_alpha(
         "them without transparency, or give masks by `--masks`.",
         stacklevel=3,
     )
-
-
-def _check_count(folder: Path, paths: list[Path]) -> None:
-    if len(paths) < MIN_PHOTOGRAPHS:
-        raise InputError(
-            f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
-            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another viewpoint "
-            "under another light."
-        )
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

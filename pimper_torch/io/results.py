@@ -10,7 +10,6 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from pimper_torch.asset.bake import Textured
 from pimper_torch.asset.make import few_enough, textured
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.config import to_yaml
@@ -24,7 +23,7 @@ from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
-from pimper_torch.relighting.held_out import Relighting, relight
+from pimper_torch.relighting.held_out import relight
 from pimper_torch.report.page import asset_within, write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.report.vertex_layers import surface_layers
@@ -111,7 +110,11 @@ def write_result(
             write_asset(asset, staging / "asset.glb", whole.scene.offset_world)
             if "obj" in (files or MeshFiles()).formats:
                 write_asset_obj(asset, staging / "asset.obj", whole.scene.offset_world)
-            relighting = _with_textures(relighting, asset, whole)
+            # By the photographs that the mesh was judged by.
+            held_out, silhouettes = whole.held_out, whole.silhouettes
+            relighting = relighting.with_textures(
+                asset, held_out or whole.scene, None if held_out else silhouettes
+            )
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
@@ -137,13 +140,6 @@ def write_result(
                     summary=summary,
                     settings=(staging / "config.yaml").read_text(encoding="utf-8"),
                 )
-
-
-def _with_textures(relighting: Relighting, asset: Textured, result: Reconstruction) -> Relighting:
-    """Judge the asset by the photographs that the mesh was judged by."""
-    if result.held_out is not None:
-        return relighting.with_textures(asset, result.held_out, None)
-    return relighting.with_textures(asset, result.scene, result.silhouettes)
 
 
 def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:

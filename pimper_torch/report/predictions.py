@@ -97,14 +97,12 @@ def view_entries(
         if silhouettes.source != "everything":
             small = shrunk(silhouettes.inside[view, :height, :width][None], longest)[0]
             entry["outline"] = outline(small, width / small.shape[1])
-        entries.append(entry | ({} if predicted is None else _prediction(predicted, longest)))
+        if predicted is not None:
+            entry |= {"light": _light(predicted.light), "figure": predicted.figure}
+            entry["prediction"] = jpeg(shrunk(predicted.radiance, longest))
+        entries.append(entry)
         drop_pages()
     return entries
-
-
-def _prediction(predicted: Prediction, longest: int) -> Json:
-    picture = jpeg(shrunk(predicted.radiance, longest))
-    return {"light": _light(predicted.light), "prediction": picture, "figure": predicted.figure}
 
 
 def _light(light: ViewLights) -> Json:

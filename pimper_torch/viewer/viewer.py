@@ -107,9 +107,11 @@ class Viewer:
     def _add_camera(
         self, view: int, name: str, cameras: Cameras, picture: np.ndarray | None
     ) -> None:
+        from viser.transforms import SO3
+
         assert self._frame is not None
         stand = self._stands[name] = stand_of(cameras, view, self._frame)
-        wxyz, position = _quaternion(stand), stand.position.numpy()
+        wxyz, position = SO3.from_matrix(stand.rotation.numpy()).wxyz, stand.position.numpy()
         (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[view].tolist()
         width, height = cameras.sizes_px[view].tolist()
         depth = min(_DEEPEST, _SIDE / max(width / fx, height / fy))
@@ -273,12 +275,6 @@ class Viewer:
         self._sun.position = tuple(10 * one for one in direction)  # it shines on the origin
         self._sun.intensity = _BRIGHTNESS * (1 - self._ambient.value)
         self._sky.intensity = _BRIGHTNESS * self._ambient.value
-
-
-def _quaternion(stand: Stand) -> np.ndarray:
-    from viser.transforms import SO3
-
-    return SO3.from_matrix(stand.rotation.numpy()).wxyz
 
 
 def _stand_at(camera: Any, stand: Stand) -> None:  # noqa: ANN401 - a page's, or of new pages
