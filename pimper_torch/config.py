@@ -84,7 +84,6 @@ def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Confi
     unions, and dataclasses of these. Inverse of :func:`to_mapping`.
 
     Args:
-        mapping: Keys are names of fields.
         where: What the mapping is, for messages; a file's name for instance.
 
     Raises:

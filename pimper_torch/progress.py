@@ -39,9 +39,6 @@ def part(place: int, count: int) -> Iterator[None]:
     """Let what is reported inside the ``with`` block fill one of ``count`` equal parts.
 
     Parts nest, so that a stage of several steps, which report by themselves, has one bar.
-
-    Args:
-        place: Of the part, from 0.
     """
     whole = current().progress
 

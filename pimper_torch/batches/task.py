@@ -53,7 +53,6 @@ class Task:
         arguments: Of ``pimper reconstruct``, with absolute paths.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
-        token: Of this try.
         avoid: Workers on which earlier tries were lost.
     """
 

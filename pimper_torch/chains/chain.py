@@ -133,11 +133,7 @@ class Chain(Stage):
         sparse_model: Path | str | None,
         mesh: Mesh | None,
     ) -> Iterator[Step]:
-        """Run the stages up to the surface; yield each pass's records, without reports.
-
-        Args:
-            run: Calls the stages.
-        """
+        """Run the stages up to the surface; yield each pass's records, without reports."""
 
     def running(self) -> Running:
         """Return how stages are called in a run."""
@@ -162,9 +158,6 @@ class Chain(Stage):
 
         Views that cannot be used are left out; priors become those of undistorted views. A scene
         without observed points gets some, unless a mesh stands in for them.
-
-        Raises:
-            InputError: Cameras come twice.
         """
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)

@@ -57,7 +57,6 @@ def held_apart(
     """Divide a scene into views that are used, and every n-th by name that is held out.
 
     Args:
-        every: Which; 0 for none.
         needed: Names, with their suffix or without, of views that are used in any case.
 
     Returns:

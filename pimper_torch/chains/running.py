@@ -53,7 +53,6 @@ class Running:
     is not known, and so is one that gradients are asked of.
 
     Attributes:
-        names: Of the stages.
         store: Where records are kept; nowhere without.
         put_off: Stages whose records are made when another one asks for them: all samples of all
             views take more memory than there is.

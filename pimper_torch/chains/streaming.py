@@ -108,9 +108,6 @@ def photometry_and_heights(
     that light is fitted to; a factorization that is not :class:`InParts` is called so.
 
     Args:
-        warp: Resamples views on some buckets.
-        factorize: Separates albedo, normals and light.
-        sweep: Finds heights under that light.
         sources: The photographs as the warp prepares them, and the surface that occludes.
 
     Differentiable as the stages are.
@@ -162,11 +159,7 @@ def photometry_and_heights(
 
 
 def warn_of_priors(told: Mapping[str, int | float]) -> None:
-    """Warn of priors that are far from what the photographs tell.
-
-    Args:
-        told: Figures of the swept patches.
-    """
+    """Warn of priors that are far from what the photographs tell."""
     for what in ("normals", "depths"):
         over = told.get(f"prior_{what}_over_claim", 0.0)
         if over > 3:

@@ -63,7 +63,6 @@ def options_of(
 
     Args:
         command: Whose parameters are options; or settings, whose fields are.
-        between: What stands between several values.
         path: Of settings: what stands before a field's name.
     """
     said = meanings(type(command) if _is_settings(command) else command)
@@ -186,7 +185,6 @@ def read_arguments(
 
     Args:
         command: Its parameters are the options; its docstring is their help.
-        name: After ``pimper``.
         levels: Several numbers are one word, such as 15000,15100,14900.
         rare: Options that ``--help`` leaves to ``--help-all``, as it leaves settings of stages.
 

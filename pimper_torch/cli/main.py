@@ -262,7 +262,6 @@ def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
 
     Raises:
         PimperError: What ``checked`` of the command's module raises.
-        SystemExit: ``--help`` was answered.
     """
     if "torch" in sys.modules:
         return

@@ -225,7 +225,6 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
 
     Raises:
         ConfigError: No such preset, unknown or wrong arguments, or an impossible setting.
-        SystemExit: ``--help`` was answered.
     """
     name = _preset(arguments)
     _refuse_others(command, arguments, name)

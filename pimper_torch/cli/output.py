@@ -44,7 +44,6 @@ class Output:
     - ``error``: ``kind``, ``message``, ``exit_code``; it is the last one then.
 
     Attributes:
-        as_json: Events instead of sentences.
         level: What is told on standard error: errors alone, warnings too, stages too (info), or
             all figures of stages and tracebacks too (debug).
     """

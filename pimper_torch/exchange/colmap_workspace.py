@@ -38,7 +38,6 @@ def write_colmap(
 
     Raises:
         InputError: A camera has a skew, which COLMAP's pinhole cannot have.
-        OutputError: The model cannot be written.
     """
     folder = Path(folder)
     refuse_skew(cameras, views.names, "a COLMAP model")

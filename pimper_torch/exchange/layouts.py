@@ -91,7 +91,6 @@ def write_formats(
     """Write a result in some layouts, each in a folder of its name.
 
     Args:
-        folder: Holds none of them.
         axes: That normals of ``maps`` have.
 
     Raises:

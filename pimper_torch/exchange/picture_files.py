@@ -60,11 +60,7 @@ def file_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
-    """Refuse cameras whose pixels are sheared noticeably, for formats that cannot represent it.
-
-    Raises:
-        InputError: Names the photographs.
-    """
+    """Refuse cameras whose pixels are sheared noticeably, for formats that cannot represent it."""
     K = cameras.intrinsics.detach().cpu().double()
     height = cameras.sizes_px[:, 1].cpu().double()
     moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * height / 2

@@ -38,7 +38,6 @@ class Result(Record):
         silhouettes: As they were written, 0 or 1; without planes.
         lights_world: First-order light of every view; NaN where unknown, ``None`` where all are.
         reference: Name of the view that the pictures of the result show.
-        summary: ``summary.json``.
     """
 
     mesh: Mesh

@@ -59,7 +59,6 @@ class Decoded(Record):
         lossy: True for JPEG, whose samples ring round edges.
         full: Level of the file that is full scale, a sample of 1: 255, 65535, or what the file
             says.
-        full_told: The file itself says so.
         colour: What the file says about its samples.
     """
 

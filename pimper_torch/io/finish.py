@@ -19,7 +19,6 @@ class MeshFiles:
     Attributes:
         faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a
             sample's spacing and 1.5 degrees.
-        watertight: Borders are closed by caps.
         formats: Beside PLY and GLB, which are always written.
     """
 
@@ -39,7 +38,6 @@ class Finished(Record):
     Attributes:
         mesh: Without caps; what pictures show.
         closed: With caps, if it shall have some.
-        summary: What was done, for ``summary.json``.
     """
 
     mesh: Mesh

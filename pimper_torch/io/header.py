@@ -103,7 +103,6 @@ class Header(Record):
         width: Pixels, the right way up.
         height: Pixels, the right way up.
         orientation: EXIF's number, 1 to 8; 1 is upright.
-        focal: See :mod:`pimper_torch.io.header`.
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
         full: Level that is full scale, 255 or 65535, or less where a TIFF has other bits.

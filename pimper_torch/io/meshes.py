@@ -360,9 +360,6 @@ COLORS, RAW_COLORS = "COLOR_0", "_COLOR_0"
 def readable(path: Path, suffix: str) -> bytes:
     """Return a file's bytes so that trimesh reads all that they hold.
 
-    Args:
-        suffix: Of its name, lower case.
-
     Raises:
         InputError: It is cut short, or has values that trimesh passes over.
     """

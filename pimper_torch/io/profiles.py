@@ -285,7 +285,6 @@ def colour_of_codes(primaries: int, curve: int, source: str, *, narrow: bool = F
         primaries: 1 sRGB's, 9 BT.2020, 12 Display P3; 2 where they are not told.
         curve: 13 sRGB, 8 linear, 4 and 5 gamma 2.2 and 2.8, 1, 6, 14 and 15 BT.709; 2 where it
             is not told.
-        source: Where it stands, for messages.
         narrow: Samples are no RGB over the full range.
     """
     response: Response | None

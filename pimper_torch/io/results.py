@@ -87,9 +87,7 @@ def write_result(
     Args:
         config: The dataclass of settings that it ran with.
         folder: New or empty; its parents are made.
-        about: More for ``summary.json``.
         files: How many faces the mesh has, and in which formats.
-        report: Whether ``report.html`` is written.
 
     Raises:
         OutputError: The folder holds something else, or cannot be written.

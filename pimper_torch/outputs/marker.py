@@ -51,11 +51,7 @@ class FileList:
 
 
 def seal(folder: Path, kind: Kind) -> None:
-    """Bring a folder's files to the disk, and list them in its marker.
-
-    Raises:
-        OutputError: The list cannot be written.
-    """
+    """Bring a folder's files to the disk, and list them in its marker."""
     files = {}
     for path in _inside(folder):
         if path.is_file():

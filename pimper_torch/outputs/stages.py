@@ -52,7 +52,6 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
 
     Args:
         target: The folder, without links. It is made, and its parents are.
-        shown: As the user names it.
     """
     # Local: a refusal of arguments does not need it.
     from filelock import FileLock, Timeout

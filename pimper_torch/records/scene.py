@@ -135,8 +135,6 @@ class Mesh(Record):
     """Triangles; counter-clockwise seen from outside.
 
     Attributes:
-        vertices_world: In scene units.
-        faces: Indices of vertices.
         normals_world: Unit, outward, one a vertex.
         albedo: Linear, one a vertex, up to one scale for the whole mesh.
         confidence: In [0, 1], one a vertex: how well the photographs determine it.

@@ -57,7 +57,6 @@ def save_record(record: Record, path: str | Path) -> None:
     Raises:
         InputError: A field holds something else than records, tensors, tuples, lists, mappings,
             enums, paths, numbers, texts and ``None``.
-        OutputError: The file cannot be written.
     """
     path = Path(path)
     writer = _Writer()

@@ -43,7 +43,6 @@ def outline(inside: Float[Tensor, "height width"], scale: float) -> str:
     """Trace the border of a silhouette as a path of SVG.
 
     Args:
-        inside: Probability of the object.
         scale: Pixels of the photograph to one of ``inside``.
     """
     # Local: scipy's image functions take long to import.

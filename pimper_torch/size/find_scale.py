@@ -16,9 +16,6 @@ from pimper_torch.size.scale import Length, Scale, compare_with_units, fitted, m
 def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit = "mm") -> Scale:
     """Find the scale of a result from places that are known distances apart.
 
-    Args:
-        bars: One at least.
-
     Raises:
         InputError: A place cannot be found, see :func:`~pimper_torch.size.marks.place_of`.
     """
@@ -36,14 +33,7 @@ def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit =
 def scale_of_cameras(
     result: Reconstruction, distances: Sequence[CameraDistance], unit: Unit = "mm"
 ) -> Scale:
-    """Find the scale of a result from cameras that are known distances apart.
-
-    Args:
-        distances: One at least.
-
-    Raises:
-        InputError: A photograph has no camera.
-    """
+    """Find the scale of a result from cameras that are known distances apart."""
     centers = result.cameras.detach().to("cpu", torch.float64).centers_world
     lengths = []
     for one in distances:

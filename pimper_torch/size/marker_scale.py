@@ -103,9 +103,6 @@ def squares_of(image: Float[Tensor, "channel height width"]) -> list[Square]:
     """Find printed markers in a photograph, their corners to a small fraction of a pixel.
 
     Markers on paper that is saturated are left out: there black squares look smaller.
-
-    Args:
-        image: Linear radiance.
     """
     picture = image.mean(dim=0)
     found = find_squares(to_bytes(picture))

@@ -64,9 +64,6 @@ def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
     r"""Find the factor by least squares, :math:`\min_f \sum (f d - L)^2`.
 
     Lengths that contradict one another by more than :data:`AGREEING` are warned of.
-
-    Args:
-        lengths: One at least.
     """
     for length in lengths:
         if not (length.found > 0 and length.known > 0):

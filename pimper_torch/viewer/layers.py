@@ -44,8 +44,6 @@ def painted(mesh: Mesh, name: str, frame: Frame, unit: str = "scene units") -> L
     """Colour a mesh.
 
     Args:
-        mesh: On the CPU.
-        name: One of :func:`layers_of`.
         frame: In which normals have colours.
     """
     own = vertex_normals(mesh.vertices_world, mesh.faces)

@@ -147,9 +147,6 @@ class Viewer:
 
         Args:
             mesh: In the world of the cameras.
-
-        Raises:
-            InputError: It has no faces.
         """
         if not len(mesh.faces):
             raise InputError(

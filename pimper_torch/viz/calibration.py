@@ -18,7 +18,6 @@ def draw_calibration(
 
     Args:
         robust: The same, blind to outliers.
-        path: PNG file.
     """
     # Local, so that importing the package does not load matplotlib; Figure without pyplot
     # leaves no global state behind.

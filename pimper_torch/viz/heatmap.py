@@ -164,8 +164,6 @@ def draw_heatmap(
 
     Args:
         error: Of every pixel of a view, see the head of this file.
-        scale: Colours and their unit.
-        path: Ends in ``.png``.
         shading: The surface in that view, see :func:`shading_in_view`.
     """
     rows, columns = crop_to(~error.isnan())
@@ -182,7 +180,6 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
 
     Args:
         rows: At least one; a method that is missing in one leaves its place empty there.
-        path: Ends in ``.png``.
     """
     if not rows:
         raise InputError("there is no scene to draw; needed: one or more.")

@@ -32,7 +32,6 @@ def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -
 
     Raises:
         ConfigError: A side of which there are no markers.
-        OSError: The file cannot be written.
     """
     figure = draw_sheet(side_mm, paper)
     figure.savefig(path, format="pdf", metadata={"CreationDate": None, "Title": TITLE})

@@ -48,10 +48,6 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PAN
     and that again from 40 degrees to the left and to the right. Where silhouettes are known they
     are drawn over the photograph, and below over small photographs of all views, or of 64 where
     there are more, red where a view is not trusted.
-
-    Args:
-        path: Ends in ``.png``.
-        panel_px: Width of a rendered picture.
     """
     shown = tiles(result, panel_px)
     rows = [shown[first : first + _ACROSS] for first in range(0, len(shown), _ACROSS)]
@@ -168,7 +164,6 @@ def thumbnails(
     """Tile small photographs of some views, each with its silhouette as a line of one pixel.
 
     Args:
-        views: Linear radiance.
         silhouettes: Of the same views. Lines are yellow, and red where a view is not trusted.
         shown: Views, in the order of the tiles.
 

@@ -78,11 +78,7 @@ def fitted(picture: Picture, room_px: int) -> Picture:
 
 
 def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: str) -> Picture:
-    """Draw the sides of triangles over a picture.
-
-    Args:
-        corners: Pixels.
-    """
+    """Draw the sides of triangles over a picture."""
     large = _image(picture)
     large = large.resize((2 * large.width, 2 * large.height))  # lines are smooth
     draw = ImageDraw.Draw(large)

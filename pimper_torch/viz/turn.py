@@ -47,7 +47,6 @@ def draw_turn(
     Args:
         cameras: Of the photographs, which tell where up is.
         reference: View whose side of the surface is seen first.
-        path: Ends in ``.webp``.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
     caster = RayCaster(mesh.vertices_world, mesh.faces)
