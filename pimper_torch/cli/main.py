@@ -32,41 +32,27 @@ from pimper_torch.errors import InputError, PimperError, PimperWarning
 from pimper_torch.outputs.files import require_name
 
 _HELP = """\
-usage: pimper reconstruct PHOTOS -o OUT [options]
-       pimper batch LIST -o OUT [options] [-- options of reconstruct]
-       pimper doctor [PHOTOS] [options]
-       pimper demo [-o OUT] [options]
-       pimper config [NAME] [options]
-       pimper render SCENE -o OUT [options]
-       pimper export RESULT -o OUT --format FORMAT [options]
-       pimper evaluate RESULT TRUTH [options]
-       pimper bench [-o OUT] [options]
-       pimper convert DATA -o OUT --source KIND --target KIND [options]
-       pimper gamma PHOTOS [options]
-       pimper view OUT [options]
-       pimper frames VIDEO -o OUT [options]
-       pimper markers -o SHEET [options]
-       pimper clean OUT
+usage: pimper COMMAND [options]
        pimper --version
 
 Photographs from many viewpoints under many unknown lights, to a dense surface with normals,
 albedo and light.
 
-  reconstruct   a folder of photographs
-  batch         many objects, on this machine or on an engine
-  doctor        what is installed here, and what photographs are worth, before a run
-  demo          the photographs of a skull that come with the package
-  config        the settings of a preset and what they mean, or one of them
-  render        photographs of a scene with known truth
-  export        a result in the layouts of other programs
-  evaluate      a result against the truth
-  bench         the table: scenes, presets and baselines
-  convert       a data set of another layout, or to one
-  gamma         the response of photographs from a fixed camera under several lights
-  view          a result in the browser, to turn and to light
-  frames        photographs out of a video: sharp frames, equally far apart on the way
-  markers       a sheet to print and to photograph with an object, which tells its size
-  clean         what runs into a folder kept to go on from, and what killed runs left
+  reconstruct PHOTOS -o OUT  a folder of photographs
+  batch LIST -o OUT          many objects, on this machine or on an engine
+  doctor [PHOTOS]            what is installed here, and what photographs are worth, before a run
+  demo                       the photographs of a skull that come with the package
+  config [NAME]              the settings of a preset and what they mean, or one of them
+  render SCENE -o OUT        photographs of a scene with known truth
+  export RESULT -o OUT       a result in the layouts of other programs
+  evaluate RESULT TRUTH      a result against the truth
+  bench                      the table: scenes, presets and baselines
+  convert DATA -o OUT        a data set of another layout, or to one
+  gamma PHOTOS               the response of photographs from a fixed camera under several lights
+  view OUT                   a result in the browser, to turn and to light
+  frames VIDEO -o OUT        photographs out of a video: sharp frames, equally far apart on the way
+  markers -o SHEET           a sheet to print and to photograph with an object, which tells its size
+  clean OUT                  what runs into a folder kept to go on from, and what killed runs left
 
 `pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
 

@@ -257,8 +257,8 @@ def test_warnings_are_sentences(photos, chain, tmp_path, capsys, monkeypatch):
 def test_help_names_the_commands_and_version_the_version(capsys):
     assert run("--help") == 0
     told = capsys.readouterr().out
-    assert "pimper reconstruct PHOTOS" in told
-    assert "pimper demo" in told
+    assert "reconstruct PHOTOS -o OUT" in told
+    assert "\n  demo " in told
     assert "130 interrupted" in told
     assert run("--version") == 0
     lines = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
