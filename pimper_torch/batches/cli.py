@@ -1,6 +1,5 @@
 """``pimper batch``: many objects, on this machine or on an engine."""
 
-import types
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -92,12 +91,7 @@ class Lines:
         self._progress.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def progressed(self, name: str, event: Mapping[str, Any]) -> None:

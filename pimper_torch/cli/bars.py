@@ -1,7 +1,6 @@
 """Progress of a run: bars on the terminal, or events for a machine."""
 
 import time
-import types
 from collections.abc import Callable
 
 from rich.console import Console
@@ -46,12 +45,7 @@ class Bars:
         self._progress.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def started(self, stage: str) -> None:
