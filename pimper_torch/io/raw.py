@@ -88,8 +88,7 @@ def read_raw(path: Path | str) -> np.ndarray:
     path = Path(path)
     rawpy = load_extra("raw", path)
     with _opened(path) as raw:
-        levels = filter(None, raw.camera_white_level_per_channel or ())
-        white = min(map(int, (raw.white_level, *levels)))
+        white = _white(raw)
         black = min((int(level) for level in raw.black_level_per_channel), default=0)
         saturated = _saturated(raw, white)
         array = raw.postprocess(
@@ -146,6 +145,12 @@ def _shown(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that
     if 0 <= top < bottom <= sizes.height and 0 <= left < right <= sizes.width:
         return slice(top, bottom), slice(left, right)
     return slice(0, sizes.height), slice(0, sizes.width)
+
+
+def _white(raw: Any) -> int:  # noqa: ANN401 - as above
+    """Return the level of saturation: the lowest that the file tells."""
+    told = filter(None, raw.camera_white_level_per_channel or ())
+    return min(map(int, (raw.white_level, *told)))
 
 
 def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as above
