@@ -281,7 +281,7 @@ class _Reader:
 
 
 def _structure(path: Path, metadata: Mapping[str, str] | None) -> object:
-    """Parse the record's structure, strictly; checks the format."""
+    """Parse the record's structure, and check the format."""
     text = (metadata or {}).get(_KEY)
     if text is None:
         raise InputError(f"{path}: holds tensors but no record; needed: what `save_record` writes.")
@@ -289,7 +289,7 @@ def _structure(path: Path, metadata: Mapping[str, str] | None) -> object:
         needed = f"needed: {_MAX_STRUCTURE} bytes at most"
         raise InputError(f"{path}: its structure takes {len(text)} bytes; {needed}. {_AGAIN}")
     try:
-        structure = json.loads(text, parse_constant=_no_number, object_pairs_hook=_once)
+        structure = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: its structure is no JSON ({error}); needed: what `save_record` writes. "
@@ -302,17 +302,6 @@ def _structure(path: Path, metadata: Mapping[str, str] | None) -> object:
             "again with this version of pimper_torch, or load it with the version that wrote it."
         )
     return structure["record"]
-
-
-def _no_number(text: str) -> object:
-    raise ValueError(f"{text} is no number of JSON")
-
-
-def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    made = dict(pairs)
-    if len(made) < len(pairs):
-        raise ValueError(f"a name stands twice in {_shortly(sorted(name for name, _ in pairs))}")
-    return made
 
 
 def _is_a(hint: object, cls: type | types.UnionType) -> bool:

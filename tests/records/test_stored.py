@@ -319,9 +319,7 @@ def forge(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: text.replace("[1, 2.0]", "[1, NaN]"), "NaN is no number of JSON"),
         (lambda text: text[:-1], "its structure is no JSON"),
-        (lambda text: text.replace('"format": 1', '"format": 1, "format": 1'), "stands twice"),
         (lambda text: "[" * 10**5 + "]" * 10**5, "its structure is no JSON"),
         (lambda text: text.replace("[1, 2.0]", f"[{'9' * 5000}, 2.0]"), "is no JSON"),
         (lambda text: text + " " * 2**25, "needed: 33554432 bytes at most"),
