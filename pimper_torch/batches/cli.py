@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from pimper_torch.batches.engines import SlurmExecutor, dask_workers, require_dask, require_slurm
-from pimper_torch.batches.many_objects import TRIES, batch
+from pimper_torch.batches.many_objects import TRIES, Listener, batch
 from pimper_torch.batches.objects import CSV, HTML
 from pimper_torch.batches.table import terminal
 from pimper_torch.batches.task import Outcome
@@ -40,12 +40,6 @@ class TryEvents:
 
     def __init__(self, write: Callable[..., None]) -> None:
         self._write = write
-
-    def __enter__(self) -> "TryEvents":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def progressed(self, name: str, event: Mapping[str, Any]) -> None:
         """Write where a try begins, and its stages."""
@@ -156,9 +150,10 @@ class _Job:
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``batch``: a line an object, and a table at the end."""
     job, settings = checked(command, arguments)
-    shown = TryEvents(output.event) if output.as_json else Lines(output.shows("info"))
+    shown: AbstractContextManager[Listener] = Lines(output.shows("info"))
+    shown = nullcontext(TryEvents(output.event)) if output.as_json else shown
     try:
-        with _engine(job) as executor, shown:
+        with _engine(job) as executor, shown as listener:
             outcomes = batch(
                 job.list,
                 job.out,
@@ -170,7 +165,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
                 time_limit_min=job.time_limit,
                 mem_gb=job.mem_gb,
                 cpus_per_task=job.cpus_per_task,
-                listener=shown,
+                listener=listener,
             )
     except KeyboardInterrupt as error:
         left = f"objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}"
