@@ -55,7 +55,7 @@ RESULT_NAMES = (
     "turn.webp",
     "report.html",
 )
-"""What a result consists of, and nothing else; a table in the manual tells what each file holds."""
+"""Files of a result, and nothing else; a table in the manual tells what each holds."""
 _PARTS = 8  # of the bar: simplification, light, meshes, asset, maps, sheet, turning picture, page
 
 
