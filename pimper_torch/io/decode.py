@@ -109,7 +109,7 @@ def read_header(path: Path | str) -> Header:
             width=width,
             height=height,
             orientation=orientation,
-            focal=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
+            focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
             channels=1 if grey else 3,
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,

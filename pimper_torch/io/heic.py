@@ -31,7 +31,7 @@ def read_heic_header(path: Path | str) -> Header:
         width=image.size[0],
         height=image.size[1],
         orientation=1,
-        focal=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), *image.size),
+        focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), *image.size),
         channels=3 if image.mode.startswith("RGB") else 1,
         deep=bits > 8,
         full=255 if bits <= 8 else (2**bits - 1) << (16 - bits),

@@ -15,7 +15,7 @@ from pimper_torch.errors import InputError, caution, some
 from pimper_torch.file_names import match_files
 from pimper_torch.io.decode import SUFFIXES, decode, read_header, rotated
 from pimper_torch.io.extras import HEIC_SUFFIXES, RAW_SUFFIXES, extra_of, is_installed, load_extra
-from pimper_torch.io.header import Header, focals_px
+from pimper_torch.io.header import Header
 from pimper_torch.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.io.responses import tell_cautions
 from pimper_torch.mapped import drop_pages, each, parts, zeros
@@ -328,8 +328,8 @@ def shrunk_focals(
         max(size) / max(header.width, header.height)
         for header, size in zip(headers, sizes, strict=True)
     ]
-    focals = focals_px([header.focal for header in headers])
-    return torch.tensor(focals, dtype=torch.float32) * torch.tensor(scales)
+    focals = torch.tensor([header.focal_px for header in headers], dtype=torch.float32)
+    return focals * torch.tensor(scales)
 
 
 def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:

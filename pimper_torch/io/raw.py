@@ -69,7 +69,7 @@ def read_raw_header(path: Path | str) -> Header:
             width=width,
             height=height,
             orientation=orientation,
-            focal=focal_from_exif(tags, width, height),
+            focal_px=focal_from_exif(tags, width, height),
             channels=1 if gray else 3,
             deep=True,
             full=np.iinfo(np.uint16).max,

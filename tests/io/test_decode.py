@@ -9,8 +9,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import InputError
 from pimper_torch.io.decode import decode, read_header, rotated
-from pimper_torch.io.header import focal_from_exif, focals_px
-from pimper_torch.sfm.lenses import group_lenses
+from pimper_torch.io.header import focal_from_exif
 
 
 @pytest.fixture
@@ -106,18 +105,18 @@ def test_one_bit_and_cmyk_files_are_photographs_too(tmp_path, pixels):
 
 def test_the_focal_length_follows_from_the_35_mm_equivalent():
     # On 36 mm x 24 mm the equivalent is the focal length itself.
-    assert focal_from_exif({0xA405: 50}, 3600, 2400).px == pytest.approx(5000)
-    assert focal_from_exif({0xA405: 50}, 2400, 3600).px == pytest.approx(5000)
+    assert focal_from_exif({0xA405: 50}, 3600, 2400) == pytest.approx(5000)
+    assert focal_from_exif({0xA405: 50}, 2400, 3600) == pytest.approx(5000)
 
 
 def test_the_focal_length_follows_from_the_focal_plane():
     # 30 mm on a 22.5 mm wide sensor with 4500 pixels: 200 pixels a millimetre.
     for unit, per_unit in ((2, 5080.0), (3, 2000.0), (4, 200.0)):
         tags = {0x920A: 30.0, 0xA20E: per_unit, 0xA210: unit}
-        assert focal_from_exif(tags, 4500, 3000).px == pytest.approx(6000)
+        assert focal_from_exif(tags, 4500, 3000) == pytest.approx(6000)
         resized = tags | {0xA002: 4500, 0xA003: 3000}
-        assert focal_from_exif(resized, 900, 600).px == pytest.approx(1200)
-        assert focal_from_exif(resized, 600, 900).px == pytest.approx(1200)
+        assert focal_from_exif(resized, 900, 600) == pytest.approx(1200)
+        assert focal_from_exif(resized, 600, 900) == pytest.approx(1200)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +131,7 @@ def test_the_focal_length_follows_from_the_focal_plane():
     ],
 )
 def test_exif_that_says_nothing_useful_gives_no_focal_length(tags):
-    assert math.isnan(focal_from_exif(tags, 4500, 3000).px)
+    assert math.isnan(focal_from_exif(tags, 4500, 3000))
 
 
 def zoomed(zoom, equivalent=28, focal_mm=4.0, **plane):
@@ -142,33 +141,21 @@ def zoomed(zoom, equivalent=28, focal_mm=4.0, **plane):
 
 def test_a_digital_zoom_multiplies_the_focal_length_that_the_focal_plane_gives():
     plane = {0xA20E: 200.0, 0xA210: 4}  # 200 pixels a millimetre
-    assert zoomed(2.5, equivalent=0, focal_mm=18.0, plane=plane).px == pytest.approx(9000)
+    assert zoomed(2.5, equivalent=0, focal_mm=18.0, plane=plane) == pytest.approx(9000)
     # An equivalent of 36 mm leaves the zoom out, one of 90 mm has it: the plane is the same.
     for equivalent in (36, 90):
-        single = zoomed(2.5, equivalent, focal_mm=18.0, plane=plane)
-        assert focals_px([single]) == pytest.approx([9000])
+        assert zoomed(2.5, equivalent, focal_mm=18.0, plane=plane) == pytest.approx(9000)
 
 
 @pytest.mark.parametrize("zoom", [None, 0, 0.6, "two", math.nan])
 def test_a_digital_zoom_that_is_none_changes_nothing(zoom):
     plane = {0xA20E: 200.0, 0xA210: 4}
-    assert zoomed(zoom, equivalent=0, focal_mm=18.0, plane=plane).px == pytest.approx(3600)
-    assert focals_px([zoomed(zoom), zoomed(1)]) == pytest.approx([2800, 2800])
+    assert zoomed(zoom, equivalent=0, focal_mm=18.0, plane=plane) == pytest.approx(3600)
+    assert zoomed(zoom) == pytest.approx(2800)
 
 
-def test_a_digital_zoom_is_part_of_the_equivalent_unless_equal_ones_have_unlike_zooms():
-    # As telephones write it: 28 mm, and 55 mm at 1.951.
-    assert focals_px([zoomed(1), zoomed(1.951, 55)]) == pytest.approx([2800, 5500])
-    assert focals_px([zoomed(1.951, 55)] * 2) == pytest.approx([5500, 5500])
-    # Another lens of that equivalent says nothing about this one.
-    tele = zoomed(1, 55, focal_mm=9.0)
-    assert focals_px([zoomed(1.951, 55), tele]) == pytest.approx([5500, 5500])
-    # Equivalents are rounded, here of 12.8 and 13.2 mm: they are told apart all the same.
-    wide, narrow = focals_px([zoomed(1, 13), zoomed(1.03, 13)])
-    assert (narrow / wide, math.sqrt(wide * narrow)) == pytest.approx((1.03, 1300))
-    assert group_lenses([(9, 6)] * 2, [wide, narrow]) == [0, 1]
-    # A camera that leaves it out.
-    assert focals_px([zoomed(1), zoomed(2), zoomed(4)]) == pytest.approx([2800, 5600, 11200])
+def test_a_digital_zoom_is_part_of_the_equivalent():
+    assert zoomed(1.951, 55) == pytest.approx(5500)  # as telephones write it, of 28 mm
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])

@@ -39,7 +39,7 @@ def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path, stor
     path = write(tmp_path / "a.HEIC", UPRIGHT)
     header = read_header(path)
     assert (header.width, header.height, header.orientation) == (48, 64, 1)
-    assert header.focal.px == pytest.approx(50 * np.hypot(48, 64) / np.hypot(36, 24))
+    assert header.focal_px == pytest.approx(50 * np.hypot(48, 64) / np.hypot(36, 24))
     assert header.colour.source == 'the ICC profile "Display P3"'
     assert header.colour.response == Srgb()
     assert header.colour.srgb_from_file is not None

@@ -88,11 +88,10 @@ def test_orientation_and_focal_length_come_from_exif(photos, pixels):
 
 
 def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
-    """A camera whose 35 mm equivalent leaves the digital zoom out."""
     for number, zoom in enumerate([1, 1, 2, 2]):
         exif = Image.Exif()
         exif[274] = 1
-        exif.get_ifd(0x8769).update({0x920A: 4.0, 0xA404: float(zoom), 0xA405: 28})
+        exif.get_ifd(0x8769).update({0x920A: 4.0, 0xA404: float(zoom), 0xA405: 28 * zoom})
         save(tmp_path / f"{number}.png", pixels, exif=exif)
     wide = 28 / np.hypot(36, 24) * np.hypot(12, 8)
     views = load_views(tmp_path)
