@@ -113,7 +113,6 @@ def read_header(path: Path | str) -> Header:
             channels=1 if grey else 3,
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
-            transparent=_transparent(png) if sixteen else (),
             colour=_colour(image, exif, png),
             cautions=(*cautions, *[CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
             layout=layout,
@@ -177,9 +176,6 @@ def decode(path: Path | str) -> Decoded:
         raise _unfit(path, str(array.dtype))
     full = _full_scale(array, header)
     array = array[..., None] if array.ndim == 2 else array
-    if array.shape[2] == len(header.transparent):
-        opaque = (array != np.array(header.transparent, dtype=array.dtype)).any(axis=2)
-        array = np.concatenate([array, opaque[..., None] * np.uint16(full)], axis=2)
     if array.shape[:2] != (header.height, header.width):
         raise _damaged(path)
     # Plane by plane, so that no more memory is taken than is returned.
@@ -220,12 +216,6 @@ def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:
     if found is None:
         return 1, []
     return 1, [f"has an EXIF orientation of {found!r:.20}, not of 1 to 8; it is taken as upright"]
-
-
-def _transparent(png: PngHead | None) -> tuple[int, ...]:
-    told = b"" if png is None else png.chunks.get(b"tRNS", b"")
-    levels = zip(told[::2], told[1::2], strict=False)
-    return tuple(256 * high + low for high, low in levels) if len(told) in (2, 6) else ()
 
 
 def _full_scale(array: np.ndarray, header: Header) -> int:

@@ -71,7 +71,6 @@ class Header(Record):
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.
         full: Level that is full scale, 255 or 65535, or less where a TIFF has other bits.
         full_told: The file itself says what its full scale is.
-        transparent: Levels of the one colour of 16 bits that a PNG calls transparent.
         cautions: What it says and is not followed, each a sentence without its subject.
         layout: Of a TIFF; ``None`` for other files.
     """
@@ -84,7 +83,6 @@ class Header(Record):
     deep: bool
     full: int = 255
     full_told: bool = False
-    transparent: tuple[int, ...] = ()
     colour: Colour = SILENT
     cautions: tuple[str, ...] = ()
     layout: Layout | None = None

@@ -192,7 +192,7 @@ def _primaries(tags: dict[bytes, bytes]) -> tuple[Tensor | None, str]:
 
 
 _MAX_CHUNK_BYTES = 2**22  # a choice: printers' profiles have 2 MB
-_CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"tRNS")
+_CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM")
 # PNG's 45455 stands for sRGB in files of programs older than its `sRGB` chunk, and of some newer.
 _SRGB_GAMMA, _NEAR = 2.2, 0.02
 _ICC_PROFILE, _TRANSFER_FUNCTION = 34675, 301  # tags of TIFF
