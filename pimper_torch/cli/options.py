@@ -152,7 +152,7 @@ class InputOptions:
             more.
         camera_distance: Two photographs, and the length between their cameras; again for more.
         markers: Markers printed by `pimper markers` tell the size; their sides in millimetres, if
-            others. With --sparse they are compared alone, unless their sides are given.
+            others. With --sparse they count only where their sides are given.
         unit: Of lengths that are given, and of the result where its size is known.
         silhouettes: Folder of soft masks of a segmenter, for some photographs or all, any size:
             PNG, JPEG, EXR, NPZ or NPY. What the other views deny is not followed.

@@ -10,7 +10,7 @@ from pimper_torch.records import Reconstruction
 from pimper_torch.size.given import CameraDistance, ScaleBar, Unit
 from pimper_torch.size.marker_scale import scale_of_markers
 from pimper_torch.size.marks import place_of, view_of
-from pimper_torch.size.scale import Length, Scale, compare_with_units, fitted, most_accurate
+from pimper_torch.size.scale import Length, Scale, fitted, most_accurate
 
 
 def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit = "mm") -> Scale:
@@ -63,8 +63,8 @@ def find_scale(
         bars: Places that are known distances apart.
         markers: Whether markers of ``pimper markers`` are looked for, and the length of their
             sides in millimetres, if it is not what their numbers say.
-        own_frame: The cameras came with the photographs, in a unit of their own. Markers of which
-            nothing was said are then compared alone.
+        own_frame: The cameras came with the photographs, in a unit of their own, which markers of
+            which nothing was said do not change.
 
     Returns:
         ``None`` where nothing tells the size.
@@ -78,7 +78,7 @@ def find_scale(
     if camera_distances:
         scales.append(scale_of_cameras(result, camera_distances, unit))
     asked = not isinstance(markers, str)
-    if markers != "off":
+    if markers != "off" and (asked or scales or not own_frame):
         side_mm = float(markers) if not isinstance(markers, str) else None
         found = scale_of_markers(result.scene, side_mm, unit)
         if found is None and asked:
@@ -87,8 +87,6 @@ def find_scale(
                 "markers`), lay it flat beside the object, and photograph both sharply, not "
                 "overexposed.",
             )
-        elif found is not None and own_frame and not asked and not scales:
-            compare_with_units(found)
         elif found is not None:
             scales.append(found)
     return most_accurate(scales)

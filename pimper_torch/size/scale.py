@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from pimper_torch.errors import InputError, caution
 from pimper_torch.records import Record
-from pimper_torch.size.given import MILLIMETRES, Unit
+from pimper_torch.size.given import Unit
 
 Source = Literal["scale bars", "markers", "camera distances"]
 # From the most accurate to the least: two places that a person clicked on the surface; printed
@@ -109,21 +109,3 @@ def most_accurate(scales: Sequence[Scale]) -> Scale | None:
                 stacklevel=2,
             )
     return best
-
-
-def compare_with_units(scale: Scale) -> None:
-    """Warn where a frame that somebody else made is in a unit of length, but for a few per cent.
-
-    Args:
-        scale: Of a result in that frame.
-    """
-    millimetres = scale.factor * MILLIMETRES[scale.unit]
-    unit = min(MILLIMETRES, key=lambda one: abs(math.log(millimetres / MILLIMETRES[one])))
-    off = MILLIMETRES[unit] / millimetres - 1
-    if AGREEING < abs(off) < 0.15:  # more is another unit, or none
-        caution(
-            f"By the {scale.source}, lengths in the frame of the cameras that were given are "
-            f"{off:+.1%} off, if its unit is {unit}. The frame was kept. Give the sides of the "
-            "markers (`--markers MM`) to have the result scaled by them.",
-            stacklevel=2,
-        )
