@@ -243,7 +243,6 @@ def _tables(root: Path) -> list[Seed]:
     (root / "curve.csv").write_text(
         "level,radiance\n" + "".join(f"{level},{value:.6f}\n" for level, value in enumerate(curve))
     )
-    (root / "curve.json").write_text(json.dumps({"radiance": curve, "levels": list(range(256))}))
     np.save(root / "curve.npy", np.array(curve))
     (root / "settings.yaml").write_text(to_yaml(CoarseToFineConfig()))
     save_record(_ball(), root / "mesh.safetensors")
@@ -269,7 +268,7 @@ def _tables(root: Path) -> list[Seed]:
         return build(CoarseToFineConfig, read_mapping(path), str(path))
 
     readers: dict[str, Callable[[Path], object]] = {
-        **{name: curves(name) for name in ("curve.csv", "curve.json", "curve.npy")},
+        **{name: curves(name) for name in ("curve.csv", "curve.npy")},
         "settings.yaml": settings,
         # Values are checked by the stages that take a record.
         "mesh.safetensors": lambda folder: load_record(Mesh, folder / "mesh.safetensors") and None,

@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -17,13 +15,8 @@ COLOURS = np.stack([CURVE, LEVELS, LEVELS**2 + LEVELS], axis=1)
 def write(path, table):
     if path.suffix == ".npy":
         np.save(path, table)
-    elif path.suffix == ".csv":
-        np.savetxt(path, table, delimiter=",")
     else:
-        columns = table.T.tolist()
-        given = len(columns) in (2, 4)
-        report = {"radiance": columns[1:] if given else columns}
-        path.write_text(json.dumps(report | ({"levels": columns[0]} if given else {})))
+        np.savetxt(path, table, delimiter=",")
     return path
 
 
@@ -31,7 +24,7 @@ def write(path, table):
     ("suffix", "radiance", "leveled"),
     [
         ("csv", CURVE[:, None], False),
-        ("json", COLOURS, True),
+        ("csv", COLOURS, True),
         ("npy", COLOURS, False),
         ("npy", CURVE[:, None], True),
     ],
@@ -75,10 +68,6 @@ def test_every_choice_gives_its_response(tmp_path):
         ("a.csv", "0,1\n1,dark\n", "holds no table"),
         ("a.csv", "\n".join("1,2,3,4,5" for _ in range(20)), "a table of 20 x 5"),
         ("a.csv", "\n".join(str(level) for level in range(100)), "is no response curve: the last"),
-        ("a.json", "[1, 2]", "no object with `radiance`"),
-        ("a.json", "{}", "holds no table"),
-        ("a.json", '{"radiance": [[1, 2], [1]]}', "holds no table"),
-        ("a.json", '{"radiance": [1, ', "holds no table"),
         ("a.npy", "not an array", "holds no table"),
         ("a.xlsx", "", r"a\.xlsx: is no response .*needed: srgb, linear"),
     ],
