@@ -22,7 +22,7 @@ class Encoding:
     Attributes:
         response: auto takes what each file says (its ICC profile, PNG's gAMA and cICP, EXIF),
             sRGB where it is silent; or, whatever they say, srgb; linear; the exponent of a gamma
-            curve, such as 2.2; a CSV, JSON or NPY file with a measured response curve.
+            curve, such as 2.2; a CSV or NPY file with a measured response curve.
         saturation: Level at which the sensor saturates, one or red, green and blue; auto finds
             it in the photographs, and takes full scale where they show none.
         black: Level that the files hold in the dark.
