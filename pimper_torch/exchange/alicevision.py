@@ -90,7 +90,7 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
             )
         ],
     }
-    write_json(whole, Path(file), indent=4)
+    write_json(whole, file, indent=4)
 
 
 def _intrinsic(

@@ -159,7 +159,7 @@ def read_mesh(path: Path | str) -> Mesh:
     try:
         # Without a resolver nothing but the file itself is opened.
         scene = trimesh.load_scene(
-            BytesIO(readable(path, suffix)),
+            BytesIO(_readable(path, suffix)),
             file_type=suffix.lstrip("."),
             process=False,
             maintain_order=True,
@@ -293,7 +293,7 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
     if len(faces):
         visual = part.visual
         colors = visual.vertex_colors if visual.kind == "vertex" else None
-        colors = part.vertex_attributes.get(RAW_COLORS, colors)
+        colors = part.vertex_attributes.get(_RAW_COLORS, colors)
     encoded = _rows(colors)
     if encoded is not None:
         kind = np.asarray(colors).dtype
@@ -354,10 +354,10 @@ def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
 
 # glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of
 # the first it rounds to 8 bits, or cuts to them.
-COLORS, RAW_COLORS = "COLOR_0", "_COLOR_0"
+_COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
 
 
-def readable(path: Path, suffix: str) -> bytes:
+def _readable(path: Path, suffix: str) -> bytes:
     """Return a file's bytes so that trimesh reads all that they hold.
 
     Raises:
@@ -389,8 +389,8 @@ def _with_raw_colors(path: Path, data: bytes) -> bytes:
         )
     for mesh in tree.get("meshes", []):
         for part in mesh["primitives"]:
-            if COLORS in part["attributes"] and part.get("mode") != 0:
-                part["attributes"][RAW_COLORS] = part["attributes"].pop(COLORS)
+            if _COLORS in part["attributes"] and part.get("mode") != 0:
+                part["attributes"][_RAW_COLORS] = part["attributes"].pop(_COLORS)
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     sizes = struct.pack("<2I", length - size + len(text), len(text))

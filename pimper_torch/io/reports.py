@@ -18,10 +18,10 @@ from pimper_torch.records import Failure, Reconstruction
 Report = dict[str, object]
 
 
-def write_json(report: Mapping[str, object], path: Path, indent: int | None = 2) -> None:
+def write_json(report: Mapping[str, object], path: Path | str, indent: int | None = 2) -> None:
     """Write numbers and texts, none of which may be NaN or infinite."""
     text = json.dumps(report, indent=indent, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    Path(path).write_text(text + "\n", encoding="utf-8")
 
 
 def lights_report(result: Reconstruction) -> Report:
