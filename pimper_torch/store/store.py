@@ -25,7 +25,6 @@ from pimper_torch.store.digest import digest
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 _RECORD, _ABOUT = ".safetensors", ".json"
-_FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +52,7 @@ class Store:
         try:
             about = json.loads(self._path(key, _ABOUT).read_bytes())
             record = load_record(cls, self._path(key, _RECORD))
-            if about["format"] != _FORMAT or about["digest"] != digest(record):
+            if about["digest"] != digest(record):
                 return None
             found = settled(record), dict(about["about"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError, PimperError):
@@ -76,7 +75,7 @@ class Store:
         hashed = digest(record)
         if hashed is None:
             return False
-        text = json.dumps({"format": _FORMAT, "digest": hashed, "about": dict(about or {})})
+        text = json.dumps({"digest": hashed, "about": dict(about or {})})
         try:
             self._path(key, _ABOUT).unlink(missing_ok=True)
             save_record(record, self._path(key, _RECORD))

@@ -1,6 +1,6 @@
 """Results in a browser or a notebook, from Python."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
             continue
         record, about = read
         mesh = record.mesh
-        for place in _places(stages, about["events"]):
+        for place in _places(stages, about.get("events", ())):
             error = mesh.expected_error
             found[place] = mesh.replace(
                 vertices_world=factor * mesh.vertices_world,
@@ -117,7 +117,7 @@ def passes_kept(folder: Path, summary: Mapping[str, Any]) -> Iterator[tuple[str,
             yield name, found[place]
 
 
-def _places(stages: list[Mapping[str, Any]], events: list[Any]) -> list[int]:
+def _places(stages: list[Mapping[str, Any]], events: Sequence[Any]) -> list[int]:
     """Return where in a summary the reports of a record stand."""
     reports = [one for one in events if isinstance(one, Mapping) and one["kind"] == "StageReport"]
     told = {(one["name"], one["seconds"], one["peak_memory_mb"]) for one in reports}
