@@ -15,9 +15,8 @@ from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageErr
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.io.extras import extra_of, format_of
+from pimper_torch.io.extras import extra_of, format_of, read_heic, read_heic_header
 from pimper_torch.io.header import Header, focal_from_exif
-from pimper_torch.io.heic import read_heic, read_heic_header
 from pimper_torch.io.profiles import (
     PngHead,
     colour_of_exif,

@@ -15,7 +15,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.mapped import each
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Mesh, Views
-from pimper_torch.report.page_pictures import shrunk
+from pimper_torch.report.predictions import shrunk
 from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.layers import LAYERS, layers_of, painted
 from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server

@@ -15,8 +15,15 @@ from pimper_torch.relighting.fit_lights import ViewLights
 from pimper_torch.relighting.held_out import Judged, Relighting
 from pimper_torch.relighting.lit_surface import Materials
 from pimper_torch.report.page import section_entries, write_page
-from pimper_torch.report.page_pictures import jpeg, longest_px, outline, shrunk
-from pimper_torch.report.predictions import Prediction, predictions, view_entries
+from pimper_torch.report.predictions import (
+    Prediction,
+    jpeg,
+    longest_px,
+    outline,
+    predictions,
+    shrunk,
+    view_entries,
+)
 from pimper_torch.report.vertex_layers import VertexLayer
 
 MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
