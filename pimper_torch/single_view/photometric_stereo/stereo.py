@@ -12,9 +12,8 @@ from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.bas_relief import (
     BasRelief,
     convex,
-    relief_from_albedo,
     relief_from_strength,
-    rounded_relief,
+    standard_relief,
 )
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,
@@ -34,7 +33,7 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
 # the default: nearest to known lights on the rendered objects (benchmarks/photometric_stereo.py).
 METHODS: dict[str, tuple[str, ...]] = {
     "calibrated": (),
-    "integrability": ("albedo_entropy", "rounded", "equal_albedo", "equal_strength"),
+    "integrability": ("albedo_entropy", "rounded", "equal_strength"),
     "perspective": (),
 }
 
@@ -99,7 +98,7 @@ def photometric_stereo(
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ==================  ==========================================  =================
 
-    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_albedo``, ``equal_strength``, or
+    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_strength`` (of the lights), or
     ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
@@ -188,9 +187,7 @@ def _integrable(
     matrix = integrable(factors.shading, reliability, mask).matrix
     shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
     if resolve == "rounded":
-        relief = rounded_relief(shading, reliability, mask)
-    elif resolve == "equal_albedo":
-        relief = relief_from_albedo(shading, reliability, mask)
+        relief = standard_relief(shading, reliability)
     elif resolve == "equal_strength":
         relief = relief_from_strength(lights, shading, reliability, mask)
     else:
@@ -200,7 +197,7 @@ def _integrable(
         images[:, :, mask] = radiance
         groups = chromaticity_groups(images, inside) if images.shape[1] > 1 else None
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
-        relief = convex(relief, shading, reliability, mask)
+    relief = convex(relief, shading, reliability, mask)
     moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
     free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
     return _lambertian(radiance, moved, relief, free)

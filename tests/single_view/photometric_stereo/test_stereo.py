@@ -42,15 +42,6 @@ def test_point_lights_of_one_strength_are_enough(
     assert (found.lit[:, bumpy.mask] == lit)[:, some].double().mean() > 0.99
 
 
-def test_pixels_of_one_albedo_are_enough(bumpy, point_lights, generator, angles_deg):
-    lights = point_lights(12, spread=0.5) * (
-        0.5 + torch.rand(12, 1, generator=generator, dtype=torch.float64)
-    )
-    images, _ = photographed(bumpy, lights, torch.ones(bumpy.columns.shape[1]).double())
-    found = photometric_stereo(images, bumpy.mask, method="integrability", resolve="equal_albedo")
-    assert angles_deg(found.normals[bumpy.mask].mT, bumpy.columns).mean() < 0.7
-
-
 def test_without_knowledge_a_convention_is_taken_and_named(ball, point_lights, angles_deg):
     lights = point_lights(12, spread=0.5)
     images, _ = photographed(ball, lights, torch.ones(ball.columns.shape[1]).double())
