@@ -171,7 +171,7 @@ def render_objects(
     return RenderedScene(
         views=_views(torch.stack([frame.image for frame in frames]), cameras),
         cameras=cameras,
-        lights_world=lights.harmonics_world(cameras.centers_world),
+        lights_world=lights.harmonics_world(),
         **{name: torch.stack([getattr(frame, name) for frame in frames]) for name in _MAPS},
         mesh=stage.mesh,
     )

@@ -186,9 +186,8 @@ def _lights_report(scene: Scene) -> dict[str, object]:
         "positions_world": lights.positions_world.tolist(),
         "irradiance": lights.irradiance.tolist(),
         "ambient": lights.ambient.tolist(),
-        "flash": lights.flash.tolist(),
         "target_world": lights.target_world.tolist(),
-        "harmonics_world": lights.harmonics_world(scene.cameras.centers_world).tolist(),
+        "harmonics_world": lights.harmonics_world().tolist(),
     }
 
 
