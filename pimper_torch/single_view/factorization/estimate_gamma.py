@@ -27,9 +27,6 @@ from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
 from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
 
-# Lower bound of the encoded value about which the fit is linearized: a choice.
-_DARKEST = 0.02
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class EncodedMatrix(Record):
@@ -93,7 +90,7 @@ def fit_encoded(
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
         linear = left @ solved.shading[0]
-        about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
+        about = response.encoded_from_linear(linear).clamp_min(0.02)
         residual = mask * (problem.encoded - about)
         if problem.scale and iteration < iterations:
             weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
@@ -148,8 +145,6 @@ def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
 MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
 # Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
 _TRIALS = 8
-# Of gamma's logarithm: a choice, a tenth of the smallest standard errors.
-_TOLERANCE = 1e-4
 
 # Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
@@ -160,8 +155,6 @@ _MAX_RESIDUAL = 0.015
 # Encoded value up to which shading is not first-order.
 _DARK = 0.1
 
-# Samples; more are subsampled evenly.
-_MAX_SAMPLES = 300
 
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
@@ -318,7 +311,7 @@ def _problem(
             f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
             "other lights, expose so that less is dark or saturated, or lower the rank."
         )
-    count = min(_MAX_SAMPLES, len(samples))
+    count = min(300, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
     chosen = samples[spaced.to(samples.device)]
     return EncodedMatrix(
@@ -371,7 +364,7 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
         return float(fit.loss.sum())
 
     bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _TOLERANCE})
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     gamma = math.exp(found.x)
     fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
     return _Minimum(

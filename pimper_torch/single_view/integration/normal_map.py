@@ -1,7 +1,6 @@
 """Integration of a normal map to depth, orthographic or pinhole, with mask, weights and anchors."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
 from pimper_torch.single_view.integration.discontinuities import (
@@ -26,11 +25,6 @@ Integration = Literal["discontinuities", "weighted"]
 
 # Weight of steps over pixels without a normal, whose slopes are inpainted: a choice.
 _FILLED_WEIGHT = 1e-4
-
-# Blocks across a normal map, and curl with y negated over that with y as it is, below which a
-# warning comes. A ball, waves and a vase of 160 pixels, normals 3 degrees off: 0.09 to 0.41 where y
-# is upside down; a plane 0.9 to 1.1 either way. Curl below the floor is rounding.
-_BLOCKS, _CURL_RATIO, _CURL_FLOOR = 24, 0.5, 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -79,9 +73,6 @@ def integrate_normal_map(
     Raises:
         InputError: Unusable rasters, or normals coded as colours or with z to the viewer.
 
-    Warns:
-        PimperWarning: Normals that are integrable only with y negated.
-
     Differentiable in normals, weights and known depths; which steps are continuous is constant.
 
     >>> up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 5, 3)
@@ -120,7 +111,7 @@ def integrate_normal_map(
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
-    system = RasterSystem(*weights, anchor, what="the integration")
+    system = RasterSystem(*weights, anchor)
     found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(
@@ -185,7 +176,7 @@ def _known(
 def _refuse_convention(
     normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
 ) -> None:
-    """Refuse normals that are coded as colours or face away; warn of y upward."""
+    """Refuse normals that are coded as colours or face away."""
     some = normals.detach()[mask]
     some = some[some.isfinite().all(dim=-1) & (some != 0).any(dim=-1)]
     if len(some) == 0:
@@ -201,35 +192,6 @@ def _refuse_convention(
             f"normals: {away:.0%} of them have z towards the viewer, as OpenGL's do, whose y "
             f"points up, too: negate y and z; {axes}."
         )
-    as_given, flipped = (_curl(normals.detach(), mask, sign) for sign in (1.0, -1.0))
-    if flipped + _CURL_FLOOR < _CURL_RATIO * as_given:
-        warnings.warn(
-            f"normals look as if y pointed up: with y negated they are those of a surface (median "
-            f"curl of the slopes {flipped:.2g}, as given {as_given:.2g}); {axes}. Negate y if the "
-            "depth comes out wrong.",
-            PimperWarning,
-            stacklevel=3,
-        )
-
-
-def _curl(
-    normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"], sign: float
-) -> float:
-    """Return the median absolute curl of the slopes, around squares of four blocks.
-
-    Slopes are averaged over blocks, which reduces noise.
-    """
-    slopes = -normals[..., :2] / normals[..., 2:]
-    usable = mask & slopes.isfinite().all(dim=-1) & (normals[..., 2] < 0)
-    slopes = torch.where(usable[..., None], slopes, 0).movedim(-1, 0)[None]
-    block = max(1, min(mask.shape) // _BLOCKS)
-    whole = avg_pool2d(usable.to(slopes)[None, None], block)[0, 0] > 1 - 1e-6
-    right, down = avg_pool2d(slopes, block)[0]
-    whole = whole[1:, 1:] & whole[1:, :-1] & whole[:-1, 1:] & whole[:-1, :-1]
-    across = (right[1:] - right[:-1])[:, 1:] + (right[1:] - right[:-1])[:, :-1]
-    along = (down[:, 1:] - down[:, :-1])[1:] + (down[:, 1:] - down[:, :-1])[:-1]
-    curl = (across - sign * along).abs()[whole]
-    return float(curl.median()) if len(curl) else 0.0
 
 
 def _refuse(

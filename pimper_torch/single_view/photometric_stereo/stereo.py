@@ -23,6 +23,7 @@ from pimper_torch.single_view.photometric_stereo.integrability import integrable
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.regress_lights import (
     Factored,
+    StereoSolution,
     calibrated_stereo,
     chromatic_albedo,
     determined,
@@ -139,12 +140,8 @@ def photometric_stereo(
         heavy = heavy[used]
         radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
         if lights is not None:
-            own = lights[used].double()
-            _refuse_plane(own)
-            known = calibrated_stereo(radiance, heavy, own, robust=robust)
-            found = _Solution(
-                normals=known.normals, albedo=known.albedo, lights=own, weight=known.weight
-            )
+            _refuse_plane(lights[used])
+            found = calibrated_stereo(radiance, heavy, lights[used].double(), robust=robust)
         elif intrinsics is not None:
             whole = torch.zeros_like(images[used], dtype=torch.float64)
             whole[:, :, mask] = radiance
@@ -160,31 +157,19 @@ def photometric_stereo(
 _FACTOR = "a factor between albedo and light"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Solution(Record):
-    """Output of a method, for the pixels inside the mask in raster order, in float64."""
-
-    normals: Float[Tensor, "3 pixel"]
-    albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view 3"]
-    weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | None = None
-    free: str = "nothing"
-
-
 def _integrable(
     radiance: Float[Tensor, "view channel pixel"],
     weight: Float[Tensor, "view pixel"],
     mask: Bool[Tensor, "height width"],
     resolve: str,
     robust: bool,
-) -> _Solution:
+) -> StereoSolution:
     """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
     enough, spanned = determined(factors.weight, factors.lights)
     total = factors.weight.sum(dim=0)
     reliability = torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
-    matrix = integrable(factors.shading, reliability, mask).matrix
+    matrix = integrable(factors.shading, reliability, mask)
     shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
     if resolve == "rounded":
         relief = standard_relief(shading, reliability)
@@ -208,7 +193,7 @@ def _lambertian(
     factors: Factored,
     applied: BasRelief | None,
     free: str,
-) -> _Solution:
+) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""
     size = factors.shading.norm(dim=0)
     normals = factors.shading / torch.where(size > 0, size, 1)
@@ -217,7 +202,7 @@ def _lambertian(
     length = factors.lights.norm(dim=1)
     shining = length[length > 0]
     factor = shining.median() if len(shining) else length.new_ones(())
-    return _Solution(
+    return StereoSolution(
         normals=normals,
         albedo=albedo * factor,
         lights=factors.lights / factor,
@@ -228,7 +213,7 @@ def _lambertian(
 
 
 def _spread_out(
-    found: _Solution,
+    found: StereoSolution,
     given: Float[Tensor, "view pixel"],
     mask: Bool[Tensor, "height width"],
     used: Bool[Tensor, " view"],

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError
 from pimper_torch.single_view.integration import raster_system
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem
@@ -412,22 +412,3 @@ def test_normals_of_another_convention_are_refused(change, told):
     normals, mask, _ = dome(40)
     with pytest.raises(InputError, match=told):
         integrate_normal_map(change(normals), mask)
-
-
-@pytest.mark.parametrize("noise_deg", [0.0, 3.0])
-def test_normals_whose_y_points_up_are_told(noise_deg):
-    normals, mask, _ = dome()
-    generator = torch.Generator().manual_seed(3)
-    spread = torch.randn(normals.shape, generator=generator, dtype=torch.float64)
-    normals = normals + noise_deg / 57.3 * spread
-    integrate_normal_map(normals, mask, method="weighted")  # silent: warnings are errors here
-    with pytest.warns(PimperWarning, match="as if y pointed up"):
-        integrate_normal_map(normals * torch.tensor([1.0, -1, 1]).double(), mask, method="weighted")
-
-
-def test_a_plane_is_a_surface_whichever_way_y_points():
-    plane = torch.tensor([0.3, 0.2, -0.9]).double().expand(60, 60, 3)
-    generator = torch.Generator().manual_seed(4)
-    rough = plane + 0.05 * torch.randn(60, 60, 3, generator=generator, dtype=torch.float64)
-    for normals in (plane, rough):
-        integrate_normal_map(normals, method="weighted")
