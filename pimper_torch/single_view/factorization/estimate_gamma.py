@@ -25,7 +25,11 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
+from pimper_torch.single_view.factorization.low_rank import (
+    brightness_guess,
+    low_rank_problem,
+    singular_left,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -85,7 +89,8 @@ def fit_encoded(
         heavy = weight / rate.square()
         heavy = heavy / heavy.max()
         if left is None:
-            left = _start(target, mask, problem.rank)
+            guess = brightness_guess(target, mask)[None]
+            left = singular_left(target[None], mask[None], problem.rank, guess, 29)[0]
         matrix = low_rank_problem(target[None], heavy[None], left[None])
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
@@ -108,16 +113,6 @@ def _derivative(
         at = encoded.detach().requires_grad_()
         (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
     return rate
-
-
-def _start(
-    matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
-) -> Float[Tensor, "view rank"]:
-    """Impute missing values by albedo times brightness, then by low-rank approximations."""
-    gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
-    level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
-    return singular_left(matrix[None], mask[None], rank, guess[None], 29)[0]
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:

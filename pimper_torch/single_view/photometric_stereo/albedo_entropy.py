@@ -23,7 +23,7 @@ from pimper_torch.single_view.factorization.bas_relief import (
 
 
 def chromaticities(
-    images: Float[Tensor, "view channel height width"], mask: Bool[Tensor, "height width"]
+    radiance: Float[Tensor, "view channel pixel"],
 ) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
     """Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
 
@@ -33,7 +33,7 @@ def chromaticities(
         Colours whose sum over channels is zero, up to one colour that all pixels share; and
         whether a pixel has one: bright enough in all channels of some view.
     """
-    values = images[:, :, mask].double()
+    values = radiance.double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
     bright = values.amin(dim=1) > 0.02 * brightest
     log = torch.where(bright[:, None], values, 1).log()
@@ -49,12 +49,11 @@ def chromaticities(
     for _ in range(20):
         pixel = (weight * (log - point_light[..., None])).sum(dim=0) / total_pixel
         point_light = (weight * (log - pixel)).sum(dim=2) / total_view
-    return pixel.to(images), bright.any(dim=0)
+    return pixel.to(radiance), bright.any(dim=0)
 
 
 def chromaticity_groups(
-    images: Float[Tensor, "view channel height width"],
-    mask: Bool[Tensor, "height width"],
+    radiance: Float[Tensor, "view channel pixel"],
 ) -> Int[Tensor, " pixel"]:
     """Cluster pixels of similar chromaticity.
 
@@ -62,17 +61,17 @@ def chromaticity_groups(
     so on; then every pixel is assigned to the nearest cluster within the radius.
 
     Args:
-        images: Linear radiance, of two channels or more.
+        radiance: Linear, of two channels or more.
 
     Returns:
-        Labels of the pixels in raster order, the largest group's 0; -1 for pixels in no group.
+        Labels of the pixels, the largest group's 0; -1 for pixels in no group.
     """
-    if images.shape[1] < 2:
+    if radiance.shape[1] < 2:
         raise InputError(
-            f"images have {images.shape[1]} channel; needed: two at least, pixels of one paint "
+            f"images have {radiance.shape[1]} channel; needed: two at least, pixels of one paint "
             "are grouped by colour. Use another method for grey images."
         )
-    colour, known = chromaticities(images, mask)
+    colour, known = chromaticities(radiance)
     labels = torch.full_like(known, -1, dtype=torch.int64)
     if not bool(known.any()):
         raise InputError("no pixel inside the mask is bright in all channels; needed: some.")

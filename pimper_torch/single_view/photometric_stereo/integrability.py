@@ -19,6 +19,7 @@ from itertools import combinations
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
@@ -149,15 +150,11 @@ def _least(equations: Curls) -> Float[Tensor, " both"]:
     pairs = equations.across.shape[1]
     # ``across`` and ``down`` are uncorrelated.
     metric = torch.kron(torch.eye(2).to(both), equations.noise)
-    eye = torch.eye(len(metric)).to(metric)
-    root = torch.linalg.cholesky(metric + 1e-12 * metric.diagonal().mean() * eye)
+    metric = metric + 1e-12 * metric.diagonal().mean() * torch.eye(len(metric)).to(metric)
     weight = equations.weight
     for _ in range(10):
         full = (weight[:, None] * both).mT @ both
-        inner = torch.linalg.solve_triangular(root, full, upper=False)
-        inner = torch.linalg.solve_triangular(root, inner.mT, upper=False)
-        vectors = torch.linalg.eigh((inner + inner.mT) / 2).eigenvectors
-        vectors = torch.linalg.solve_triangular(root.mT, vectors, upper=True)
+        vectors = torch.from_numpy(eigh(full.cpu().numpy(), metric.cpu().numpy())[1]).to(full)
         residual = both @ vectors[:, 0]
         scale = CAUCHY_TUNING * robust_deviation(residual, weight > 0)
         weight = equations.weight * cauchy_weights(residual, scale)

@@ -17,6 +17,7 @@ Source: Papadhimitri & Favaro, A new perspective on uncalibrated photometric ste
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
@@ -183,13 +184,11 @@ def _least(
     both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
     both = both * weight[:, None, None]
     noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
-    root = torch.linalg.cholesky(noise + 1e-12 * noise.trace() * torch.eye(9).to(noise))
+    noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
     moment = (weight[:, None] * rows).mT @ rows
-    reduced = torch.linalg.solve_triangular(root, moment, upper=False)
-    reduced = torch.linalg.solve_triangular(root, reduced.mT, upper=False)
-    ratios, vectors = torch.linalg.eigh((reduced + reduced.mT) / 2)
-    least = torch.linalg.solve_triangular(root.mT, vectors[:, :1], upper=True)
-    return least.reshape(3, 3), float(ratios[1] / ratios[0].clamp_min(1e-300))
+    ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
+    least = torch.from_numpy(vectors[:, 0].reshape(3, 3)).to(rows)
+    return least, float(ratios[1] / max(ratios[0], 1e-300))
 
 
 def _noise_of_crosses(

@@ -21,7 +21,7 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem
+from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
 
 # The scale of the weights starts at this multiple and is multiplied by the second per iteration,
 # down to 1: choices, so that the initial fit does not decide which samples are outliers.
@@ -304,11 +304,8 @@ def _filled(
     x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
 ) -> Float[Tensor, "view rank"]:
     """Impute missing samples by view's times pixel's brightness, and take singular vectors."""
-    gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
-    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    albedo = (weight * x).sum(dim=0, keepdim=True) / level
     fraction = weight / weight.amax().clamp_min(1e-300)
-    filled = fraction * x + (1 - fraction) * gain * albedo
+    filled = fraction * x + (1 - fraction) * brightness_guess(x, weight)
     return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
 
 

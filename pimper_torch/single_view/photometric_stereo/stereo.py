@@ -176,11 +176,8 @@ def _integrable(
     elif resolve == "equal_strength":
         relief = relief_from_strength(lights, shading, reliability, mask)
     else:
-        used, inside = reliability > 0, torch.zeros_like(mask)
-        inside[mask] = used
-        images = radiance.new_zeros(*radiance.shape[:2], *mask.shape)
-        images[:, :, mask] = radiance
-        groups = chromaticity_groups(images, inside) if images.shape[1] > 1 else None
+        used = reliability > 0
+        groups = chromaticity_groups(radiance[:, :, used]) if radiance.shape[1] > 1 else None
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
     relief = convex(relief, shading, reliability, mask)
     moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
