@@ -18,20 +18,6 @@ from pimper_torch.video.quality import motion, sharpness, thumbnail
 # adds then counts once. A choice, 6 pixels of 320: flow is still sure.
 _STEP = 0.02
 
-# Of each stretch of the way, the middle from which a frame is taken: neighbours are then at least
-# two fifths of a stretch apart. A choice.
-_MIDDLE = 0.6
-
-# Frames that have moved less than this, in widths, show the same: a pixel of those that flow is
-# measured in.
-_SAME = 1 / 320
-
-# Of a stretch, by which sums of its length may be short: far above what float64 rounds.
-_ROUNDING = 1e-6
-
-# Least way of all frames together, in widths: below, nothing moved. A choice.
-_LEAST_WAY = 0.1
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Scan(Record):
@@ -75,20 +61,22 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
         raise InputError(
             f"the video has {frames} frames, and {count} are to be chosen. Choose fewer."
         )
-    if whole < _LEAST_WAY:
+    if whole < 0.1:
         raise InputError(
             f"nothing moves in the {frames} frames of the video (by {whole:.1%} of their width in "
             "all); needed: a camera that goes round the object, or an object that turns."
         )
     steps = scan.way.double().diff()
-    length = max(_stretch(steps, count), _SAME)
+    # Frames that have moved by less than a pixel of those that flow is measured in show the same.
+    length = max(_stretch(steps, count), 1 / 320)
     place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
-    stretch = (place + _ROUNDING).floor().clamp(max=count - 1)
+    stretch = (place + 1e-6).floor().clamp(max=count - 1)
     middle = (place - stretch - 0.5).abs()
     numbers = []
+    # From the middle three fifths, so that neighbours are two fifths of a stretch apart.
     for number in sorted(set(stretch.tolist())):
         here = (stretch == number).nonzero()[:, 0]
-        inner = here[middle[here] <= max(_MIDDLE / 2, float(middle[here].min()))]
+        inner = here[middle[here] <= max(0.3, float(middle[here].min()))]
         numbers.append(inner[scan.sharpness[inner].argmax()])
     return torch.stack(numbers)
 

@@ -9,8 +9,6 @@ from torch import Tensor
 # Width of the pictures in which motion is measured. A choice: a hundredth of it is 3 pixels.
 _WIDTH_PX = 320
 
-# Of the pixels, those that move most: an object that turns before a wall covers a fifth. A choice.
-_MOVING = 0.8
 
 # Lags in pixels: blur takes differences over the short one, and hardly those over the long one.
 _SHORT, _LONG = 1, 4
@@ -50,4 +48,5 @@ def motion(
     ECCV 2016, for the flow.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
-    return float(np.quantile(np.linalg.norm(flow, axis=2), _MOVING)) / before.shape[1]
+    # An object that turns before a wall covers a fifth.
+    return float(np.quantile(np.linalg.norm(flow, axis=2), 0.8)) / before.shape[1]

@@ -15,12 +15,7 @@ _FORMAT = "a MATLAB file of version 5 to 7"
 
 
 def read_matlab(file: DataSetPath, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read arrays of numbers of a MATLAB file (up to version 7).
-
-    Raises:
-        InputError: No such file, not a MATLAB file, or a variable is absent or no array of
-            numbers; lists what the file holds.
-    """
+    """Read arrays of numbers of a MATLAB file (up to version 7)."""
     found = _variables(file, names)
     absent = [name for name in names if name not in found]
     there = some(sorted(found), most=12) or "none"

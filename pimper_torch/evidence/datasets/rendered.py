@@ -11,10 +11,10 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.datasets.raster import read_photographs
+from pimper_torch.evidence.scenes.ray_tracing import MAP_NAMES
 from pimper_torch.evidence.scenes.rendered_folder import (
     FORMAT,
     FORMAT_VERSION,
-    MAP_NAMES,
     unpack_maps,
 )
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
@@ -50,9 +50,6 @@ def read_rendered(
     Returns:
         Cameras and lights in float64. Every view has a light of its own, and a position of its own
         unless ``lights_per_pose`` share one.
-
-    Raises:
-        InputError: Not such a folder, or something in it is missing or damaged.
     """
     root = DataSetPath(Path(folder), _KIND)
     names, settings = _read_report(root)

@@ -21,9 +21,6 @@ from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import Cameras, Record
 
-# Clear of the surface in embree's float32, yet below what a pixel shows.
-_CLEARANCE = 2e-4
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spots(Record):
@@ -70,7 +67,8 @@ class TracedObjects:
         self._roughness = torch.tensor([one.roughness for one in objects])
         self.outside = torch.tensor([one.surroundings for one in objects])
         extent = vertices.amax(dim=0) - vertices.amin(dim=0)
-        self.clearance = _CLEARANCE * float(extent.norm())
+        # Clear of the surface in embree's float32, yet below what a pixel shows.
+        self.clearance = 2e-4 * float(extent.norm())
 
     def cast(self, origins: Float[Tensor, "ray 3"], along: Float[Tensor, "ray 3"]) -> Hits:
         """Find what rays meet first."""
@@ -141,12 +139,13 @@ class TracedObjects:
         return albedo
 
 
-# Rays worked on at once: what they need stays in the processor's cache.
-_BATCH = 1 << 16
 # Square roots of radiance that differ by more are sampled finely: about 4 levels of 255.
 _UNEVEN = 0.015
 # A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
 _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
+
+
+MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -198,7 +197,7 @@ def render_frame(
         radiance = torch.where(hit, shaded.matte + shaded.mirrored, 0)
         return spots, shaded, sensor.exposure * radiance
 
-    found = [seen_at(pixels) for pixels in torch.split(centers, _BATCH)]
+    found = [seen_at(pixels) for pixels in torch.split(centers, (1 << 16))]
     spots, shaded, radiances = zip(*found, strict=True)
     radiance = torch.cat(radiances)
     if sensor.supersample > 1:
@@ -207,7 +206,7 @@ def render_frame(
         offsets = torch.cartesian_prod(steps, steps)
         fine = [
             torch.stack([seen_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
-            for rows in torch.split(uneven, _BATCH // 4)
+            for rows in torch.split(uneven, (1 << 16) // 4)
         ]
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))

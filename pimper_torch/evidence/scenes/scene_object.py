@@ -22,10 +22,6 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
 from pimper_torch.relighting.lit_surface import facet_density, masking
 
-# A dielectric mirrors everything at grazing incidence; no real one mirrors less than 2 % head
-# on, so that what is given less than that stands for something wholly or partly matte.
-_MIN_SPECULAR = 0.02
-
 
 def fresnel(
     cosine: Float[Tensor, "*batch"], specular: Float[Tensor, "*batch"]
@@ -36,7 +32,8 @@ def fresnel(
         cosine: Between the light and what it falls on.
         specular: The share at a cosine of 1; 0 mirrors nothing at any angle.
     """
-    grazing = (specular / _MIN_SPECULAR).clamp_max(1)
+    # No real dielectric mirrors less than 2 % head on; less stands for something partly matte.
+    grazing = (specular / 0.02).clamp_max(1)
     return specular + (grazing - specular) * (1 - cosine).clamp(0, 1) ** 5
 
 

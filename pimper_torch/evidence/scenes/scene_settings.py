@@ -48,10 +48,6 @@ def expose(
     return (radiance + spread * noise).clamp(0, 1)
 
 
-# 64 GB, in which no photograph of a camera is rendered.
-_MOST_RAYS = 640_000_000
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
     """Settings of a rendered scene.
@@ -150,8 +146,8 @@ class SceneConfig:
         """Refuse what cannot be photographed."""
         require_ranges(self)
         _ = self.sensor  # refuses its own
-        # Rays of a photograph take 100 bytes each.
-        rays = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
+        # Rays of a photograph take 100 bytes each: 64 GB.
+        rays = int((640_000_000 / (self.width * self.height)) ** 0.5)
         moving = self.turned_over or self.fixed_point_light or self.jitter_px > 0
         shared = self.num_views % self.lights_per_pose == 0
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg

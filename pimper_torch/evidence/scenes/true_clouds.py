@@ -32,7 +32,6 @@ def sparse_scene(
     their errors are along the rays as in real clouds.
 
     Args:
-        num_points: At most.
         noise_px: Standard deviation of every observation.
         outlier_fraction: Fraction of the points that are moved along their first ray by up to
             half their depth, with tracks of two views.
@@ -140,36 +139,27 @@ def _mislead(
     return torch.cat([moved, points[count:]]), seen
 
 
-_STEEPEST = 0.2  # cosine below which a surface is too slanted for its features to be found
-_CLEARANCE = 1e-3  # of the distance to the camera
-
-
 def true_model(
     surface: Mesh,
     blockers: Mesh,
     cameras: Cameras,
     names: tuple[str, ...],
     generator: torch.Generator,
-    *,
-    num_points: int = 1500,
-    min_views: int = 3,
 ) -> tuple[SparseModel, Float[Tensor, "point channel"]]:
     """Draw points evenly over a surface and follow them through the photographs.
 
     Args:
-        surface: With albedo.
         blockers: Everything that may stand in front of it.
-        min_views: Views that see a point at least, or all there are.
 
     Returns:
-        Cameras, at most ``num_points`` points with exact observations, and the points' albedo.
+        Cameras, at most 1,500 points with exact observations, and the points' albedo.
     """
-    points, normals, albedo = _scatter(surface, 6 * num_points, generator)
+    points, normals, albedo = _scatter(surface, 6 * 1500, generator)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = _seen(points, normals, pixels, depth, blockers, cameras)
-    fewest = min(min_views, cameras.num_views)
+    fewest = min(3, cameras.num_views)
     (kept,) = torch.nonzero(seen.sum(dim=0) >= fewest, as_tuple=True)
-    kept = kept[:num_points]
+    kept = kept[:1500]
     point, view = torch.nonzero(seen[:, kept].mT, as_tuple=True)
     model = SparseModel(
         names=names,
@@ -214,9 +204,10 @@ def _seen(
         eye = cameras.centers_world[view]
         toward = eye - points
         distance = toward.norm(dim=-1)
-        facing = (normals * toward).sum(dim=-1) > _STEEPEST * distance
+        # More slanted, features of a surface are not found.
+        facing = (normals * toward).sum(dim=-1) > 0.2 * distance
         size = cameras.sizes_px[view].to(pixels)
         framed = (depth[view] > 0) & ((pixels[view] > 1) & (pixels[view] < size - 1)).all(dim=-1)
-        hidden = caster.occluded(points, eye, _CLEARANCE * distance)
+        hidden = caster.occluded(points, eye, 1e-3 * distance)
         found.append(facing & framed & ~hidden)
     return torch.stack(found)

@@ -119,12 +119,9 @@ def room(generator: torch.Generator) -> tuple[SceneObject, ...]:
     )
 
 
-OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
-_MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
 _PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs; those of noise are less
 _COLOUR = (1 << 21) + 2  # number of the point lights' colours
 _WINDOW = (-0.74, -0.47, 0.48)  # direction: left of the cameras, and above
-_FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +133,6 @@ class Scene:
         objects: At rest in the world: the object's first, then its table, if that turns along.
         fixed: Objects that are at rest while the object turns or is turned over, in the room's
             frame: z up from the table's plane, origin on the turntable's axis, camera at -y.
-        world_from_room: Of each photograph.
     """
 
     name: str
@@ -205,7 +201,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     cameras, lights, target, azimuths = _taken(points, config, generator)
     world_from_room = rotated_about(target, azimuths)
     reach = float((points - target)[:, :2].norm(dim=-1).amax())
-    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
+    turning, fixed = _surroundings(config, generator, target, 1.15 * reach)
     return Scene(
         name=str(name_or_path),
         config=config,
@@ -227,7 +223,8 @@ def _taken(
     """Place cameras and lights round an object on the table."""
     lowest, highest = points.amin(dim=0), points.amax(dim=0)
     toward = _toward(config, generator)
-    focal_px = _FOCAL * config.width
+    # A normal to short telephoto lens.
+    focal_px = 1.6 * config.width
     target, distance = aim_to_fit(
         toward,
         points,
@@ -402,7 +399,7 @@ def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
     if longest <= 0 or not math.isfinite(longest):
         raise InputError(f"{path}: all its vertices are at one point; needed: a surface.")
     foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
-    vertices = (vertices - foot) * (OBJECT_SIZE / longest)
+    vertices = (vertices - foot) * (2.4 / longest)
     # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
     # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
     positions, own = torch.unique(vertices, dim=0, return_inverse=True)
