@@ -150,7 +150,6 @@ _MAX_RESIDUAL = 0.015
 # Encoded value up to which shading is not first-order.
 _DARK = 0.1
 
-
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
 

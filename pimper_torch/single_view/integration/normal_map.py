@@ -51,7 +51,6 @@ def integrate_normal_map(
     spacing: tuple[float, float] = (1.0, 1.0),
     weight: Raster | None = None,
     known_depth: Raster | None = None,
-    known_weight: Raster | None = None,
     method: Integration = "discontinuities",
 ) -> IntegratedMap:
     """Integrate a normal map to depth.
@@ -64,9 +63,8 @@ def integrate_normal_map(
         intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
             rays are parallel.
         spacing: Distance of neighbouring pixels in a row and in a column, under parallel rays.
-        weight: Of each normal; 1 if not given, 0 like not finite.
+        weight: Of each normal, that of a known depth being 1; 1 if not given, 0 like not finite.
         known_depth: Depth at some pixels, NaN at the others.
-        known_weight: Of the known depths, in units of that of one normal; 1 if not given.
         method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
             squares.
 
@@ -80,11 +78,11 @@ def integrate_normal_map(
     0.0
     """
     normals = torch.as_tensor(normals)
-    mask, weight, known_depth, known_weight = (
+    mask, weight, known_depth = (
         None if raster is None else torch.as_tensor(raster)
-        for raster in (mask, weight, known_depth, known_weight)
+        for raster in (mask, weight, known_depth)
     )
-    _refuse(normals, mask, weight, known_depth, known_weight, spacing)
+    _refuse(normals, mask, weight, known_depth, spacing)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
     _refuse_convention(normals, mask)
@@ -94,8 +92,8 @@ def integrate_normal_map(
     if intrinsics is not None:
         intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
     mask = mask[box]  # the box of the mask, to save time and memory
-    weight, known_depth, known_weight = (
-        None if raster is None else raster[box] for raster in (weight, known_depth, known_weight)
+    weight, known_depth = (
+        None if raster is None else raster[box] for raster in (weight, known_depth)
     )
     unit = _usable(normals[box], mask, weight)
     if intrinsics is None:
@@ -103,7 +101,7 @@ def integrate_normal_map(
     else:
         steps = perspective_steps(unit, mask, intrinsics)
     continuity = None
-    anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
+    anchor, unknown = _known(known_depth, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
         continuity = find_discontinuities(steps, *weights, anchor, unknown)
@@ -153,7 +151,6 @@ def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tupl
 
 def _known(
     depth: Float[Tensor, "height width"] | None,
-    weight: Float[Tensor, "height width"] | None,
     mask: Bool[Tensor, "height width"],
     steps: Steps,
     intrinsics: Float[Tensor, "3 3"] | None,
@@ -167,10 +164,9 @@ def _known(
             f"known_depth has {int((depth[given] <= 0).sum())} values that are not positive; "
             "under a pinhole all must be. Mark pixels of unknown depth with NaN."
         )
-    strength = torch.where(given, 1.0 if weight is None else weight.double(), 0).double()
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
-    return strength / (steps.unit_right * steps.unit_down), unknown
+    return given.double() / (steps.unit_right * steps.unit_down), unknown
 
 
 def _refuse_convention(
@@ -199,7 +195,6 @@ def _refuse(
     mask: Tensor | None,
     weight: Tensor | None,
     known_depth: Tensor | None,
-    known_weight: Tensor | None,
     spacing: tuple[float, float],
 ) -> None:
     if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
@@ -208,26 +203,18 @@ def _refuse(
             f"{tuple(normals.shape)}; needed: floating point, height width 3."
         )
     size = normals.shape[:2]
-    rasters = {
-        "mask": mask,
-        "weight": weight,
-        "known_depth": known_depth,
-        "known_weight": known_weight,
-    }
-    for name, raster in rasters.items():
+    for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
         if raster is not None and raster.shape != size:
             raise InputError(
                 f"{name} is {raster.shape[0]} x {raster.shape[1]} pixels, the normals "
                 f"{size[0]} x {size[1]}; both must be of one size."
             )
-        if name.endswith("weight") and raster is not None and not bool((raster >= 0).all()):
+        if name == "weight" and raster is not None and not bool((raster >= 0).all()):
             raise InputError(
                 f"{name} has {int((~(raster >= 0)).sum())} values that are negative or NaN; "
                 "each must be 0 or more."
             )
     if mask is not None and not bool(mask.any()):
         raise InputError("mask has no pixel; at least one must be inside.")
-    if known_weight is not None and known_depth is None:
-        raise InputError("known_weight was given without known_depth; give both.")
     if not all(0 < step < math.inf for step in spacing):
         raise InputError(f"spacing is {spacing}; both distances must be above 0.")

@@ -1,10 +1,9 @@
 """Photometric stereo from one viewpoint, by any of the methods."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -39,17 +38,6 @@ METHODS: dict[str, tuple[str, ...]] = {
 }
 
 
-class PixelStatus(IntEnum):
-    """The status of a pixel."""
-
-    FOUND = 0
-    OUTSIDE = 1  # of the mask
-    TOO_FEW = 2  # samples with weight, for the unknowns of the method
-    FLAT = 3  # the lights that reach it lie in a plane, and do not determine its normal
-    BLACK = 4  # its radiance is zero
-    AVERTED = 5  # its normal does not face the viewer
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PhotometricStereo(Record):
     """Normals, albedo and lights of one viewpoint.
@@ -60,8 +48,8 @@ class PhotometricStereo(Record):
             length 1.
         lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
-        valid: Where the normal is determined and faces the viewer.
-        finding: A :class:`PixelStatus` for each pixel.
+        valid: Where samples are as many as unknowns, lights span space, and the normal faces the
+            viewer.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -71,10 +59,8 @@ class PhotometricStereo(Record):
     lights: Float[Tensor, "view 3"]
     lit: Bool[Tensor, "view height width"]
     valid: Bool[Tensor, "height width"]
-    finding: Int[Tensor, "height width"]
     applied: BasRelief | None
     free: str
-    unused_views: tuple[int, ...]
 
 
 def photometric_stereo(
@@ -218,17 +204,8 @@ def _spread_out(
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
     enough, spanned = determined(found.weight, found.lights)
-    finding = torch.full_like(spanned, int(PixelStatus.FOUND), dtype=torch.long)
-    checks = [
-        (found.normals[2] >= 0, PixelStatus.AVERTED),
-        ((found.normals == 0).all(dim=0) | (found.albedo <= 0).all(dim=0), PixelStatus.BLACK),
-        (~spanned, PixelStatus.FLAT),
-        (~enough, PixelStatus.TOO_FEW),
-    ]
-    for wrong, name in checks:  # the last one that applies is reported
-        finding = torch.where(wrong, int(name), finding)
-    raster = torch.full(mask.shape, int(PixelStatus.OUTSIDE), device=mask.device)
-    raster[mask] = finding
+    valid = torch.zeros_like(mask)
+    valid[mask] = enough & spanned & (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
     normals = like.new_zeros(*mask.shape, 3)
     normals[mask] = found.normals.mT.to(like)
     albedo = like.new_zeros(*mask.shape, len(found.albedo))
@@ -244,11 +221,9 @@ def _spread_out(
         albedo=albedo,
         lights=lights,
         lit=lit,
-        valid=raster == int(PixelStatus.FOUND),
-        finding=raster,
+        valid=valid,
         applied=found.applied,
         free=found.free,
-        unused_views=tuple(torch.nonzero(~used)[:, 0].tolist()),
     )
 
 

@@ -280,7 +280,7 @@ def test_known_depths_fix_the_constant_and_bend_what_normals_say(method):
             normals,
             spacing=(2 / 30, 2 / 30),
             known_depth=known,
-            known_weight=torch.full_like(z, weight),
+            weight=torch.full_like(z, 1 / weight),
             method="weighted",
         )
         for weight in (1.0, 1e6)
@@ -365,7 +365,6 @@ def test_float32_normals_give_float32_depth():
     [
         ({"mask": torch.zeros(6, 6, dtype=torch.bool)}, "no pixel"),
         ({"weight": -torch.ones(6, 6)}, "36 values"),
-        ({"known_weight": torch.ones(6, 6)}, "without known_depth"),
         ({"known_depth": torch.zeros(6, 6), "intrinsics": torch.eye(3)}, "not positive"),
         ({"spacing": (1.0, 0.0)}, "spacing"),
     ],
