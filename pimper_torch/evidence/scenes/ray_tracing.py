@@ -144,7 +144,6 @@ _UNEVEN = 0.015
 # A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
 _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
-
 MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
 
 

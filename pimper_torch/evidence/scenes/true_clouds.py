@@ -1,10 +1,9 @@
 """Sparse clouds with tracks from the truth, as if structure from motion had run."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
 from pimper_torch.evidence.scenes.render_in_memory import RenderedScene
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
@@ -20,10 +19,7 @@ def sparse_scene(
     num_points: int,
     generator: torch.Generator,
     *,
-    min_views: int = 3,
     noise_px: float = 0.0,
-    outlier_fraction: float = 0.0,
-    in_views: tuple[int, ...] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> SparseScene:
     """Sample visible surface points, follow them through the views and triangulate them.
@@ -33,27 +29,18 @@ def sparse_scene(
 
     Args:
         noise_px: Standard deviation of every observation.
-        outlier_fraction: Fraction of the points that are moved along their first ray by up to
-            half their depth, with tracks of two views.
-        in_views: Pick points in the maps of these views; ``None`` is all of them.
         dtype: Of photographs, cameras and points.
     """
-    require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
-    require(0 <= outlier_fraction < 1, "outlier_fraction", outlier_fraction, "at least 0, below 1")
     cameras = scene.cameras
-    views = tuple(range(cameras.num_views)) if in_views is None else in_views
-    points = _pick(scene, views, 4 * num_points, generator)
+    points = _pick(scene, 4 * num_points, generator)
     pixels, seen = _follow(scene, points)
-    (kept,) = torch.nonzero(seen.sum(dim=1) >= min_views, as_tuple=True)
+    (kept,) = torch.nonzero(seen.sum(dim=1) >= 3, as_tuple=True)
     kept = kept[:num_points]
     points, pixels, seen = points[kept], pixels[kept], seen[kept]
     if noise_px > 0:
         spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         pixels = pixels + noise_px * spread.to(pixels)
         points = triangulate_rays(cameras, pixels, seen)
-    num_outliers = round(outlier_fraction * len(points))
-    if num_outliers > 0:
-        points, seen = _mislead(points, seen, cameras, num_outliers, generator)
     where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
     errors = (where - pixels).norm(dim=-1)
     point_index, view_index = torch.nonzero(seen, as_tuple=True)
@@ -72,13 +59,11 @@ def sparse_scene(
     )
 
 
-def _pick(
-    scene: RenderedScene, views: tuple[int, ...], count: int, generator: torch.Generator
-) -> Float[Tensor, "point 3"]:
-    """Unproject pixels drawn at random from the depth maps of some views."""
+def _pick(scene: RenderedScene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Unproject pixels drawn at random from the depth maps."""
     cameras, found = scene.cameras, []
-    fraction = -(-count // len(views))
-    for view in views:
+    fraction = -(-count // cameras.num_views)
+    for view in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[view])
         depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
         (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
@@ -119,24 +104,6 @@ def _follow(
         bracketed = (own > patch.amin(dim=0) - slack) & (own < patch.amax(dim=0) + slack)
         seen[view, inside] = smooth & bracketed
     return pixels.movedim(0, 1), seen.mT
-
-
-def _mislead(
-    points: Float[Tensor, "point 3"],
-    seen: Bool[Tensor, "point view"],
-    cameras: Cameras,
-    count: int,
-    generator: torch.Generator,
-) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, "point view"]]:
-    """Move the first ``count`` points along their first rays; keep two views of each."""
-    wrong: Int[Tensor, " point"] = torch.arange(count)
-    order = torch.cumsum(seen[wrong].long(), dim=1)
-    seen = torch.cat([seen[wrong] & (order <= 2), seen[count:]])
-    first = seen[wrong].long().argmax(dim=1)
-    eyes = cameras.centers_world[first]
-    factor = 1 + (torch.rand(count, 1, generator=generator, dtype=torch.float64) - 0.5).to(points)
-    moved = eyes + factor * (points[wrong] - eyes)
-    return torch.cat([moved, points[count:]]), seen
 
 
 def true_model(
