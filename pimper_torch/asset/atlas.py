@@ -18,7 +18,6 @@ from pimper_torch.records import Mesh, Record
 # A choice: what browsers on telephones take.
 MAX_SIDE = 4096
 
-
 # The same mesh takes it 1.5 s. A choice: long enough for a slow machine.
 _LIMIT_S = 60.0
 

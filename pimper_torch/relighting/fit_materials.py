@@ -16,12 +16,7 @@ from torch import Tensor
 
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.relighting.fit_lights import (
-    Observed,
-    ViewLights,
-    fit_strengths,
-    loss_scale,
-)
+from pimper_torch.relighting.fit_lights import Observed, ViewLights, fit_strengths, loss_scale
 from pimper_torch.relighting.lit_surface import LitSurface, Materials, diffuse_color, response
 
 _MATTE = (0.0, 1.0, 0.0)

@@ -15,12 +15,7 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.raster import nearest
-from pimper_torch.evidence.datasets.sampling import (
-    CamerasOf,
-    LightOptions,
-    Shot,
-    read_shots,
-)
+from pimper_torch.evidence.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Capture, Truth

@@ -12,11 +12,7 @@ from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.datasets.raster import read_photographs
 from pimper_torch.evidence.scenes.ray_tracing import MAP_NAMES
-from pimper_torch.evidence.scenes.rendered_folder import (
-    FORMAT,
-    FORMAT_VERSION,
-    unpack_maps,
-)
+from pimper_torch.evidence.scenes.rendered_folder import FORMAT, FORMAT_VERSION, unpack_maps
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.numpy_files import read_npz

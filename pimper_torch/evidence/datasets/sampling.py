@@ -11,10 +11,7 @@ from torch import Tensor
 
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import some
-from pimper_torch.evidence.datasets.raster import (
-    intrinsics_from_indices,
-    read_photographs,
-)
+from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.io.decode import read_header
 from pimper_torch.radiometry import LINEAR, Encoding

@@ -10,11 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.evidence.scenes.procedural_meshes import join
 from pimper_torch.evidence.scenes.scene_lights import Lights, PointLight
-from pimper_torch.evidence.scenes.scene_object import (
-    SceneObject,
-    normals_at_vertices,
-    reflect,
-)
+from pimper_torch.evidence.scenes.scene_object import SceneObject, normals_at_vertices, reflect
 from pimper_torch.evidence.scenes.scene_settings import SensorConfig, expose
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through

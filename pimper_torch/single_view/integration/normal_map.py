@@ -13,10 +13,7 @@ from torch.nn.functional import pad
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
-from pimper_torch.single_view.integration.discontinuities import (
-    Continuity,
-    find_discontinuities,
-)
+from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 

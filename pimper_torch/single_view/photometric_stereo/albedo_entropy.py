@@ -16,10 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import (
-    BasRelief,
-    standard_relief,
-)
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 
 def chromaticities(
