@@ -116,6 +116,7 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
     # Frames that have moved by less than a pixel of those that flow is measured in show the same.
     length = max(_stretch(steps, count), 1 / 320)
     place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
+    # Sums of the length may round down.
     stretch = (place + 1e-6).floor().clamp(max=count - 1)
     middle = (place - stretch - 0.5).abs()
     numbers = []

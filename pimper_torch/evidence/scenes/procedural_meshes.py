@@ -175,7 +175,7 @@ def mesh_level_set(
     ]
     grid = torch.cartesian_prod(*axes)
     with torch.no_grad():
-        values = torch.cat([level(part) for part in torch.split(grid, (1 << 20))]).reshape(
+        values = torch.cat([level(part) for part in torch.split(grid, 1 << 20)]).reshape(
             counts.tolist()
         )
     found, faces, _, _ = marching_cubes(

@@ -192,7 +192,7 @@ def render_frame(
         radiance = torch.where(hit, shaded.matte + shaded.mirrored, 0)
         return spots, shaded, sensor.exposure * radiance
 
-    found = [seen_at(pixels) for pixels in torch.split(centers, (1 << 16))]
+    found = [seen_at(pixels) for pixels in torch.split(centers, 1 << 16)]
     spots, shaded, radiances = zip(*found, strict=True)
     radiance = torch.cat(radiances)
     if sensor.supersample > 1:
@@ -201,7 +201,7 @@ def render_frame(
         offsets = torch.cartesian_prod(steps, steps)
         fine = [
             torch.stack([seen_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
-            for rows in torch.split(uneven, (1 << 16) // 4)
+            for rows in torch.split(uneven, 1 << 14)
         ]
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))
