@@ -38,7 +38,7 @@ Resolver = Callable[[OneView, Tensor, Tensor], BasRelief]
 
 def entropy_and_colour(made: OneView, shading: Tensor, _: Tensor) -> BasRelief:
     """Minimise the entropy of albedo within groups of one chromaticity."""
-    return resolve_by_albedo_entropy(shading, chromaticity_groups(made.images, made.mask))
+    return resolve_by_albedo_entropy(shading, chromaticity_groups(made.images[:, :, made.mask]))
 
 
 RESOLVERS: dict[str, Resolver] = {

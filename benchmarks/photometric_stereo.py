@@ -297,7 +297,6 @@ def rendered(
         irradiance=strength,
         ambient=torch.zeros_like(strength),
         target_world=torch.zeros(3, dtype=torch.float64),
-        flash=torch.zeros_like(strength),
     )
     texture = patches(generator) if one_strength else lambda points: 0.7 + 0 * points
     scene = render_objects(

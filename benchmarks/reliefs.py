@@ -38,15 +38,21 @@ class WavyPlane:
         for _ in range(_NEWTON_STEPS):
             points = origins + distance[..., None] * directions
             gap = points[..., 2] - self.height_field(points[..., :2])
-            slope = self.height_field.gradient(points[..., :2])
+            slope = self._slope(points[..., :2])
             closing = directions[..., 2] - (slope * directions[..., :2]).sum(-1)
             distance = distance - gap / closing
         return torch.where(start.isfinite(), distance, torch.inf)
 
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Lean against the gradient."""
-        slope = self.height_field.gradient(points[..., :2])
+        slope = self._slope(points[..., :2])
         return normalize(torch.cat([-slope, torch.ones_like(slope[..., :1])], dim=-1), dim=-1)
+
+    def _slope(self, places: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+        waves = self.height_field
+        vectors = waves.wave_vectors.to(places)
+        angle = places @ vectors.mT + waves.phases.to(places)
+        return (angle.cos() * waves.amplitudes.to(places)) @ vectors
 
 
 def ball(

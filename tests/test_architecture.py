@@ -78,7 +78,7 @@ SOLE_IMPORTERS = {
     "fcpw": {"geometry/nearest.py"},
     "kornia_rs": {"io/decode.py", "io/tiff.py"},
     "tifffile": {"io/tiff.py"},
-    "cv2": {"silhouettes/opencv.py", "size/aruco.py", "video/quality.py"},
+    "cv2": {"silhouettes/opencv.py", "size/aruco.py", "video/choose.py"},
     "av": {"video/read.py"},
     "numba": {"kernels/compile.py"},
     "yaml": {"config.py"},

@@ -23,19 +23,6 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Mesh, Record
 from pimper_torch.viz.maps import albedo_scale, base_color
 
-# Least component along the blended normal in a normal map: viewers do not draw a surface that
-# faces away from itself. A choice.
-_LEAST_OUTWARD = 0.02
-
-# Texels beside a chart that blending may reach are a diagonal away.
-_BESIDE = 1.5
-
-# Barycentric coordinate to which a face is continued: slivers would be continued far. A choice.
-_CONTINUED = 1.0
-
-# Worked on at once: a choice, some 100 bytes of memory for each.
-_BLOCK_TEXELS = 250_000
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Textured(Record):
@@ -47,7 +34,6 @@ class Textured(Record):
         normals: Of its vertices, unit; those that the normal map is relative to.
         uv: Right and down over the textures, in [0, 1].
         tangent: Unit along ``u``, and the sign of the bitangent.
-        base_color: sRGB.
         normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
         reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
     """
@@ -126,7 +112,7 @@ def baked(
         return torch.cat(columns, dim=1), met.face >= 0
 
     (texels,) = torch.nonzero(laid.face >= 0, as_tuple=True)
-    blocks = list(side_by_side(bake, torch.split(texels, _BLOCK_TEXELS), tracked=False))
+    blocks = list(side_by_side(bake, torch.split(texels, 250_000), tracked=False))
     raster = values.new_zeros(len(laid.face), values.shape[1] + own.shape[1])
     raster[texels] = torch.cat([found for found, _ in blocks])
     known = torch.zeros_like(laid.face, dtype=torch.bool)
@@ -191,11 +177,13 @@ def _laid(atlas: Atlas) -> Hits:
     start = torch.cat([centers, torch.full_like(centers[:, :1], -1.0)], dim=1)
     met = RayCaster(flat, atlas.faces).cast(start, torch.tensor([0.0, 0, 1]).expand_as(start))
     nearest, distance = _nearest_known((met.face >= 0).reshape(atlas.height, atlas.width))
-    (beside,) = torch.nonzero((distance > 0) & (distance < _BESIDE), as_tuple=True)
+    # Texels that blending may reach are a diagonal away.
+    (beside,) = torch.nonzero((distance > 0) & (distance < 1.5), as_tuple=True)
     face, barycentric = met.face.clone(), met.barycentric.clone()
     face[beside] = met.face[nearest[beside]]
     barycentric[beside] = barycentric_2d(centers[beside], flat[atlas.faces[face[beside]], :2])
-    close = (barycentric > -_CONTINUED).all(dim=1)
+    # Slivers would be continued far.
+    close = (barycentric > -1.0).all(dim=1)
     return met.replace(face=torch.where(close, face, -1), barycentric=barycentric)
 
 
@@ -210,9 +198,8 @@ def _relative(
     volume = (tangent * across[0]).sum(dim=1, keepdim=True)
     found = torch.stack([(normals * one).sum(dim=1) for one in across], dim=1) * volume.sign()
     found = normalize(found, dim=1)
-    return normalize(
-        torch.cat([found[:, :2], found[:, 2:].clamp_min(_LEAST_OUTWARD)], dim=1), dim=1
-    )
+    # Viewers do not draw a surface that faces away from itself.
+    return normalize(torch.cat([found[:, :2], found[:, 2:].clamp_min(0.02)], dim=1), dim=1)
 
 
 def _nearest_known(

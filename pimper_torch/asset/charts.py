@@ -5,8 +5,6 @@ import sys
 import numpy as np
 import xatlas
 
-_PADDING_TEXELS = 4  # two texels of every chart beside its own, so that three mip levels are apart
-
 
 def main(pieces: str, found: str) -> None:
     """Unwrap pieces of a mesh onto one atlas.
@@ -26,7 +24,8 @@ def main(pieces: str, found: str) -> None:
     for places, triangles in zip(vertices, faces, strict=True):
         atlas.add_mesh(places, triangles)
     options = xatlas.PackOptions()
-    options.padding, options.texels_per_unit = _PADDING_TEXELS, 1.0
+    # Two texels of every chart beside its own, so that three mip levels are apart.
+    options.padding, options.texels_per_unit = 4, 1.0
     atlas.generate(xatlas.ChartOptions(), options)
     vertex: list[np.ndarray] = []
     uv: list[np.ndarray] = []

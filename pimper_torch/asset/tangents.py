@@ -21,7 +21,6 @@ def tangents(
     are weighted by their area on the texture.
 
     Args:
-        normals: Unit.
         uv: Right and down over the texture.
     """
     a, b, c = vertices[faces].unbind(dim=1)

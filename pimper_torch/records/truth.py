@@ -40,7 +40,6 @@ class Truth(Record):
     lit: Bool[Tensor, "view height width"] | None = None
     highlight: Bool[Tensor, "view height width"] | None = None
     lights_world: Float[Tensor, "view 4"] | None = None
-    point_lights_world: Float[Tensor, "view 3"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

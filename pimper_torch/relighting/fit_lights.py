@@ -132,9 +132,6 @@ Strengths = tuple[
     Float[Tensor, "light channel"], Float[Tensor, "light channel"], Float[Tensor, " light"]
 ]
 
-_REWEIGHTED = 3
-_LEAST_DEVIATION = 0.002  # half a level of eight bits
-
 
 def loss_scale(seen: Observed) -> float:
     """Return the scale of Cauchy's loss, by a light of first order without any shadow."""
@@ -148,7 +145,8 @@ def loss_scale(seen: Observed) -> float:
         residuals.append(values - rows @ light)
     size = torch.stack(residuals).norm(dim=0)
     deviation = float(median_deviation(size, torch.ones_like(size, dtype=torch.bool)))
-    return CAUCHY_TUNING * max(deviation, _LEAST_DEVIATION)
+    # Half a level of eight bits.
+    return CAUCHY_TUNING * max(deviation, 0.002)
 
 
 def fit_strengths(
@@ -169,7 +167,7 @@ def fit_strengths(
     base, radiance = diffuse, seen.radiance
     used = (~seen.saturated)[:, None].expand_as(response).float()
     robust = torch.ones_like(response[..., 0])
-    for _ in range(_REWEIGHTED):
+    for _ in range(3):
         weight = robust[..., None] * seen.weight * used
         aa, ab = (weight * base**2).sum(dim=1), (weight * base * response).sum(dim=1)
         bb = (weight * response**2).sum(dim=1)
@@ -241,7 +239,6 @@ def fit_lights(
     Args:
         mesh: In the scene's frame, with albedo.
         silhouettes: Of the scene's views; by default the mesh's outline.
-        materials: By default matte.
     """
     surface = LitSurface(mesh)
     return lights_of(surface, observe_all(surface, scene, silhouettes), materials)

@@ -16,15 +16,7 @@ from torch import Tensor
 
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Mesh, Silhouettes, SparseScene
-from pimper_torch.relighting.fit_lights import (
-    Observed,
-    ViewLights,
-    fit_strengths,
-    lights_of,
-    loss_scale,
-    observe_all,
-)
+from pimper_torch.relighting.fit_lights import Observed, ViewLights, fit_strengths, loss_scale
 from pimper_torch.relighting.lit_surface import LitSurface, Materials, diffuse_color, response
 
 _MATTE = (0.0, 1.0, 0.0)
@@ -36,32 +28,15 @@ _METALLIC = (0.25, 0.5, 0.75, 1.0)
 _STEPS = (1.5, 1.22, 1.1, 1.05)
 
 _CLUSTERS = 4
-_VERTICES = 4096  # that clusters are found from
-_PIXELS = 20_000  # of all photographs together, and of one at most
-_PIXELS_OF_ONE = 3000
 
 # A gain counts from this fraction of the loss, and from so many standard errors of its mean.
 _LEAST_GAIN, _SIGNIFICANT = 2e-3, 1.0
 
 
-def fit_materials(
-    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes | None = None
-) -> Materials:
-    """Fit the materials of a surface to photographs of a scene.
-
-    Args:
-        mesh: In the scene's frame, with albedo.
-        silhouettes: Of the scene's views; by default the mesh's outline.
-    """
-    surface = LitSurface(mesh)
-    observed = observe_all(surface, scene, silhouettes)
-    return materials_under(surface, observed, lights_of(surface, observed))
-
-
 def materials_under(
     surface: LitSurface, observed: Sequence[Observed], lights: ViewLights
 ) -> Materials:
-    """Fit materials under lights whose places are known; see :func:`fit_materials`."""
+    """Fit the materials of a surface to its photographs, under lights whose places are known."""
     trial = _Trial(surface, observed, lights)
     cluster = torch.zeros(len(surface.base_color), dtype=torch.long)
     values = torch.tensor([_MATTE])
@@ -90,7 +65,7 @@ class _Trial:
         self, surface: LitSurface, observed: Sequence[Observed], lights: ViewLights
     ) -> None:
         shown = [view for view, seen in enumerate(observed) if len(seen.radiance)]
-        most = min(_PIXELS_OF_ONE, max(1, _PIXELS // max(1, len(shown))))
+        most = min(3000, max(1, 20_000 // max(1, len(shown))))
         self.observed = [observed[view].thinned(most) for view in shown]
         self.scales = [loss_scale(seen) for seen in self.observed]
         lights = lights.take(shown)
@@ -180,7 +155,7 @@ def _around(value: Float[Tensor, " 3"], step: float) -> Float[Tensor, "candidate
 def clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> Int[Tensor, " vertex"]:
     """Divide vertices by their colour as sRGB shows it."""
     colors = srgb_from_linear(base_color.double())
-    sample = colors[:: -(-len(colors) // _VERTICES)]
+    sample = colors[:: -(-len(colors) // 4096)]
     order = sample.sum(dim=1).argsort(stable=True)
     start = sample[order[(torch.arange(count) * 2 + 1) * len(order) // (2 * count)]]
     centers, _ = kmeans2(sample.numpy(), start.numpy(), minit="matrix", missing="raise")

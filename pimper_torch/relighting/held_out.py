@@ -31,7 +31,6 @@ def predict(
 
     Args:
         mesh: With albedo; prepared where several pictures of it are wanted.
-        materials: By default matte.
     """
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
     pixels = surface.pixels(camera, 0)

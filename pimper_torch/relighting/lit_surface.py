@@ -94,9 +94,6 @@ class Materials(Record):
 # simplification moves it by, and short of what casts a shadow worth seeing.
 _LIFT = 0.004
 
-# No point is nearer to a light than this fraction of the light's distance from the centre.
-_NEAREST = 0.1
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurfacePixels(Record):
@@ -195,7 +192,8 @@ class LitSurface:
         """
         offset = (pixels.points_world - self.center_world) / self.radius
         toward = directions[:, None] - closeness[:, None, None] * offset
-        distance = toward.norm(dim=-1).clamp_min(_NEAREST)
+        # No point is nearer to a light.
+        distance = toward.norm(dim=-1).clamp_min(0.1)
         toward = toward / distance[..., None]
         cosine = (toward * pixels.normals_world).sum(dim=-1).clamp_min(0)
         if shadows:

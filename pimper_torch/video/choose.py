@@ -6,31 +6,63 @@ A jump of the pictures, in which there is no frame, counts as one distance only.
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, cat
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Record
-from pimper_torch.video.quality import motion, sharpness, thumbnail
+
+# Width of the pictures in which motion is measured. A choice: a hundredth of it is 3 pixels.
+_WIDTH_PX = 320
+
+# Lags in pixels: blur takes differences over the short one, and hardly those over the long one.
+_SHORT, _LONG = 1, 4
+
+
+def sharpness(luma: UInt8[Tensor, "height width"]) -> float:
+    """Find how much neighbours differ, as a fraction of what pixels a little apart differ.
+
+    It is that of rows or of columns, whichever is less: motion blurs along one of them. Brightness
+    and contrast cancel. It compares frames of one video; 0 where nothing differs.
+    """
+    values = luma.to(torch.float32)
+    return min(_finest(values), _finest(values.mT))
+
+
+def _finest(values: Float[Tensor, "row column"]) -> float:
+    short, long = (
+        float((values[:, lag:] - values[:, :-lag]).square().mean()) for lag in (_SHORT, _LONG)
+    )
+    return short / long if long > 0 else 0.0
+
+
+def thumbnail(luma: UInt8[Tensor, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    """Shrink a frame to where motion is measured."""
+    height, width = luma.shape
+    size = (_WIDTH_PX, max(16, round(height * _WIDTH_PX / width)))
+    small: np.ndarray = cv2.resize(luma.numpy(), size, interpolation=cv2.INTER_AREA)
+    return small
+
+
+def motion(
+    before: UInt8[np.ndarray, "height width"], after: UInt8[np.ndarray, "height width"]
+) -> float:
+    """Find how far what moves most has moved between thumbnails, as a fraction of their width.
+
+    Source: Kroeger, Timofte, Dai, Van Gool, Fast optical flow using dense inverse search,
+    ECCV 2016, for the flow.
+    """
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
+    # An object that turns before a wall covers a fifth.
+    return float(np.quantile(np.linalg.norm(flow, axis=2), 0.8)) / before.shape[1]
+
 
 # A frame is compared with one before until it has moved so far, fractions of the width: what noise
 # adds then counts once. A choice, 6 pixels of 320: flow is still sure.
 _STEP = 0.02
-
-# Of each stretch of the way, the middle from which a frame is taken: neighbours are then at least
-# two fifths of a stretch apart. A choice.
-_MIDDLE = 0.6
-
-# Frames that have moved less than this, in widths, show the same: a pixel of those that flow is
-# measured in.
-_SAME = 1 / 320
-
-# Of a stretch, by which sums of its length may be short: far above what float64 rounds.
-_ROUNDING = 1e-6
-
-# Least way of all frames together, in widths: below, nothing moved. A choice.
-_LEAST_WAY = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -38,7 +70,7 @@ class Scan(Record):
     """Quality of every frame of a video.
 
     Attributes:
-        sharpness: See :func:`~pimper_torch.video.quality.sharpness`.
+        sharpness: See :func:`sharpness`.
         way: How far the pictures have moved since the first frame, in widths.
     """
 
@@ -75,20 +107,23 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
         raise InputError(
             f"the video has {frames} frames, and {count} are to be chosen. Choose fewer."
         )
-    if whole < _LEAST_WAY:
+    if whole < 0.1:
         raise InputError(
             f"nothing moves in the {frames} frames of the video (by {whole:.1%} of their width in "
             "all); needed: a camera that goes round the object, or an object that turns."
         )
     steps = scan.way.double().diff()
-    length = max(_stretch(steps, count), _SAME)
+    # Frames that have moved by less than a pixel of those that flow is measured in show the same.
+    length = max(_stretch(steps, count), 1 / 320)
     place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
-    stretch = (place + _ROUNDING).floor().clamp(max=count - 1)
+    # Sums of the length may round down.
+    stretch = (place + 1e-6).floor().clamp(max=count - 1)
     middle = (place - stretch - 0.5).abs()
     numbers = []
+    # From the middle three fifths, so that neighbours are two fifths of a stretch apart.
     for number in sorted(set(stretch.tolist())):
         here = (stretch == number).nonzero()[:, 0]
-        inner = here[middle[here] <= max(_MIDDLE / 2, float(middle[here].min()))]
+        inner = here[middle[here] <= max(0.3, float(middle[here].min()))]
         numbers.append(inner[scan.sharpness[inner].argmax()])
     return torch.stack(numbers)
 

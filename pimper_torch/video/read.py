@@ -12,9 +12,6 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 
-# Of a frame: those of 16K are 15360 pixels wide.
-_MAX_SIDE_PX = 16_384
-
 # No list of other files leads out of this one.
 _LOCAL = {"protocol_whitelist": "file"}
 
@@ -136,9 +133,9 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                     f"{path}: FFmpeg knows no decoder for its pictures. Convert it to MP4 (H.264)."
                 )
             width, height = _shown_size(stream)
-            if max(width, height) > _MAX_SIDE_PX:
+            if max(width, height) > 16_384:
                 raise InputError(
-                    f"{path}: is {width} x {height}; needed: {_MAX_SIDE_PX} pixels a side at most."
+                    f"{path}: is {width} x {height}; needed: 16384 pixels a side at most."
                 )
             stream.thread_type = "AUTO"
             yield container, stream

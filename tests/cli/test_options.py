@@ -53,11 +53,10 @@ RUNS = {
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
         "--elevation-deg 40 --sway-deg 2 --light point --point-light-distance 3 --irradiance 0.5 "
-        "--ambient 0.2 --flash 0.1 --window 0.2 --lamp-colour 0.3 --exposure 1.2 "
+        "--ambient 0.2 --window 0.2 --lamp-colour 0.3 --exposure 1.2 "
         "--read-noise 0.01 --shot-noise 0.01 --supersample 2 --bits 16 "
         "--encoding linear --up y --specular 0.1 --roughness 0.2",
         "{ball} --out {out} {tiny} --albedo 0.6 0.5 0.4 --table patterned --rotation-deg 30",
-        "{ball} --out {out} {tiny} --conductor copper --environment changing",
         "{ball} -o {out} {tiny} --path turntable --fixed-point-light --fixed-room --fixed-table "
         "--pan-jitter-px 2 --crop-jitter-px 1",
         "{ball} -o {out} {tiny} --path turntable --no-fixed-point-light --no-fixed-room "

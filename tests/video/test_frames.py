@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter
 from pimper_torch.cli.main import main
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import list_images
-from pimper_torch.video.choose import scanned
-from pimper_torch.video.quality import motion, sharpness, thumbnail
+from pimper_torch.video.choose import motion, scanned, sharpness, thumbnail
 from pimper_torch.video.read import frame_pictures, luma_frames
 from tests.video.clips import COUNT, HEIGHT, WIDTH, positions, texture, written
 

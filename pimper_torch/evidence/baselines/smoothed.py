@@ -28,9 +28,6 @@ from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.stage import Stage
 
-# A needle's area is taken as at least this fraction of its longest edge squared.
-_MIN_SHAPE = 1e-3
-
 # Vertices of the smooth mesh if its facets are of one size, about twice as many with those of a
 # sparse cloud: more would show nothing more.
 _NUM_VERTICES = 20_000
@@ -84,7 +81,8 @@ def thin_plate(subdivision: Subdivision, mesh: Mesh) -> Float[Tensor, "vertex 3"
     rim = boundary_vertices(subdivision.faces, len(points))
     flat = elements(points, subdivision.faces)
     one = torch.ones_like(flat.area)
-    rows, cols, values = cotangent_laplacian(flat, one, _MIN_SHAPE)
+    # A needle's area is at least this fraction of its longest edge squared.
+    rows, cols, values = cotangent_laplacian(flat, one, 1e-3)
     mass = lumped_mass(flat, one)
     keep = torch.where(rim, 0, 1 / mass.sqrt())
     count = len(points)

@@ -22,18 +22,8 @@ from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.io.photographs import load_views
 from pimper_torch.paper.triangulate import Triangulate
-from pimper_torch.records import (
-    Capture,
-    CoarseMesh,
-    Estimate,
-    Record,
-    SparseScene,
-)
-from pimper_torch.sfm.reconstruct import (
-    Reconstruct,
-    find_model,
-    placed_scene,
-)
+from pimper_torch.records import Capture, CoarseMesh, Estimate, Record, SparseScene
+from pimper_torch.sfm.reconstruct import Reconstruct, find_model, placed_scene
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.store import opened
 

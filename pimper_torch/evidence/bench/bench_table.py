@@ -146,7 +146,6 @@ def write_json(table: Table, path: Path) -> None:
 
 
 MISSING = "\N{EN DASH}"
-_NOTE_LENGTH = 60
 _PUBLISHED_MARK = "†"
 
 
@@ -324,7 +323,7 @@ def short_note(row: BenchRow) -> str:
     """Return the first line of a note, cut to a cell's width; the JSON file has the whole."""
     lines = row.note.strip().splitlines()
     first = lines[0] if lines else ""
-    return first if len(first) <= _NOTE_LENGTH else first[: _NOTE_LENGTH - 1].rstrip() + "…"
+    return first if len(first) <= 60 else first[:59].rstrip() + "…"
 
 
 def _method(row: BenchRow) -> str:

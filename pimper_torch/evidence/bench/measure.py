@@ -1,6 +1,5 @@
 """The machine that figures were measured on, and peak memory."""
 
-import os
 import platform
 import re
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from pathlib import Path
 import torch
 
 from pimper_torch.cores import usable_cores
+from pimper_torch.doctor.machine import total_gb
 from pimper_torch.records import Record
 
 
@@ -51,7 +51,7 @@ def this_machine() -> Machine:
     return Machine(
         cpu=_cpu(),
         cores=usable_cores(),
-        memory_gb=round(_memory_bytes() / 2**30, 1),
+        memory_gb=round((total_gb() or 0) * 1e9 / 2**30, 1),
         gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),
@@ -66,13 +66,6 @@ def _cpu() -> str:
         text = ""
     named = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
     return named[1].strip() if named else platform.processor() or platform.machine()
-
-
-def _memory_bytes() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):
-        return 0
 
 
 def _version(name: str) -> str:

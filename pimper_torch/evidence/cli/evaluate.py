@@ -40,11 +40,7 @@ Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
 # The position of the camera in the names of the DTU and DiLiGenT-MV sets.
 _POSITION = re.compile(r"(?:rect|view)_(\d+)")
-# Photographs of the DTU set are not compared with anything; small ones save a gigabyte.
-_THUMBNAIL_PX = 200
 FORMAT = "pimper_torch evaluation"
-# Columns that the explanation of a figure needs to stand beside it.
-_ROOM = 72
 _DEFAULT = EvaluateConfig()
 
 
@@ -148,7 +144,8 @@ def read_truth(
     scan = job.scan
     if scan is None:
         raise InputError(f"{truth}: holds many scans; needed: --scan with the number of one.")
-    capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=_THUMBNAIL_PX)
+    # They are not compared with anything; small ones save a gigabyte.
+    capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=200)
     protocol = read_dtu_protocol(truth, scan) if (truth / "ObsMask").is_dir() else None
     return named_as(capture, estimate), None, protocol
 
@@ -212,7 +209,7 @@ def show(
     lines = [row for _, found in sections for row in found]
     first = 2 + max(len(row.name) for row in lines)
     second = first + 2 + max(len(row.value) for row in lines)
-    beside = console.width >= second + _ROOM
+    beside = console.width >= second + 72
     for title, found in sections:
         console.print(Text(title, style="bold"), soft_wrap=True)
         for row in found:

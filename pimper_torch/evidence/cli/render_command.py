@@ -18,7 +18,7 @@ _DEFAULT = SceneConfig()
 _RARE_NAMES = """
 processes lights-per-pose elevation-deg sway-deg fill no-fixed-point-light no-fixed-room
 no-fixed-table no-constant-light no-turned-over pan-jitter-px crop-jitter-px point-light-distance
-irradiance flash window lamp-colour read-noise shot-noise supersample up rotation-deg
+irradiance window lamp-colour read-noise shot-noise supersample up rotation-deg
 """
 _RARE = tuple(f"--{name}" for name in _RARE_NAMES.split())
 

@@ -1,4 +1,8 @@
-"""Readers of public data sets, and their layouts as formats to write."""
+"""Readers of public data sets, and their layouts as formats to write.
+
+Where a folder is laid out otherwise, or a file is missing or damaged, a reader raises
+:class:`~pimper_torch.errors.InputError`, which says what was expected and what was found.
+"""
 
 from pimper_torch.evidence.datasets.diligent import read_diligent, read_diligent_mv
 from pimper_torch.evidence.datasets.dtu_sets import read_dtu_mvs, read_dtu_points, read_dtu_protocol

@@ -15,12 +15,7 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.raster import nearest
-from pimper_torch.evidence.datasets.sampling import (
-    CamerasOf,
-    LightOptions,
-    Shot,
-    read_shots,
-)
+from pimper_torch.evidence.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots
 from pimper_torch.io.decode import decode
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Capture, Truth
@@ -28,7 +23,6 @@ from pimper_torch.records import Capture, Truth
 _ONE_VIEW, _MANY_VIEWS = "DiLiGenT", "DiLiGenT-MV"
 # Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-_SHORTEST = 0.5  # a decoded normal shorter than this is background
 _VIEW = re.compile(r"view_(\d{2})")
 
 
@@ -50,9 +44,6 @@ def read_diligent(folder: Path | str, **options: Unpack[LightOptions]) -> Captur
     Args:
         options: See :func:`~pimper_torch.evidence.datasets.sampling.read_shots`; lights count
             from 1.
-
-    Raises:
-        InputError: Another layout; names what was expected and what was found.
 
     Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
     and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
@@ -83,9 +74,6 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
 
     Returns:
         ``truth.lights_world`` has the lights' mean intensity.
-
-    Raises:
-        InputError: Another layout; names what was expected and what was found.
 
     Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
     layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
@@ -216,7 +204,8 @@ def _normals(folder: DataSetPath) -> Float[Tensor, "height width 3"] | None:
 
 def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
     rotated = normals.nan_to_num(0) * FLIP.float()
-    known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > _SHORTEST
+    # Shorter ones are background.
+    known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5
     return torch.where(known, normalize(rotated, dim=-1), 0)
 
 

@@ -52,9 +52,6 @@ def read_dtu_points(folder: Path | str, scan: int, **options: Unpack[LightOption
         options: See :func:`~pimper_torch.evidence.datasets.sampling.read_shots`; positions and
             LEDs count from 1.
 
-    Raises:
-        InputError: Another layout; names what was expected and what was found.
-
     Source: Aanaes, Dahl & Steenstrup Pedersen, Interesting Interest Points, IJCV 97, 2012,
     roboimagedata.compute.dtu.dk; layout as in the set's RobotEvalCode (GetCam.m,
     GenStrLightGrid_v2.m, ReadMe.txt).
@@ -97,9 +94,6 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
             from 1. Lights are 0 to 6, which are read by default, or :data:`ALL_LIGHTS` for
             ``max``.
 
-    Raises:
-        InputError: Another layout; names what was expected and what was found.
-
     Source: Jensen et al., Large Scale Multi-view Stereopsis Evaluation, CVPR 2014,
     roboimagedata.compute.dtu.dk; names as in the set's SampleSet and in MVSNet's loader.
     """
@@ -128,9 +122,6 @@ def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
 
     Args:
         folder: With ``ObsMask``, as for :func:`read_dtu_mvs`.
-
-    Raises:
-        InputError: Files or variables are missing or have another shape.
 
     Source: PointCompareMain.m of the set's SampleSet.
     """

@@ -56,9 +56,6 @@ def read_colmap(
             ``sparse``, ``model`` or ``0``.
         images: Folder of the photographs; by default ``images`` beside or above the model.
         masks: Folder of masks; by default ``masks`` beside that, if there is one.
-
-    Raises:
-        InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
     root = DataSetPath(Path(folder), _COLMAP)
     files = [root.path / name / f"cameras{end}" for name in _MODELS for end in (".bin", ".txt")]
@@ -108,10 +105,6 @@ def read_llff(
             and so on.
         masks: Folder of masks; by default ``masks``, ``mask`` or ``images_mask``, if there is
             one.
-
-    Raises:
-        InputError: The folder is laid out otherwise, there is not one photograph a row, or a
-            file is damaged.
     """
     root = DataSetPath(Path(folder), _LLFF)
     file = root.inner("poses_bounds.npy")
@@ -177,9 +170,6 @@ def read_idr(
     Args:
         camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
             ``cameras_large.npz``.
-
-    Raises:
-        InputError: The folder is laid out otherwise, or a file is missing or damaged.
     """
     root = DataSetPath(Path(folder), _IDR)
     file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, _IDR)
@@ -220,10 +210,6 @@ def read_meshroom(
         images: Folder of the photographs, which are looked up by file name: the paths in the
             file are those of the machine that wrote it. By default ``images`` beside the file,
             or the file's own folder.
-
-    Raises:
-        InputError: The file has another structure or describes a lens or rig that cannot be
-            read, or a photograph is missing or damaged.
     """
     file = file_in(folder, _MESHROOM, meshroom_sfm.KIND)
     pictures = _pictures(file, images)
@@ -251,10 +237,6 @@ def read_metashape(
         folder: With one ``.xml`` file; or the file itself.
         images: Folder of the photographs, which are called as the cameras are labelled, with
             or without suffix; by default as of :func:`read_meshroom`.
-
-    Raises:
-        InputError: The file is something else, defines entities, or describes a lens or rig
-            that cannot be read; or a photograph is missing or damaged.
     """
     file = file_in(folder, ("*.xml",), metashape_xml.KIND)
     pictures = _pictures(file, images)
@@ -282,9 +264,6 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
 
     Args:
         folder: With ``transforms.json`` or ``transforms_train.json``; or a file of that kind.
-
-    Raises:
-        InputError: The file has another structure, or a photograph is missing or damaged.
     """
     file = file_in(folder, _TRANSFORMS, transforms_json.KIND)
     around = file._replace(path=file.path.parent)

@@ -14,8 +14,6 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Views
 
 _CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz")
-# The object takes this fraction of the unit sphere, so that nothing of it touches the rim.
-_FRACTION = 0.9
 
 
 def write_idr(
@@ -31,7 +29,6 @@ def write_idr(
     are none: the programs want some.
 
     Args:
-        views: Undistorted.
         points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
             them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
 
@@ -81,13 +78,13 @@ def unit_sphere(
     if points_world is not None:
         points = points_world.detach().cpu().double()
         center = (points.amin(dim=0) + points.amax(dim=0)) / 2
-        radius = float((points - center).norm(dim=-1).max()) / _FRACTION
+        radius = float((points - center).norm(dim=-1).max()) / 0.9
     else:
         center = _looked_at(cameras)
         reaches = torch.tensor(
             [_reach(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
         )
-        radius = float(reaches.median() if masks is None else reaches.max() / _FRACTION)
+        radius = float(reaches.median() if masks is None else reaches.max() / 0.9)
     if not radius > 0:
         raise InputError(
             "the sphere round the object has no size; needed: points on the object, or cameras "

@@ -28,15 +28,11 @@ def read_photographs(
     """Read photographs as linear radiance, padded to one raster.
 
     Args:
-        paths: At least one.
         names: Unique, one a path.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
         masks: One a path, of any size: it is stretched over the photograph. Where there is none, a
             photograph shows the object where it is opaque.
-
-    Raises:
-        InputError: Names files that are missing or damaged, or a mask without anything in it.
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
@@ -63,25 +59,6 @@ def read_photographs(
         masks=inside if has_masks else None,
         focals_px=shrunk_focals(headers, sizes),
     )
-
-
-def require_one_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return the size of photographs before they are shrunk; refuse those of unlike kinds."""
-    headers = [read_header(there(path)) for path in paths]
-    first = headers[0]
-    for path, header in zip(paths, headers, strict=True):
-        if (header.width, header.height) != (first.width, first.height):
-            raise InputError(
-                f"{path}: is {header.width} x {header.height}, but {paths[0].name} is "
-                f"{first.width} x {first.height}; needed: files of one size, as the data set has "
-                "them. Unpack it again."
-            )
-        if header.channels != first.channels:
-            raise InputError(
-                f"{path}: has {header.channels} colours, but {paths[0].name} has "
-                f"{first.channels}; needed: photographs of one kind. Unpack the data set again."
-            )
-    return first.width, first.height
 
 
 def nearest(

@@ -11,12 +11,8 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.config import build
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.datasets.raster import read_photographs
-from pimper_torch.evidence.scenes.rendered_folder import (
-    FORMAT,
-    FORMAT_VERSION,
-    MAP_NAMES,
-    unpack_maps,
-)
+from pimper_torch.evidence.scenes.ray_tracing import MAP_NAMES
+from pimper_torch.evidence.scenes.rendered_folder import FORMAT, FORMAT_VERSION, unpack_maps
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.numpy_files import read_npz
@@ -50,9 +46,6 @@ def read_rendered(
     Returns:
         Cameras and lights in float64. Every view has a light of its own, and a position of its own
         unless ``lights_per_pose`` share one.
-
-    Raises:
-        InputError: Not such a folder, or something in it is missing or damaged.
     """
     root = DataSetPath(Path(folder), _KIND)
     names, settings = _read_report(root)
@@ -66,13 +59,12 @@ def read_rendered(
     truth_of = root.inner("truth")
     cameras = _read_cameras(truth_of.inner("sparse"), named)
     pictures = _read_views(root, named, settings, cameras, photographs)
-    point_lights, lights = _read_lights(truth_of.inner("lights.json"), len(names))
+    lights = _read_lights(truth_of.inner("lights.json"), len(names))
     moving = settings.fixed_table or settings.turned_over
     truth = Truth(
         mesh=read_mesh(truth_of.path / "mesh.ply"),
         surroundings=None if moving else read_mesh(truth_of.path / "surroundings.ply"),
         lights_world=lights[chosen],
-        point_lights_world=point_lights[chosen],
     )
     if maps:
         truth = truth.replace(**_read_maps(truth_of.inner("maps"), named, settings))
@@ -156,12 +148,7 @@ def _read_maps(
     return {key: torch.stack(values) for key, values in read.items()}
 
 
-def _read_lights(
-    file: DataSetPath, count: int
-) -> tuple[Float[Tensor, "view 3"], Float[Tensor, "view 4"]]:
-    report = file.read_json()
-    positions, harmonics = (
-        file.numbers(report.get(name), side * count, f"{name}, for each of {count} views")
-        for name, side in (("positions_world", 3), ("harmonics_world", 4))
-    )
-    return positions.reshape(-1, 3), harmonics.reshape(-1, 4)
+def _read_lights(file: DataSetPath, count: int) -> Float[Tensor, "view 4"]:
+    harmonics = file.read_json().get("harmonics_world")
+    needed = f"harmonics_world, for each of {count} views"
+    return file.numbers(harmonics, 4 * count, needed).reshape(-1, 4)

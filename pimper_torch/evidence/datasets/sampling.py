@@ -11,12 +11,9 @@ from torch import Tensor
 
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import some
-from pimper_torch.evidence.datasets.raster import (
-    intrinsics_from_indices,
-    read_photographs,
-    require_one_size,
-)
+from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.decode import read_header
 from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Cameras, Capture, Record, Truth
 
@@ -43,7 +40,6 @@ class Shot(Record):
 
     Attributes:
         direction: Unit, to the light, in our camera's axes, where it is known.
-        strength: Of the light.
     """
 
     position: int
@@ -84,8 +80,6 @@ def read_shots(
     Args:
         shots: All that there are, under different lights where they share a position.
         size_px: Of photographs that the intrinsics are for; by default that of the files.
-        positions: Read these only.
-        lights: Read these only.
         light_seed: Read one light a position, chosen by this seed, see
             :func:`one_light_per_position`; ``None`` reads all. Decided before anything is decoded.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
@@ -97,7 +91,6 @@ def read_shots(
     )
     chosen = [shots[index] for index in kept]
     paths = [shot.path for shot in chosen]
-    full_px = require_one_size(paths)
     masks = [shot.mask for shot in chosen]
     names = [shot.name for shot in chosen]
     views = read_photographs(paths, names, encoding=encoding, max_size_px=max_size_px, masks=masks)
@@ -106,7 +99,9 @@ def read_shots(
         order = sorted({shot.position for shot in chosen})
         index = torch.tensor([order.index(shot.position) for shot in chosen])
         K, cam_from_world = cameras(order)
-        across, down = (views.sizes_px[0].double() / torch.tensor(size_px or full_px)).tolist()
+        header = read_header(paths[0])
+        full_px = torch.tensor(size_px or (header.width, header.height))
+        across, down = (views.sizes_px[0].double() / full_px).tolist()
         K = scale_intrinsics(intrinsics_from_indices(K), across, down)
         poses = cam_from_world[index]
         placed = Cameras(

@@ -101,7 +101,6 @@ class CameraFigures(Record):
     mean_center: float
     median_center: float
     mean_center_percent: float
-    mean_center_percent_of_diagonal: float
     mean_focal_percent: float
     mean_position_percent: float = math.nan
     mean_bend_percent: float = math.nan
@@ -153,7 +152,6 @@ def compare_cameras(
         mean_center=float(offset.mean()),
         median_center=float(offset.median()),
         mean_center_percent=float((100 * offset / away).mean()),
-        mean_center_percent_of_diagonal=float(100 * offset.mean() / diagonal),
         mean_focal_percent=float(100 * focal.abs().mean()),
         mean_position_percent=position,
         mean_bend_percent=bend,

@@ -68,8 +68,6 @@ def _settled(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tenso
 # Of the published code, in millimetres: the density of points, the distance past which a point
 # is an outlier, and the side of the cells by which it searches for neighbours.
 THINNING_MM, CAP_MM, _CELL_MM = 0.2, 20.0, 60.0
-# The sets' objects have some ten million points 0.2 mm apart; a hundred million take gigabytes.
-_MAX_POINTS = 2e8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,10 +180,11 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     n1, n2 = n1[usable].long(), n2[usable].long()
     counts = (n1 + 1) * (n2 + 1)
     total = float(counts.double().sum())
-    if total > _MAX_POINTS:
+    # The sets' objects have some ten million; a hundred million take gigabytes.
+    if total > 2e8:
         raise InputError(
             f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at "
-            f"most {_MAX_POINTS / 2:.0g}. Is the result in the millimetres of the set? Align it "
+            "most 1e+08. Is the result in the millimetres of the set? Align it "
             "by its cameras first."
         )
     face = torch.arange(len(usable)).repeat_interleave(counts)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize, pad
+from torch.nn.functional import avg_pool2d, normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.metrics.surface_distances import joined
@@ -174,19 +174,6 @@ def meet_in_view(
     """
     valid = depth_true.isfinite() if where is None else depth_true.isfinite() & where
     hits = cast_view(mesh, cameras_true, view)
-    height, width = hits.face.shape
-    if depth_true.shape != (height, width):  # the views of a set share one raster, padded
-        if depth_true.shape[0] < height or depth_true.shape[1] < width:
-            raise InputError(
-                f"view {view}: its true depth has {tuple(depth_true.shape)} rows and columns, its "
-                f"camera {(height, width)}; needed: one and the same size."
-            )
-        frame = (0, depth_true.shape[1] - width, 0, depth_true.shape[0] - height)
-        hits = Hits(
-            face=pad(hits.face, frame, value=-1),
-            distance=pad(hits.distance, frame, value=torch.inf),
-            barycentric=pad(hits.barycentric, (0, 0, *frame)),
-        )
     both = valid & (hits.face >= 0)
     if not both.any():
         raise InputError(

@@ -144,10 +144,6 @@ def _spread(points: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
     return (points - points.mean(dim=0)).square().sum(dim=1).mean()
 
 
-# A direction of the seven that moves the surface less than this fraction of the strongest is no
-# direction: turning a ball, sliding a plane.
-_UNDETERMINED = 1e-6
-
 Method = Literal["auto", "none", "cameras", "icp"]
 
 
@@ -156,7 +152,6 @@ class Alignment(Record):
     """A similarity, and how it was found.
 
     Attributes:
-        description: In words.
         truth_from_world: Upper left block is scale times rotation.
         scale: Scene units of the truth in one of the estimate.
         cameras: Pairs of cameras that were used.
@@ -306,9 +301,8 @@ def _step_to_planes(
     rotation = torch.linalg.cross(local, unit)
     grow = (local * unit).sum(dim=1, keepdim=True)
     rows = torch.cat([rotation, unit, grow], dim=1)
-    solution = torch.linalg.pinv(rows.mT @ rows, rtol=_UNDETERMINED, hermitian=True) @ (
-        rows.mT @ gap
-    )
+    # Turning a ball or sliding a plane is no direction.
+    solution = torch.linalg.pinv(rows.mT @ rows, rtol=1e-6, hermitian=True) @ (rows.mT @ gap)
     w, t, s = solution[:3], solution[3:6], solution[6]
     zero = torch.zeros_like(s)
     skew = torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)

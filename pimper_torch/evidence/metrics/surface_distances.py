@@ -25,7 +25,6 @@ class SurfaceSamples(Record):
     Attributes:
         normals: Of their faces, unit; ``None`` for a point cloud.
         corners: Vertices of their faces; the one of a point cloud.
-        fractions: Barycentric coordinates.
     """
 
     points: Float[Tensor, "sample 3"]
@@ -90,48 +89,29 @@ def _drawn(
     return torch.searchsorted(ends, positions, right=True).clamp_max(len(ends) - 1)
 
 
-# Fraction of the object's diagonal that a surface may lie in front of a point without hiding it:
-# the ray caster's float32 needs a millionth, depth maps of files a thousandth.
-_HIDDEN_BEHIND = 1e-3
-
-
 def count_seeing(
     samples: SurfaceSamples, capture: Capture, diagonal: float
 ) -> Int[Tensor, " sample"] | None:
     """Count the positions of the camera that each true point is seen from.
 
-    By ray casting the true mesh with its surroundings and the face's front towards the camera, or,
-    for a cloud, by the true depth maps. Views taken from one position (``capture.position``) count
-    once.
+    By ray casting the true mesh with its surroundings, and the face's front towards the camera.
+    Views taken from one position (``capture.position``) count once.
 
     Args:
         diagonal: Of the object's bounding box, scene units.
 
     Returns:
-        ``None`` without cameras, or with neither a mesh nor depth maps.
+        ``None`` without cameras or without a mesh.
     """
-    truth, cameras = capture.truth, capture.cameras
-    if cameras is None or (truth.mesh is None and truth.depth is None):
+    mesh, cameras = capture.truth.mesh, capture.cameras
+    if cameras is None or mesh is None or not len(mesh.faces):
         return None
-    tolerance = _HIDDEN_BEHIND * diagonal
-    caster = None
-    if truth.mesh is not None and len(truth.mesh.faces):
-        whole = joined(truth.mesh, truth.surroundings)
-        caster = RayCaster(whole.vertices_world, whole.faces)
-    elif truth.depth is None:
-        return None
+    whole = joined(mesh, capture.truth.surroundings)
+    caster = RayCaster(whole.vertices_world, whole.faces)
     count = torch.zeros(len(samples.points), dtype=torch.long)
     for position in torch.unique(capture.position):
-        seen = torch.zeros(len(count), dtype=torch.bool)
-        views = (capture.position == position).nonzero()[:, 0].tolist()
-        # A ray caster sees the same in all of them; depth maps may have other holes.
-        for view in views[:1] if caster is not None else views:
-            if caster is not None:
-                seen |= _seen_by_casting(samples, cameras, view, caster, tolerance)
-            else:
-                assert truth.depth is not None
-                seen |= _seen_in_depth(samples, cameras, view, truth.depth[view], tolerance)
-        count += seen
+        view = int((capture.position == position).nonzero()[0])
+        count += _seen(samples, cameras, view, caster, diagonal)
     return count
 
 
@@ -146,47 +126,21 @@ def joined(mesh: Mesh, other: Mesh | None) -> Mesh:
     )
 
 
-def _seen_by_casting(
-    samples: SurfaceSamples, cameras: Cameras, view: int, caster: RayCaster, tolerance: float
+def _seen(
+    samples: SurfaceSamples, cameras: Cameras, view: int, caster: RayCaster, diagonal: float
 ) -> Bool[Tensor, " sample"]:
-    _, _, seen = _in_picture(samples.points, cameras, view)
-    center = cameras.centers_world[view].to(samples.points)
-    if samples.normals is not None:
-        seen &= ((center - samples.points) * samples.normals).sum(dim=1) > 0
-    asked = seen.nonzero()[:, 0]
-    hidden = caster.occluded(samples.points[asked], center, tolerance)
-    seen[asked[hidden]] = False
-    return seen
-
-
-def _seen_in_depth(
-    samples: SurfaceSamples,
-    cameras: Cameras,
-    view: int,
-    depth_true: Float[Tensor, "height width"],
-    tolerance: float,
-) -> Bool[Tensor, " sample"]:
-    pixels, depth, seen = _in_picture(samples.points, cameras, view)
-    column, row = pixels.nan_to_num(0).floor().long().unbind(dim=1)
-    height, width = depth_true.shape
-    there = depth_true[row.clamp(0, height - 1), column.clamp(0, width - 1)].to(depth)
-    return seen & there.isfinite() & ((depth - there).abs() <= tolerance)
-
-
-def _in_picture(
-    points: Float[Tensor, "sample 3"], cameras: Cameras, view: int
-) -> tuple[Float[Tensor, "sample 2"], Float[Tensor, " sample"], Bool[Tensor, " sample"]]:
+    assert samples.normals is not None  # of a mesh
+    points, center = samples.points, cameras.centers_world[view].to(samples.points)
     pixels, depth = project(
         points, cameras.cam_from_world[view].to(points), cameras.intrinsics[view].to(points)
     )
     size = cameras.sizes_px[view].to(points)
-    return pixels, depth, (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-
-
-_BINS = 10
-
-# Median of the absolute value of unit Gaussian noise.
-_MEDIAN_OF_ONE = 0.6745
+    seen = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    seen &= ((center - points) * samples.normals).sum(dim=1) > 0
+    asked = seen.nonzero()[:, 0]
+    # The ray caster's float32 needs a millionth of the diagonal.
+    seen[asked[caster.occluded(points[asked], center, 1e-3 * diagonal)]] = False
+    return seen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,14 +189,14 @@ def calibrate(
     """
     known = expected.isfinite() & (expected > 0)
     expected, true = expected[known].double().cpu(), true[known].double().cpu()
-    if len(expected) < _BINS:
+    if len(expected) < 10:
         return None
     fraction = true / expected
     order = expected.argsort()
     varied = bool(expected.min() < expected.max())
     correlation = spearmanr(expected.numpy(), true.numpy()).statistic if varied else math.nan
     return Calibration(
-        ratio=float(fraction.median()) / _MEDIAN_OF_ONE,
+        ratio=float(fraction.median()) / 0.6745,
         within_one=float((fraction <= 1).double().mean()),
         within_two=float((fraction <= 2).double().mean()),
         rank_correlation=float(correlation),
@@ -250,9 +204,9 @@ def calibrate(
             CalibrationBin(
                 expected=float(expected[one].square().mean().sqrt()),
                 root_mean_square=float(true[one].square().mean().sqrt()),
-                robust=float(true[one].median()) / _MEDIAN_OF_ONE,
+                robust=float(true[one].median()) / 0.6745,
             )
-            for one in torch.tensor_split(order, _BINS)
+            for one in torch.tensor_split(order, 10)
         ),
         samples=len(expected),
     )
@@ -278,8 +232,6 @@ class ThresholdFigures(Record):
     """Fractions of each surface nearer to the other than a threshold.
 
     Attributes:
-        precision: Of the estimate.
-        recall: Of the truth.
         f_score: Their harmonic mean; 0 if both are 0.
     """
 

@@ -99,14 +99,12 @@ def moved(
     )
 
 
-def push_clear(
-    mesh: Mesh, others: Sequence[Mesh], position: tuple[float, float], step: float = 0.02
-) -> Mesh:
+def push_clear(mesh: Mesh, others: Sequence[Mesh], position: tuple[float, float]) -> Mesh:
     """Shift a closed solid to a position on the table, and outward from there until it is free."""
     own, rest = _Solid(mesh), [_Solid(one) for one in others]
     x, y = position
     shift = own.points.new_tensor([x, y, 0.0])
-    onward = step * shift / shift.norm()
+    onward = 0.02 * shift / shift.norm()
     while any(one.holds(own.points + shift) or own.holds(one.points - shift) for one in rest):
         shift = shift + onward
     return moved(mesh, shift=(float(shift[0]), float(shift[1]), 0.0))
@@ -155,9 +153,6 @@ def _mesh(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> 
 
 Level = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
-_SLAB = 1 << 20  # points at once
-_NEWTON_STEPS = 4  # from within a cell of the surface; each doubles the digits
-
 
 def mesh_level_set(
     level: Level,
@@ -180,14 +175,15 @@ def mesh_level_set(
     ]
     grid = torch.cartesian_prod(*axes)
     with torch.no_grad():
-        values = torch.cat([level(part) for part in torch.split(grid, _SLAB)]).reshape(
+        values = torch.cat([level(part) for part in torch.split(grid, 1 << 20)]).reshape(
             counts.tolist()
         )
     found, faces, _, _ = marching_cubes(
         values.numpy(), level=0.0, spacing=(cell, cell, cell), gradient_direction="descent"
     )
     vertices = start + torch.from_numpy(found.astype("float64"))
-    for _ in range(_NEWTON_STEPS):
+    # From within a cell of the surface; each step doubles the digits.
+    for _ in range(4):
         value, gradient = _with_gradient(level, vertices)
         step = value / (gradient * gradient).sum(dim=-1)
         vertices = vertices - step[:, None] * gradient

@@ -10,21 +10,12 @@ from torch.nn.functional import normalize
 
 from pimper_torch.evidence.scenes.procedural_meshes import join
 from pimper_torch.evidence.scenes.scene_lights import Lights, PointLight
-from pimper_torch.evidence.scenes.scene_object import (
-    SceneObject,
-    normals_at_vertices,
-    reflect,
-)
+from pimper_torch.evidence.scenes.scene_object import SceneObject, normals_at_vertices, reflect
 from pimper_torch.evidence.scenes.scene_settings import SensorConfig, expose
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import Cameras, Record
-
-# Clear of the surface in embree's float32, yet below what a pixel shows.
-_CLEARANCE = 2e-4
-# Conductors that mirror one another; what is mirrored once more is left out.
-_MIRRORS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -43,7 +34,7 @@ class Shaded(Record):
     """Radiance of spots towards the eye.
 
     Attributes:
-        mirrored: Radiance of the highlight, and of what a conductor mirrors.
+        mirrored: Radiance of the highlight.
         lit: True where the point light reaches.
     """
 
@@ -68,20 +59,19 @@ class TracedObjects:
         counts = torch.tensor([len(one.mesh.faces) for one in objects])
         self._ends = torch.cumsum(counts, dim=0)
         self._starts = self._ends - counts
-        # A conductor's fraction of mirrored light is Fresnel's own; 1 leaves the lobe alone.
-        self._specular = torch.tensor([1.0 if one.conductor else one.specular for one in objects])
-        self._metal = torch.tensor([one.conductor is not None for one in objects])
+        self._specular = torch.tensor([one.specular for one in objects])
         self._roughness = torch.tensor([one.roughness for one in objects])
         self.outside = torch.tensor([one.surroundings for one in objects])
         extent = vertices.amax(dim=0) - vertices.amin(dim=0)
-        self.clearance = _CLEARANCE * float(extent.norm())
+        # Clear of the surface in embree's float32, yet below what a pixel shows.
+        self.clearance = 2e-4 * float(extent.norm())
 
     def cast(self, origins: Float[Tensor, "ray 3"], along: Float[Tensor, "ray 3"]) -> Hits:
         """Find what rays meet first."""
         return self._caster.cast(origins, along)
 
-    def trace(self, eye: Float[Tensor, "*origin 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
-        """Look along rays from one position, or from one each, and see what is there."""
+    def trace(self, eye: Float[Tensor, " 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
+        """Look along rays from one position, and see what is there."""
         hits = self._caster.cast(eye, rays)
         hit = hits.face >= 0
         points = eye + torch.where(hit, hits.distance, 1)[:, None] * rays
@@ -109,89 +99,22 @@ class TracedObjects:
         lit = torch.zeros(len(points), dtype=torch.bool)
         return lit.index_copy(0, facing, met >= distance[:, 0])
 
-    def shade(
-        self,
-        spots: Spots,
-        eye: Float[Tensor, "*origin 3"],
-        point_light: PointLight,
-        *,
-        flash: Float[Tensor, " 3"] | None = None,
-        bounces: int = _MIRRORS,
-    ) -> Shaded:
-        """Return the radiance that reaches the eye.
-
-        Args:
-            eye: Its position, or the origin of each ray.
-            flash: Position of the flash, which then casts shadows; by default the eye.
-            bounces: Of conductors that mirror one another.
-        """
+    def shade(self, spots: Spots, eye: Float[Tensor, " 3"], point_light: PointLight) -> Shaded:
+        """Return the radiance that reaches the eye."""
         specular, roughness = (
             self._specular[spots.object_index],
             self._roughness[spots.object_index],
         )
         to_eye = normalize(eye - spots.points, dim=-1)
         lit = self.lit(spots.points, spots.normals, point_light.position)
-        flash_position = eye if flash is None else flash
-        flashed = spots.object_index >= 0
-        if flash is not None and point_light.flash > 0:
-            flashed = self.lit(spots.points, spots.normals, flash)
-        window = point_light.from_window(spots.normals)
-        received = torch.full_like(specular, point_light.ambient).add(window)[:, None]
-        mirrored = torch.zeros_like(spots.points)
-        white = torch.ones_like(specular[:1])
-        colour = white if point_light.colour is None else point_light.colour
-        for position, irradiance, reached, tone in (
-            (point_light.position, point_light.irradiance, lit, colour),
-            (flash_position, point_light.flash, flashed, white),
-        ):
-            if irradiance == 0:
-                continue
-            toward, arriving = point_light.arriving(spots.points, position, irradiance)
-            matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
-            half = normalize(toward + to_eye, dim=-1)
-            tint = self._tint(spots.object_index, (half * toward).sum(dim=-1))
-            received = received + torch.where(reached, arriving * matte, 0)[:, None] * tone
-            mirrored = mirrored + torch.where(reached, arriving * lobe, 0)[:, None] * tint * tone
-        (metal,) = torch.nonzero(
-            self._metal[spots.object_index] & (spots.object_index >= 0), as_tuple=True
-        )
-        if len(metal) and bounces > 0:
-            seen = self._mirrored(
-                spots, metal, to_eye[metal], point_light, flash_position, bounces - 1
-            )
-            mirrored = mirrored.index_add(0, metal, seen)
+        toward, arriving = point_light.arriving(spots.points)
+        matte, lobe = reflect(spots.normals, toward, to_eye, specular, roughness)
+        colour = torch.ones(3) if point_light.colour is None else point_light.colour
+        soft = torch.full_like(specular, point_light.ambient)
+        soft = soft.add(point_light.from_window(spots.normals))[:, None]
+        received = soft + torch.where(lit, arriving * matte, 0)[:, None] * colour
+        mirrored = torch.where(lit, arriving * lobe, 0)[:, None] * colour
         return Shaded(matte=spots.albedo * received, mirrored=mirrored, lit=lit)
-
-    def _mirrored(
-        self,
-        spots: Spots,
-        metal: Int[Tensor, " metal"],
-        to_eye: Float[Tensor, "metal 3"],
-        point_light: PointLight,
-        flash: Float[Tensor, " 3"],
-        bounces: int,
-    ) -> Float[Tensor, "metal channel"]:
-        """Return what smooth conductors show of other objects and of the environment."""
-        normals = spots.normals[metal]
-        cosine = (normals * to_eye).sum(dim=-1, keepdim=True)
-        along = normalize(2 * cosine * normals - to_eye, dim=-1)
-        start = spots.points[metal] + self.clearance * normals
-        there = self.trace(start, along)
-        shaded = self.shade(there, start, point_light, flash=flash, bounces=bounces)
-        hit = (there.object_index >= 0)[:, None]
-        radiance = torch.where(hit, shaded.matte + shaded.mirrored, point_light.surroundings(along))
-        return self._tint(spots.object_index[metal], cosine[:, 0]) * radiance
-
-    def _tint(
-        self, object_index: Int[Tensor, " ray"], cosine: Float[Tensor, " ray"]
-    ) -> Float[Tensor, "ray 3"]:
-        """Return Fresnel's factor of conductors, 1 of all others."""
-        tint = cosine.new_ones(len(cosine), 3)
-        for index, one in enumerate(self.objects):
-            if one.conductor is not None:
-                own = (object_index == index)[:, None]
-                tint = torch.where(own, one.conductor.reflectance(cosine), tint)
-        return tint
 
     def _albedo(
         self, hits: Hits, points: Float[Tensor, "ray 3"], object_index: Int[Tensor, " ray"]
@@ -212,12 +135,12 @@ class TracedObjects:
         return albedo
 
 
-# Rays worked on at once: what they need stays in the processor's cache.
-_BATCH = 1 << 16
 # Square roots of radiance that differ by more are sampled finely: about 4 levels of 255.
 _UNEVEN = 0.015
 # A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
 _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
+
+MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -266,11 +189,10 @@ def render_frame(
         spots = stage.trace(eye, rays)
         shaded = stage.shade(spots, eye, point_light)
         hit = (spots.object_index >= 0)[:, None]
-        beyond = point_light.surroundings(rays)
-        radiance = torch.where(hit, shaded.matte + shaded.mirrored, beyond)
+        radiance = torch.where(hit, shaded.matte + shaded.mirrored, 0)
         return spots, shaded, sensor.exposure * radiance
 
-    found = [seen_at(pixels) for pixels in torch.split(centers, _BATCH)]
+    found = [seen_at(pixels) for pixels in torch.split(centers, 1 << 16)]
     spots, shaded, radiances = zip(*found, strict=True)
     radiance = torch.cat(radiances)
     if sensor.supersample > 1:
@@ -279,7 +201,7 @@ def render_frame(
         offsets = torch.cartesian_prod(steps, steps)
         fine = [
             torch.stack([seen_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
-            for rows in torch.split(uneven, _BATCH // 4)
+            for rows in torch.split(uneven, 1 << 14)
         ]
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))

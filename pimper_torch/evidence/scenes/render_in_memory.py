@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.evidence.scenes.procedural_meshes import potato, table
-from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
+from pimper_torch.evidence.scenes.ray_tracing import MAP_NAMES, TracedObjects, render_frame
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import Lights, wandering_lights
 from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
@@ -109,9 +109,6 @@ class RenderedScene(Record):
     mesh: Mesh | None = None
 
 
-_MAPS = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
-
-
 def render_shape(
     shape: Shape, cameras: Cameras, lights_world: Float[Tensor, "view 4"], texture: Texture
 ) -> RenderedScene:
@@ -171,8 +168,8 @@ def render_objects(
     return RenderedScene(
         views=_views(torch.stack([frame.image for frame in frames]), cameras),
         cameras=cameras,
-        lights_world=lights.harmonics_world(cameras.centers_world),
-        **{name: torch.stack([getattr(frame, name) for frame in frames]) for name in _MAPS},
+        lights_world=lights.harmonics_world(),
+        **{name: torch.stack([getattr(frame, name) for frame in frames]) for name in MAP_NAMES},
         mesh=stage.mesh,
     )
 

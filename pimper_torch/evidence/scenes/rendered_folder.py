@@ -42,7 +42,6 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.sfm.colmap import write_binary
 
-MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
 _MASKS = ("foreground", "lit", "highlight")
 
 
@@ -83,7 +82,6 @@ def unpack_maps(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
 
 
 FORMAT, FORMAT_VERSION = "pimper_torch rendered scene", 1
-_FAST = 1  # level of PNG's compression: noise does not shrink much further at any
 
 
 def render_scene(
@@ -155,7 +153,8 @@ def _write_photograph(
         write_deep_png((65535 * encoded).round().numpy().astype(np.uint16), path)
     else:
         samples = (255 * encoded).round().numpy().astype(np.uint8)
-        Image.fromarray(samples).save(path, compress_level=_FAST)
+        # Noise does not shrink much further at any level of compression.
+        Image.fromarray(samples).save(path, compress_level=1)
 
 
 def _write_truth(scene: Scene, folder: Path) -> None:
@@ -186,9 +185,8 @@ def _lights_report(scene: Scene) -> dict[str, object]:
         "positions_world": lights.positions_world.tolist(),
         "irradiance": lights.irradiance.tolist(),
         "ambient": lights.ambient.tolist(),
-        "flash": lights.flash.tolist(),
         "target_world": lights.target_world.tolist(),
-        "harmonics_world": lights.harmonics_world(scene.cameras.centers_world).tolist(),
+        "harmonics_world": lights.harmonics_world().tolist(),
     }
 
 

@@ -13,9 +13,6 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras
 
-# Of scenes on a table, whose world has z up.
-# Of two aims that are as good, the one nearer to the object's centre is taken.
-_STAY = 0.01
 FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -178,7 +175,7 @@ def aim_to_fit(
         # alone is less the nearer the target itself is to them. Convex.
         target = torch.from_numpy(values)
         off = target - centre
-        return distance(target) + float(off @ mean_toward) + _STAY * float(off @ off)
+        return distance(target) + float(off @ mean_toward) + 0.01 * float(off @ off)
 
     found = minimize(farness, centre.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
     target = torch.from_numpy(found.x)

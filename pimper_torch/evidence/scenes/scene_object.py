@@ -5,8 +5,7 @@ radiance 1: physics' irradiance divided by pi. A highlight is then pi times the 
 bidirectional reflectance, times irradiance and cosine.
 
 Source: Cook & Torrance, ACM TOG 1(1), 1982, for the microfacet model; Schlick, Computer Graphics
-Forum 13(3), 1994, for Fresnel's factor; Born & Wolf, Principles of Optics, 7th ed. 1999, sections
-1.5.2 and 14.2, for conductors.
+Forum 13(3), 1994, for Fresnel's factor.
 """
 
 from collections.abc import Callable
@@ -24,41 +23,6 @@ from pimper_torch.records import Mesh
 from pimper_torch.relighting.lit_surface import facet_density, masking
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Conductor:
-    """The complex refractive index of a metal, once for red, green and blue."""
-
-    index: tuple[float, float, float]
-    extinction: tuple[float, float, float]
-
-    def reflectance(self, cosine: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch channel"]:
-        """Return the fraction of unpolarized light that is mirrored.
-
-        Args:
-            cosine: Between the light and what it falls on, 0 to 1.
-        """
-        cosine = cosine.clamp(0, 1)[..., None]
-        index = torch.complex(cosine.new_tensor(self.index), cosine.new_tensor(self.extinction))
-        within = torch.sqrt(index**2 - (1 - cosine**2))  # index times the cosine in the metal
-        across = (cosine - within) / (cosine + within)
-        along = (index**2 * cosine - within) / (index**2 * cosine + within)
-        return (across.abs() ** 2 + along.abs() ** 2) / 2
-
-
-# At 650, 550 and 450 nm. Source: Johnson & Christy, Physical Review B 6(12), 1972.
-CONDUCTORS = {
-    "copper": Conductor(index=(0.21, 1.02, 1.16), extinction=(3.67, 2.58, 2.40)),
-    "gold": Conductor(index=(0.17, 0.43, 1.38), extinction=(3.15, 2.46, 1.91)),
-    "silver": Conductor(index=(0.05, 0.06, 0.04), extinction=(4.41, 3.59, 2.66)),
-}
-"""Metals by name."""
-
-
-# A dielectric mirrors everything at grazing incidence; no real one mirrors less than 2 % head
-# on, so that what is given less than that stands for something wholly or partly matte.
-_MIN_SPECULAR = 0.02
-
-
 def fresnel(
     cosine: Float[Tensor, "*batch"], specular: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
@@ -68,7 +32,8 @@ def fresnel(
         cosine: Between the light and what it falls on.
         specular: The share at a cosine of 1; 0 mirrors nothing at any angle.
     """
-    grazing = (specular / _MIN_SPECULAR).clamp_max(1)
+    # No real dielectric mirrors less than 2 % head on; less stands for something partly matte.
+    grazing = (specular / 0.02).clamp_max(1)
     return specular + (grazing - specular) * (1 - cosine).clamp(0, 1) ** 5
 
 
@@ -114,8 +79,6 @@ class SceneObject:
         texture: Albedo at points of the world; ``None`` takes the mesh's own albedo.
         specular: Fraction of light that the surface mirrors head on: 0 is matte, 0.04 is glaze.
         roughness: Of the mirroring facets (its square is GGX's alpha): 0.1 is polished, 0.5 satin.
-        conductor: A metal: it mirrors the point lights as ``roughness`` says, other objects and the
-            environment sharply. Its albedo is 0.
         surroundings: True for objects around the reconstructed one, such as the table.
     """
 
@@ -123,7 +86,6 @@ class SceneObject:
     texture: Texture | None = None
     specular: float = 0.0
     roughness: float = 0.4
-    conductor: Conductor | None = None
     surroundings: bool = False
 
     def __post_init__(self) -> None:

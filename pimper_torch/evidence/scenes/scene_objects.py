@@ -24,12 +24,7 @@ from pimper_torch.evidence.scenes.procedural_meshes import (
     table,
 )
 from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
-from pimper_torch.evidence.scenes.textures import (
-    Uniform,
-    marked,
-    painted,
-    random_speckle,
-)
+from pimper_torch.evidence.scenes.textures import Uniform, marked, painted, random_speckle
 from pimper_torch.records import Mesh
 
 Recipe = Callable[[torch.Generator], tuple[SceneObject, ...]]

@@ -48,10 +48,6 @@ def expose(
     return (radiance + spread * noise).clamp(0, 1)
 
 
-# 64 GB, in which no photograph of a camera is rendered.
-_MOST_RAYS = 640_000_000
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneConfig:
     """Settings of a rendered scene.
@@ -89,7 +85,6 @@ class SceneConfig:
             farther.
         irradiance: Of the point light, as the radiance of white facing it; a quarter more or less.
         ambient: Light from everywhere, as the radiance of white; a quarter more or less.
-        flash: Of a second point light on the camera, like irradiance; 0 is none.
         window: Of soft light from one side of the room, at rest in the world, as the radiance of
             white facing it; 0 is none.
         lamp_colour: How much the point light's colour differs between photographs: the standard
@@ -109,11 +104,6 @@ class SceneConfig:
             scene's own, for a mesh file 0.
         roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
             a mesh file 0.3.
-        conductor: A metal that the object is made of: it has no matte part, and mirrors the
-            table, itself and the environment.
-        environment: A picture infinitely far away that the ambient light comes from: the same
-            in all photographs, or changing from one to the next. By default constant round a
-            conductor, else none.
     """
 
     num_views: Annotated[int, Range(least=1, most=100_000)] = 30
@@ -137,7 +127,6 @@ class SceneConfig:
     point_light_distance: Annotated[float, Range(least=1, most=1000)] = 2.5
     irradiance: Annotated[float, Range(least=0, most=1e12)] = 0.85
     ambient: Annotated[float, Range(least=0, most=1e12)] = 0.1
-    flash: Annotated[float, Range(least=0, most=1e12)] = 0.0
     window: Annotated[float, Range(least=0, most=1e12)] = 0.0
     lamp_colour: Annotated[float, Range(least=0, most=2)] = 0.0
     exposure: float = 1.0
@@ -152,15 +141,13 @@ class SceneConfig:
     albedo: tuple[float, float, float] | None = None
     specular: Annotated[float | None, Range(least=0, most=1)] = None
     roughness: Annotated[float | None, Range(least=0, most=1)] = None
-    conductor: Literal["none", "copper", "gold", "silver"] = "none"
-    environment: Literal["none", "constant", "changing"] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be photographed."""
         require_ranges(self)
         _ = self.sensor  # refuses its own
-        # Rays of a photograph take 100 bytes each.
-        rays = int((_MOST_RAYS / (self.width * self.height)) ** 0.5)
+        # Rays of a photograph take 100 bytes each: 64 GB.
+        rays = int((640_000_000 / (self.width * self.height)) ** 0.5)
         moving = self.turned_over or self.fixed_point_light or self.jitter_px > 0
         shared = self.num_views % self.lights_per_pose == 0
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
@@ -194,7 +181,7 @@ class SceneConfig:
             (
                 not self.turned_over or (self.num_views >= 2 and not self._at_rest),
                 "turned_over",
-                "2 views or more, and no environment, window, or anything fixed before the camera",
+                "2 views or more, and no window, or anything fixed before the camera",
             ),
             (0 <= self.crop_jitter_px <= widest, "crop_jitter_px", jitter),
             (self.pan_jitter_px >= 0 and self.jitter_px <= widest, "pan_jitter_px", jitter),
@@ -204,35 +191,23 @@ class SceneConfig:
                 "no fixed_point_light, under which the light goes round the object",
             ),
             (
-                self.irradiance + self.ambient + self.flash + self.window > 0,
+                self.irradiance + self.ambient + self.window > 0,
                 "irradiance",
-                "some light: irradiance, ambient, flash or window",
+                "some light: irradiance, ambient or window",
             ),
             (
                 all(0 <= channel <= 1 for channel in self.albedo or ()),
                 "albedo",
                 "between 0 and 1 in every channel",
             ),
-            (
-                self.conductor == "none" or (self.albedo is None and self.specular is None),
-                "conductor",
-                "none with albedo or specular: a metal has no matte part, and its own reflectance",
-            ),
         ):
             require(holds, name, getattr(self, name), needed)
-
-    @property
-    def surrounded(self) -> Literal["none", "constant", "changing"]:
-        """The environment asked for, or that of the conductor."""
-        if self.environment is not None:
-            return self.environment
-        return "none" if self.conductor == "none" else "constant"
 
     @property
     def _at_rest(self) -> bool:
         """Whether something stands still in the room while the object does not."""
         fixed = self.fixed_point_light or self.fixed_room or self.fixed_table
-        return fixed or self.window > 0 or self.surrounded != "none"
+        return fixed or self.window > 0
 
     @property
     def jitter_px(self) -> float:

@@ -12,7 +12,7 @@ from pimper_torch.evidence.scenes.scene_object import Texture
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waves:
-    """A sum of sines: smooth to every order, with its gradient in closed form."""
+    """A sum of sines: smooth to every order."""
 
     wave_vectors: Float[Tensor, "wave axis"]
     phases: Float[Tensor, " wave"]
@@ -20,15 +20,8 @@ class Waves:
 
     def __call__(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
         """Evaluate at points."""
-        return torch.sin(self._angle(points)) @ self.amplitudes.to(points)
-
-    def gradient(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch axis"]:
-        """Evaluate the gradient at points."""
-        slope = torch.cos(self._angle(points)) * self.amplitudes.to(points)
-        return slope @ self.wave_vectors.to(points)
-
-    def _angle(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch wave"]:
-        return points @ self.wave_vectors.to(points).mT + self.phases.to(points)
+        angle = points @ self.wave_vectors.to(points).mT + self.phases.to(points)
+        return torch.sin(angle) @ self.amplitudes.to(points)
 
 
 def random_waves(
@@ -108,7 +101,6 @@ def random_speckle(
     brightest: float = 0.85,
     contrast: float = 2.5,
     colour: float = 0.35,
-    channels: int = 3,
     offset: float = 0.0,
     tint: tuple[float, ...] = (1.0,),
 ) -> Speckle:
@@ -124,7 +116,7 @@ def random_speckle(
     side = 64  # repeats after 64 cells; no two octaves repeat together
     shape = (len(cells), 1, side, side, side)
     shared = torch.randn(shape, generator=generator)
-    own = torch.randn((len(cells), channels, side, side, side), generator=generator)
+    own = torch.randn((len(cells), 3, side, side, side), generator=generator)
     return Speckle(
         subdivisions=pad((1 - colour) * shared + colour * own, (0, 1, 0, 1, 0, 1), mode="circular"),
         cells=cells,

@@ -1,10 +1,9 @@
 """Sparse clouds with tracks from the truth, as if structure from motion had run."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.config import require
 from pimper_torch.evidence.scenes.render_in_memory import RenderedScene
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
@@ -20,10 +19,7 @@ def sparse_scene(
     num_points: int,
     generator: torch.Generator,
     *,
-    min_views: int = 3,
     noise_px: float = 0.0,
-    outlier_fraction: float = 0.0,
-    in_views: tuple[int, ...] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> SparseScene:
     """Sample visible surface points, follow them through the views and triangulate them.
@@ -32,29 +28,19 @@ def sparse_scene(
     their errors are along the rays as in real clouds.
 
     Args:
-        num_points: At most.
         noise_px: Standard deviation of every observation.
-        outlier_fraction: Fraction of the points that are moved along their first ray by up to
-            half their depth, with tracks of two views.
-        in_views: Pick points in the maps of these views; ``None`` is all of them.
         dtype: Of photographs, cameras and points.
     """
-    require(min_views >= 2, "min_views", min_views, "2 or more to triangulate from")
-    require(0 <= outlier_fraction < 1, "outlier_fraction", outlier_fraction, "at least 0, below 1")
     cameras = scene.cameras
-    views = tuple(range(cameras.num_views)) if in_views is None else in_views
-    points = _pick(scene, views, 4 * num_points, generator)
+    points = _pick(scene, 4 * num_points, generator)
     pixels, seen = _follow(scene, points)
-    (kept,) = torch.nonzero(seen.sum(dim=1) >= min_views, as_tuple=True)
+    (kept,) = torch.nonzero(seen.sum(dim=1) >= 3, as_tuple=True)
     kept = kept[:num_points]
     points, pixels, seen = points[kept], pixels[kept], seen[kept]
     if noise_px > 0:
         spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         pixels = pixels + noise_px * spread.to(pixels)
         points = triangulate_rays(cameras, pixels, seen)
-    num_outliers = round(outlier_fraction * len(points))
-    if num_outliers > 0:
-        points, seen = _mislead(points, seen, cameras, num_outliers, generator)
     where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
     errors = (where - pixels).norm(dim=-1)
     point_index, view_index = torch.nonzero(seen, as_tuple=True)
@@ -73,13 +59,11 @@ def sparse_scene(
     )
 
 
-def _pick(
-    scene: RenderedScene, views: tuple[int, ...], count: int, generator: torch.Generator
-) -> Float[Tensor, "point 3"]:
-    """Unproject pixels drawn at random from the depth maps of some views."""
+def _pick(scene: RenderedScene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Unproject pixels drawn at random from the depth maps."""
     cameras, found = scene.cameras, []
-    fraction = -(-count // len(views))
-    for view in views:
+    fraction = -(-count // cameras.num_views)
+    for view in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[view])
         depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
         (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
@@ -122,54 +106,27 @@ def _follow(
     return pixels.movedim(0, 1), seen.mT
 
 
-def _mislead(
-    points: Float[Tensor, "point 3"],
-    seen: Bool[Tensor, "point view"],
-    cameras: Cameras,
-    count: int,
-    generator: torch.Generator,
-) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, "point view"]]:
-    """Move the first ``count`` points along their first rays; keep two views of each."""
-    wrong: Int[Tensor, " point"] = torch.arange(count)
-    order = torch.cumsum(seen[wrong].long(), dim=1)
-    seen = torch.cat([seen[wrong] & (order <= 2), seen[count:]])
-    first = seen[wrong].long().argmax(dim=1)
-    eyes = cameras.centers_world[first]
-    factor = 1 + (torch.rand(count, 1, generator=generator, dtype=torch.float64) - 0.5).to(points)
-    moved = eyes + factor * (points[wrong] - eyes)
-    return torch.cat([moved, points[count:]]), seen
-
-
-_STEEPEST = 0.2  # cosine below which a surface is too slanted for its features to be found
-_CLEARANCE = 1e-3  # of the distance to the camera
-
-
 def true_model(
     surface: Mesh,
     blockers: Mesh,
     cameras: Cameras,
     names: tuple[str, ...],
     generator: torch.Generator,
-    *,
-    num_points: int = 1500,
-    min_views: int = 3,
 ) -> tuple[SparseModel, Float[Tensor, "point channel"]]:
     """Draw points evenly over a surface and follow them through the photographs.
 
     Args:
-        surface: With albedo.
         blockers: Everything that may stand in front of it.
-        min_views: Views that see a point at least, or all there are.
 
     Returns:
-        Cameras, at most ``num_points`` points with exact observations, and the points' albedo.
+        Cameras, at most 1,500 points with exact observations, and the points' albedo.
     """
-    points, normals, albedo = _scatter(surface, 6 * num_points, generator)
+    points, normals, albedo = _scatter(surface, 6 * 1500, generator)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = _seen(points, normals, pixels, depth, blockers, cameras)
-    fewest = min(min_views, cameras.num_views)
+    fewest = min(3, cameras.num_views)
     (kept,) = torch.nonzero(seen.sum(dim=0) >= fewest, as_tuple=True)
-    kept = kept[:num_points]
+    kept = kept[:1500]
     point, view = torch.nonzero(seen[:, kept].mT, as_tuple=True)
     model = SparseModel(
         names=names,
@@ -214,9 +171,10 @@ def _seen(
         eye = cameras.centers_world[view]
         toward = eye - points
         distance = toward.norm(dim=-1)
-        facing = (normals * toward).sum(dim=-1) > _STEEPEST * distance
+        # More slanted, features of a surface are not found.
+        facing = (normals * toward).sum(dim=-1) > 0.2 * distance
         size = cameras.sizes_px[view].to(pixels)
         framed = (depth[view] > 0) & ((pixels[view] > 1) & (pixels[view] < size - 1)).all(dim=-1)
-        hidden = caster.occluded(points, eye, _CLEARANCE * distance)
+        hidden = caster.occluded(points, eye, 1e-3 * distance)
         found.append(facing & framed & ~hidden)
     return torch.stack(found)

@@ -21,14 +21,8 @@ from pimper_torch.evidence.scenes.scene_cameras import (
     panned,
     turntable_directions,
 )
-from pimper_torch.evidence.scenes.scene_lights import (
-    Environment,
-    Lights,
-    lights_round,
-    random_environment,
-)
+from pimper_torch.evidence.scenes.scene_lights import Lights, lights_round
 from pimper_torch.evidence.scenes.scene_object import (
-    CONDUCTORS,
     SceneObject,
     albedo_at_vertices,
     normals_at_vertices,
@@ -125,13 +119,9 @@ def room(generator: torch.Generator) -> tuple[SceneObject, ...]:
     )
 
 
-OBJECT_SIZE = 2.4  # scene units; of every object's longest side, roughly
-_MARGIN = 1.15  # of the turntable's radius over the object's reach from the axis
-_ENVIRONMENT = 1 << 20  # numbers of environments; those of photographs' noise are smaller
-_PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs
+_PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs; those of noise are less
 _COLOUR = (1 << 21) + 2  # number of the point lights' colours
 _WINDOW = (-0.74, -0.47, 0.48)  # direction: left of the cameras, and above
-_FOCAL = 1.6  # widths of the picture: a normal to short telephoto lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +133,6 @@ class Scene:
         objects: At rest in the world: the object's first, then its table, if that turns along.
         fixed: Objects that are at rest while the object turns or is turned over, in the room's
             frame: z up from the table's plane, origin on the turntable's axis, camera at -y.
-        world_from_room: Of each photograph.
     """
 
     name: str
@@ -212,14 +201,13 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     cameras, lights, target, azimuths = _taken(points, config, generator)
     world_from_room = rotated_about(target, azimuths)
     reach = float((points - target)[:, :2].norm(dim=-1).amax())
-    environments = _environments(config, world_from_room)
-    turning, fixed = _surroundings(config, generator, target, _MARGIN * reach)
+    turning, fixed = _surroundings(config, generator, target, 1.15 * reach)
     return Scene(
         name=str(name_or_path),
         config=config,
         objects=(*objects, *turning),
         cameras=cameras,
-        lights=_coloured(lights, config).replace(environments=environments),
+        lights=_coloured(lights, config),
         fixed=fixed,
         world_from_room=world_from_room,
     )
@@ -235,7 +223,8 @@ def _taken(
     """Place cameras and lights round an object on the table."""
     lowest, highest = points.amin(dim=0), points.amax(dim=0)
     toward = _toward(config, generator)
-    focal_px = _FOCAL * config.width
+    # A normal to short telephoto lens.
+    focal_px = 1.6 * config.width
     target, distance = aim_to_fit(
         toward,
         points,
@@ -279,7 +268,6 @@ def _turned_over(
         irradiance=torch.cat([one.irradiance for one in lights]),
         ambient=torch.cat([one.ambient for one in lights]),
         target_world=lights[0].target_world,  # the box's centre, which stays where it is
-        flash=torch.cat([one.flash for one in lights]),
     )
     return Scene(
         name=name,
@@ -323,7 +311,6 @@ def _lights(
         target=target,
         irradiance=config.irradiance,
         ambient=config.ambient,
-        flash=config.flash,
         far=config.light == "directional",
     )
     if config.fixed_point_light:
@@ -341,22 +328,6 @@ def _coloured(lights: Lights, config: SceneConfig) -> Lights:
         window=window if config.window > 0 else None,
         colour=colour / colour.mean(dim=1, keepdim=True) if config.lamp_colour > 0 else None,
     )
-
-
-def _environments(
-    config: SceneConfig, world_from_room: Float[Tensor, "view 4 4"]
-) -> tuple[Environment, ...] | None:
-    """Draw the environment of every photograph; with a fixed room, it is at rest there."""
-    if config.surrounded == "none":
-        return None
-    drawn = []
-    for view in range(config.num_views):
-        number = view if config.surrounded == "changing" else 0
-        one = random_environment(_generator(config.seed, _ENVIRONMENT + number))
-        if config.fixed_room:
-            one = replace(one, own_from_world=world_from_room[view, :3, :3].mT)
-        drawn.append(one)
-    return tuple(drawn)
 
 
 def _surroundings(
@@ -392,14 +363,11 @@ def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "v
 def _finished(item: SceneObject, config: SceneConfig) -> SceneObject:
     specular = item.specular if config.specular is None else config.specular
     roughness = item.roughness if config.roughness is None else config.roughness
-    conductor = CONDUCTORS.get(config.conductor)
-    albedo = (0.0, 0.0, 0.0) if conductor else config.albedo
     made = SceneObject(
         mesh=item.mesh,
-        texture=item.texture if albedo is None else Uniform(albedo=albedo),
+        texture=item.texture if config.albedo is None else Uniform(albedo=config.albedo),
         specular=specular,
         roughness=roughness,
-        conductor=conductor,
     )
     origin = item.mesh.vertices_world.new_zeros(3)
     rotation = torch.deg2rad(origin.new_tensor([config.rotation_deg]))
@@ -431,7 +399,7 @@ def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
     if longest <= 0 or not math.isfinite(longest):
         raise InputError(f"{path}: all its vertices are at one point; needed: a surface.")
     foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
-    vertices = (vertices - foot) * (OBJECT_SIZE / longest)
+    vertices = (vertices - foot) * (2.4 / longest)
     # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
     # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
     positions, own = torch.unique(vertices, dim=0, return_inverse=True)

@@ -70,7 +70,6 @@ def align_factorizations(
     shading: Float[Tensor, "*batch 4 sample"],
     reference: Float[Tensor, "*batch 4 sample"],
     weight: Float[Tensor, "*batch sample"],
-    iterations: int = 10,
 ) -> Ambiguity:
     r"""Find the ambiguity that brings one factorization closest to another.
 
@@ -82,7 +81,6 @@ def align_factorizations(
         shading: ``N`` to be aligned, columns on the cone.
         reference: What it is aligned to, columns on the cone.
         weight: Not negative. Samples without weight are ignored.
-        iterations: Of Gauss-Newton, after the linear solution.
 
     Fails softly where the samples span less than four dimensions: the best transformation
     found is still a scaled Lorentz transformation. Constant to autograd.
@@ -95,7 +93,7 @@ def align_factorizations(
         cross = (w * target) @ source.mT + ridge[..., None, None] * eye
         linear = torch.linalg.solve(moment + ridge[..., None, None] * eye, cross, left=False)
         matrix = _nearest_lorentz(linear)
-        for _ in range(iterations):
+        for _ in range(10):
             matrix = _improve(matrix, source, target, w)
         return Ambiguity(matrix=matrix.to(shading.dtype))
 

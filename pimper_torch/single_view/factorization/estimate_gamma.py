@@ -25,10 +25,11 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem, singular_left
-
-# Lower bound of the encoded value about which the fit is linearized: a choice.
-_DARKEST = 0.02
+from pimper_torch.single_view.factorization.low_rank import (
+    brightness_guess,
+    low_rank_problem,
+    singular_left,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -88,12 +89,13 @@ def fit_encoded(
         heavy = weight / rate.square()
         heavy = heavy / heavy.max()
         if left is None:
-            left = _start(target, mask, problem.rank)
+            guess = brightness_guess(target, mask)[None]
+            left = singular_left(target[None], mask[None], problem.rank, guess, 29)[0]
         matrix = low_rank_problem(target[None], heavy[None], left[None])
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
         linear = left @ solved.shading[0]
-        about = response.encoded_from_linear(linear).clamp_min(_DARKEST)
+        about = response.encoded_from_linear(linear).clamp_min(0.02)
         residual = mask * (problem.encoded - about)
         if problem.scale and iteration < iterations:
             weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
@@ -111,16 +113,6 @@ def _derivative(
         at = encoded.detach().requires_grad_()
         (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
     return rate
-
-
-def _start(
-    matrix: Float[Tensor, "view sample"], mask: Float[Tensor, "view sample"], rank: int
-) -> Float[Tensor, "view rank"]:
-    """Impute missing values by albedo times brightness, then by low-rank approximations."""
-    gain = (mask * matrix).sum(dim=1, keepdim=True) / mask.sum(dim=1, keepdim=True).clamp_min(1)
-    level = (mask * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    guess = gain * (mask * matrix).sum(dim=0, keepdim=True) / level
-    return singular_left(matrix[None], mask[None], rank, guess[None], 29)[0]
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
@@ -148,8 +140,6 @@ def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
 MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
 # Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
 _TRIALS = 8
-# Of gamma's logarithm: a choice, a tenth of the smallest standard errors.
-_TOLERANCE = 1e-4
 
 # Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
@@ -159,9 +149,6 @@ _MAX_RESIDUAL = 0.015
 
 # Encoded value up to which shading is not first-order.
 _DARK = 0.1
-
-# Samples; more are subsampled evenly.
-_MAX_SAMPLES = 300
 
 # Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
@@ -318,7 +305,7 @@ def _problem(
             f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
             "other lights, expose so that less is dark or saturated, or lower the rank."
         )
-    count = min(_MAX_SAMPLES, len(samples))
+    count = min(300, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
     chosen = samples[spaced.to(samples.device)]
     return EncodedMatrix(
@@ -371,7 +358,7 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
         return float(fit.loss.sum())
 
     bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _TOLERANCE})
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     gamma = math.exp(found.x)
     fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
     return _Minimum(

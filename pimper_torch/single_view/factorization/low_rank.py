@@ -74,7 +74,6 @@ def low_rank_problem(
 
     Args:
         matrix: ``X``, rows as views, columns as samples; entries without weight are ignored.
-        weight: 0 where missing.
         start: Left factors of full rank.
 
     Raises:
@@ -132,6 +131,16 @@ def singular_left(
         filled = torch.where(seen, known, left @ (left.mT @ filled))
         left = _leading(filled, rank)
     return left
+
+
+def brightness_guess(
+    matrix: Float[Tensor, "row column"], weight: Float[Tensor, "row column"]
+) -> Float[Tensor, "row column"]:
+    """Return the product of each row's and each column's brightness, for missing entries."""
+    gain = (weight * matrix).sum(dim=1, keepdim=True)
+    gain = gain / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
+    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    return gain * (weight * matrix).sum(dim=0, keepdim=True) / level
 
 
 def random_left(

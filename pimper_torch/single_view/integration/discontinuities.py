@@ -91,15 +91,14 @@ def find_discontinuities(
         tested &= joined(steps.kink_right, steps.kink_down) < _KINK
         tested &= joined(steps.twist_right, steps.twist_down) < _TWIST
         fraction = torch.where(tested, 1.0, _TIE) * inside
-        solution = None
         scale, cause = 3.0, StopCause.LIMIT  # pixels
         for taken in range(1, _MAX_ITERATIONS + 1):
             weights = weight * fraction
-            system = RasterSystem(*parts(weights), anchor, tolerance=1e-6, what="the integration")
+            system = RasterSystem(*parts(weights), anchor, tolerance=1e-6)
             source = differences_transposed(*parts(weights * target))
             if anchor is not None and heights is not None:
                 source = source + anchor * heights
-            solution = system.solve_values(source, solution)
+            solution = system.solve(source)
             right, down = differences(solution)
             residual = joined(
                 right / steps.unit_right - steps.right, down / steps.unit_down - steps.down

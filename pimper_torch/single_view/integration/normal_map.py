@@ -1,7 +1,6 @@
 """Integration of a normal map to depth, orthographic or pinhole, with mask, weights and anchors."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,15 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
-from pimper_torch.single_view.integration.discontinuities import (
-    Continuity,
-    find_discontinuities,
-)
+from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
 
@@ -26,11 +22,6 @@ Integration = Literal["discontinuities", "weighted"]
 
 # Weight of steps over pixels without a normal, whose slopes are inpainted: a choice.
 _FILLED_WEIGHT = 1e-4
-
-# Blocks across a normal map, and curl with y negated over that with y as it is, below which a
-# warning comes. A ball, waves and a vase of 160 pixels, normals 3 degrees off: 0.09 to 0.41 where y
-# is upside down; a plane 0.9 to 1.1 either way. Curl below the floor is rounding.
-_BLOCKS, _CURL_RATIO, _CURL_FLOOR = 24, 0.5, 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -57,7 +48,6 @@ def integrate_normal_map(
     spacing: tuple[float, float] = (1.0, 1.0),
     weight: Raster | None = None,
     known_depth: Raster | None = None,
-    known_weight: Raster | None = None,
     method: Integration = "discontinuities",
 ) -> IntegratedMap:
     """Integrate a normal map to depth.
@@ -70,17 +60,13 @@ def integrate_normal_map(
         intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
             rays are parallel.
         spacing: Distance of neighbouring pixels in a row and in a column, under parallel rays.
-        weight: Of each normal; 1 if not given, 0 like not finite.
+        weight: Of each normal, that of a known depth being 1; 1 if not given, 0 like not finite.
         known_depth: Depth at some pixels, NaN at the others.
-        known_weight: Of the known depths, in units of that of one normal; 1 if not given.
         method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
             squares.
 
     Raises:
         InputError: Unusable rasters, or normals coded as colours or with z to the viewer.
-
-    Warns:
-        PimperWarning: Normals that are integrable only with y negated.
 
     Differentiable in normals, weights and known depths; which steps are continuous is constant.
 
@@ -89,11 +75,11 @@ def integrate_normal_map(
     0.0
     """
     normals = torch.as_tensor(normals)
-    mask, weight, known_depth, known_weight = (
+    mask, weight, known_depth = (
         None if raster is None else torch.as_tensor(raster)
-        for raster in (mask, weight, known_depth, known_weight)
+        for raster in (mask, weight, known_depth)
     )
-    _refuse(normals, mask, weight, known_depth, known_weight, spacing)
+    _refuse(normals, mask, weight, known_depth, spacing)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
     _refuse_convention(normals, mask)
@@ -103,8 +89,8 @@ def integrate_normal_map(
     if intrinsics is not None:
         intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
     mask = mask[box]  # the box of the mask, to save time and memory
-    weight, known_depth, known_weight = (
-        None if raster is None else raster[box] for raster in (weight, known_depth, known_weight)
+    weight, known_depth = (
+        None if raster is None else raster[box] for raster in (weight, known_depth)
     )
     unit = _usable(normals[box], mask, weight)
     if intrinsics is None:
@@ -112,7 +98,7 @@ def integrate_normal_map(
     else:
         steps = perspective_steps(unit, mask, intrinsics)
     continuity = None
-    anchor, unknown = _known(known_depth, known_weight, mask, steps, intrinsics)
+    anchor, unknown = _known(known_depth, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
         continuity = find_discontinuities(steps, *weights, anchor, unknown)
@@ -120,7 +106,7 @@ def integrate_normal_map(
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
-    system = RasterSystem(*weights, anchor, what="the integration")
+    system = RasterSystem(*weights, anchor)
     found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(
@@ -162,7 +148,6 @@ def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tupl
 
 def _known(
     depth: Float[Tensor, "height width"] | None,
-    weight: Float[Tensor, "height width"] | None,
     mask: Bool[Tensor, "height width"],
     steps: Steps,
     intrinsics: Float[Tensor, "3 3"] | None,
@@ -176,16 +161,15 @@ def _known(
             f"known_depth has {int((depth[given] <= 0).sum())} values that are not positive; "
             "under a pinhole all must be. Mark pixels of unknown depth with NaN."
         )
-    strength = torch.where(given, 1.0 if weight is None else weight.double(), 0).double()
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
-    return strength / (steps.unit_right * steps.unit_down), unknown
+    return given.double() / (steps.unit_right * steps.unit_down), unknown
 
 
 def _refuse_convention(
     normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
 ) -> None:
-    """Refuse normals that are coded as colours or face away; warn of y upward."""
+    """Refuse normals that are coded as colours or face away."""
     some = normals.detach()[mask]
     some = some[some.isfinite().all(dim=-1) & (some != 0).any(dim=-1)]
     if len(some) == 0:
@@ -201,35 +185,6 @@ def _refuse_convention(
             f"normals: {away:.0%} of them have z towards the viewer, as OpenGL's do, whose y "
             f"points up, too: negate y and z; {axes}."
         )
-    as_given, flipped = (_curl(normals.detach(), mask, sign) for sign in (1.0, -1.0))
-    if flipped + _CURL_FLOOR < _CURL_RATIO * as_given:
-        warnings.warn(
-            f"normals look as if y pointed up: with y negated they are those of a surface (median "
-            f"curl of the slopes {flipped:.2g}, as given {as_given:.2g}); {axes}. Negate y if the "
-            "depth comes out wrong.",
-            PimperWarning,
-            stacklevel=3,
-        )
-
-
-def _curl(
-    normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"], sign: float
-) -> float:
-    """Return the median absolute curl of the slopes, around squares of four blocks.
-
-    Slopes are averaged over blocks, which reduces noise.
-    """
-    slopes = -normals[..., :2] / normals[..., 2:]
-    usable = mask & slopes.isfinite().all(dim=-1) & (normals[..., 2] < 0)
-    slopes = torch.where(usable[..., None], slopes, 0).movedim(-1, 0)[None]
-    block = max(1, min(mask.shape) // _BLOCKS)
-    whole = avg_pool2d(usable.to(slopes)[None, None], block)[0, 0] > 1 - 1e-6
-    right, down = avg_pool2d(slopes, block)[0]
-    whole = whole[1:, 1:] & whole[1:, :-1] & whole[:-1, 1:] & whole[:-1, :-1]
-    across = (right[1:] - right[:-1])[:, 1:] + (right[1:] - right[:-1])[:, :-1]
-    along = (down[:, 1:] - down[:, :-1])[1:] + (down[:, 1:] - down[:, :-1])[:-1]
-    curl = (across - sign * along).abs()[whole]
-    return float(curl.median()) if len(curl) else 0.0
 
 
 def _refuse(
@@ -237,7 +192,6 @@ def _refuse(
     mask: Tensor | None,
     weight: Tensor | None,
     known_depth: Tensor | None,
-    known_weight: Tensor | None,
     spacing: tuple[float, float],
 ) -> None:
     if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
@@ -246,26 +200,18 @@ def _refuse(
             f"{tuple(normals.shape)}; needed: floating point, height width 3."
         )
     size = normals.shape[:2]
-    rasters = {
-        "mask": mask,
-        "weight": weight,
-        "known_depth": known_depth,
-        "known_weight": known_weight,
-    }
-    for name, raster in rasters.items():
+    for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
         if raster is not None and raster.shape != size:
             raise InputError(
                 f"{name} is {raster.shape[0]} x {raster.shape[1]} pixels, the normals "
                 f"{size[0]} x {size[1]}; both must be of one size."
             )
-        if name.endswith("weight") and raster is not None and not bool((raster >= 0).all()):
+        if name == "weight" and raster is not None and not bool((raster >= 0).all()):
             raise InputError(
                 f"{name} has {int((~(raster >= 0)).sum())} values that are negative or NaN; "
                 "each must be 0 or more."
             )
     if mask is not None and not bool(mask.any()):
         raise InputError("mask has no pixel; at least one must be inside.")
-    if known_weight is not None and known_depth is None:
-        raise InputError("known_weight was given without known_depth; give both.")
     if not all(0 < step < math.inf for step in spacing):
         raise InputError(f"spacing is {spacing}; both distances must be above 0.")

@@ -16,22 +16,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import (
-    BasRelief,
-    standard_relief,
-)
-
-# Channels darker than this fraction of a photograph's brightest value are ignored: a choice.
-_DARK = 0.02
-# Alternations between lights and pixels: a choice; each at least halves the residual where point
-# lights overlap.
-_ALTERNATIONS = 20
-# Pixels that are clustered; all are then assigned: a choice.
-_CLUSTERED = 2000
+from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 
 def chromaticities(
-    images: Float[Tensor, "view channel height width"], mask: Bool[Tensor, "height width"]
+    radiance: Float[Tensor, "view channel pixel"],
 ) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
     """Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
 
@@ -41,9 +30,9 @@ def chromaticities(
         Colours whose sum over channels is zero, up to one colour that all pixels share; and
         whether a pixel has one: bright enough in all channels of some view.
     """
-    values = images[:, :, mask].double()
+    values = radiance.double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
-    bright = values.amin(dim=1) > _DARK * brightest
+    bright = values.amin(dim=1) > 0.02 * brightest
     log = torch.where(bright[:, None], values, 1).log()
     log = log - log.mean(dim=1, keepdim=True)
     # Harmonic: the darkest channel has the noisiest logarithm.
@@ -53,18 +42,15 @@ def chromaticities(
     total_pixel = weight.sum(dim=0).clamp_min(1e-30)
     point_light = torch.zeros_like(log[:, :, 0])
     pixel = torch.zeros_like(log[0])
-    for _ in range(_ALTERNATIONS):
+    # Each at least halves the residual where point lights overlap.
+    for _ in range(20):
         pixel = (weight * (log - point_light[..., None])).sum(dim=0) / total_pixel
         point_light = (weight * (log - pixel)).sum(dim=2) / total_view
-    return pixel.to(images), bright.any(dim=0)
+    return pixel.to(radiance), bright.any(dim=0)
 
 
 def chromaticity_groups(
-    images: Float[Tensor, "view channel height width"],
-    mask: Bool[Tensor, "height width"],
-    *,
-    radius: float = 0.05,
-    smallest: float = 0.01,
+    radiance: Float[Tensor, "view channel pixel"],
 ) -> Int[Tensor, " pixel"]:
     """Cluster pixels of similar chromaticity.
 
@@ -72,32 +58,31 @@ def chromaticity_groups(
     so on; then every pixel is assigned to the nearest cluster within the radius.
 
     Args:
-        images: Linear radiance, of two channels or more.
-        radius: In logarithm of colour; a few times its noise, less than half the distance of
-            different paints.
-        smallest: Groups with less than this fraction of the pixels are dropped.
+        radiance: Linear, of two channels or more.
 
     Returns:
-        Labels of the pixels in raster order, the largest group's 0; -1 for pixels in no group.
+        Labels of the pixels, the largest group's 0; -1 for pixels in no group.
     """
-    if images.shape[1] < 2:
+    if radiance.shape[1] < 2:
         raise InputError(
-            f"images have {images.shape[1]} channel; needed: two at least, pixels of one paint "
+            f"images have {radiance.shape[1]} channel; needed: two at least, pixels of one paint "
             "are grouped by colour. Use another method for grey images."
         )
-    colour, known = chromaticities(images, mask)
+    colour, known = chromaticities(radiance)
     labels = torch.full_like(known, -1, dtype=torch.int64)
     if not bool(known.any()):
         raise InputError("no pixel inside the mask is bright in all channels; needed: some.")
     colour = colour[:, known].mT.double().contiguous()
-    sample = colour[:: -(-len(colour) // _CLUSTERED)]
+    sample = colour[:: -(-len(colour) // 2000)]  # all are then assigned
+    # In logarithm of colour: a few times its noise, less than half the distance of paints.
+    radius = 0.05
     neighbours = torch.cdist(sample, sample) < radius
     remaining = torch.ones(len(sample), dtype=torch.bool, device=sample.device)
     leaders = []
     while bool(remaining.any()):
         votes = (neighbours & remaining).sum(dim=1) * remaining
         best = int(votes.argmax())
-        if int(votes[best]) < max(2, smallest * len(sample)):
+        if int(votes[best]) < max(2, 0.01 * len(sample)):
             break
         leaders.append(sample[neighbours[best] & remaining].mean(dim=0))
         remaining = remaining & ((sample - leaders[-1]).norm(dim=1) > 2 * radius)
@@ -112,23 +97,18 @@ def chromaticity_groups(
 _MIN_LAMBDA, _MAX_LAMBDA, _LAMBDAS = 0.125, 4.0, 23
 _MAX_TILT, _TILTS = 1.0, 17
 
-# Initial width of the kernel in logarithm of albedo: a choice. A wider one smooths the right
-# minimum away where albedos are close, a narrower one needs a finer grid.
-_FIRST_WIDTH = 0.03
+# Widths of the kernel in logarithm of albedo. A wider first one smooths the right minimum away
+# where albedos are close, a narrower one needs a finer grid; the last is the noise of shading.
+_FIRST_WIDTH, _LAST_WIDTH = 0.03, 0.015
 # Half the range of the histogram, in logarithm of albedo: a choice, a factor of 20.
 _REACH = 3.0
 # Grid points that are refined, halved with every kernel, and pixels used meanwhile: choices.
 _CANDIDATES, _FEW_PIXELS = 200, 1000
-# Products of pixels and candidates at a time: a choice, they fit a processor's cache.
-_CHUNK_ENTRIES = 250_000
 
 
 def resolve_by_albedo_entropy(
     shading: Float[Tensor, "3 pixel"],
     groups: Int[Tensor, " pixel"] | None = None,
-    *,
-    width: float = 0.015,
-    max_pixels: int = 20_000,
 ) -> BasRelief:
     r"""Find the bas-relief transformation of minimum albedo entropy; constant to autograd.
 
@@ -141,7 +121,6 @@ def resolve_by_albedo_entropy(
             zero or not finite are left out.
         groups: Pixels of equal chromaticity (:func:`.chromaticity_groups`), within which the
             entropy of brightness is minimized; by default all are one group.
-        width: Of the last kernel, as a fraction of albedo; about the noise of shading.
 
     Fails where the surface has as many albedos as pixels, or few different normals. Convex stays
     convex.
@@ -166,7 +145,7 @@ def resolve_by_albedo_entropy(
         b = start.on_shading(shading[:, usable].double())
         labels = torch.zeros_like(b[0]).long() if groups is None else groups[usable]
         labels = torch.unique(labels, return_inverse=True)[1]
-        found = _minimized(b, labels, width, max_pixels)
+        found = _minimized(b, labels)
         whole = BasRelief(mu=found[0], nu=found[1], lam=found[2].exp()).after(start)
         return whole.to(shading.dtype)
 
@@ -183,7 +162,8 @@ def albedo_entropy(
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """
-    size = max(1, _CHUNK_ENTRIES // shading.shape[1])
+    # Products at a time fit a cache.
+    size = max(1, 250_000 // shading.shape[1])
     parts = [
         _entropy(shading, labels, candidates[first : first + size], width)
         for first in range(0, len(candidates), size)
@@ -191,9 +171,7 @@ def albedo_entropy(
     return torch.cat(parts)
 
 
-def _minimized(
-    b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], width: float, max_pixels: int
-) -> Float[Tensor, " 3"]:
+def _minimized(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Float[Tensor, " 3"]:
     few, few_labels = _subsampled(b, labels, _FEW_PIXELS)
     tilts = torch.linspace(-_MAX_TILT, _MAX_TILT, _TILTS).to(b)
     flat, steep = (torch.tensor(value).to(b).log() for value in (_MIN_LAMBDA, _MAX_LAMBDA))
@@ -202,16 +180,16 @@ def _minimized(
     best = grid[albedo_entropy(few, few_labels, grid, _FIRST_WIDTH).argsort()[:_CANDIDATES]]
     step = torch.stack([tilts[1] - tilts[0], tilts[1] - tilts[0], lambdas[1] - lambdas[0]]) / 2
     narrow = _FIRST_WIDTH
-    while narrow > width:
+    while narrow > _LAST_WIDTH:
         best, entropy = _local_search(few, few_labels, best, step, narrow)
         best = torch.unique(best[entropy.argsort()[: -(-len(best) // 2)]], dim=0)
         step, narrow = step / 2, narrow / 1.4142
-    final = albedo_entropy(few, few_labels, best, width).argmin()
-    many, many_labels = _subsampled(b, labels, max_pixels)
+    final = albedo_entropy(few, few_labels, best, _LAST_WIDTH).argmin()
+    many, many_labels = _subsampled(b, labels, 20_000)
     best = best[final][None]
     # Down to a step that changes albedo by a tenth of the kernel.
-    while float(step.max()) > width / 10:
-        best, _ = _local_search(many, many_labels, best, step, width)
+    while float(step.max()) > _LAST_WIDTH / 10:
+        best, _ = _local_search(many, many_labels, best, step, _LAST_WIDTH)
         step = step / 2
     return best[0]
 
@@ -222,7 +200,6 @@ def _local_search(
     best: Float[Tensor, "candidate 3"],
     step: Float[Tensor, " 3"],
     width: float,
-    iterations: int = 4,
 ) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
     """Move each candidate to its best neighbour a step away until none is better."""
     around = torch.tensor(list(itertools.product((-1, 0, 1), repeat=3))).to(b) * step
@@ -230,7 +207,7 @@ def _local_search(
     best = best.clone()
     least = torch.full_like(best[:, 0], torch.inf)
     moving = torch.arange(len(best), device=b.device)
-    for _ in range(iterations):
+    for _ in range(4):
         neighbours = best[moving, None] + around
         entropy = albedo_entropy(b, labels, neighbours.flatten(0, 1), width).reshape(
             neighbours.shape[:2]

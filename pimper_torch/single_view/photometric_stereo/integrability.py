@@ -19,6 +19,7 @@ from itertools import combinations
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
@@ -31,9 +32,6 @@ from pimper_torch.records import Record
 # coefficients, which biases the solution. On the grey sphere of 215 pixels, normals after the best
 # bas-relief are 7.3 degrees off with single pixels in blocks of 4, and 6.1 so.
 _CELLS, _BLOCKS = 64, 16
-_ITERATIONS = 10
-# Minimum curl of the second best solution, as a fraction of the terms: a choice, above rounding.
-_MIN_SECOND_CURL = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -42,7 +40,7 @@ class Curls(Record):
 
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
-        noise: Covariance of ``across``, and of ``down``, from the noise of the pseudo-normals;
+        noise: Covariance of ``across``, and of ``down``, from white noise of the pseudo-normals;
             up to a factor.
     """
 
@@ -50,23 +48,6 @@ class Curls(Record):
     down: Float[Tensor, "equation pair"]
     weight: Float[Tensor, " equation"]
     noise: Float[Tensor, "pair pair"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Integrable(Record):
-    """The matrix that makes pseudo-normals of three dimensions integrable.
-
-    Attributes:
-        matrix: ``A``, up to a bas-relief transformation and a factor: shading is ``A s``.
-        curl: Root mean square of the equations' residuals over that of their terms: 0 for a
-            surface, 1 for unrelated terms.
-        certainty: Residual of the second best solution over that of the best; near 1 the solution
-            is arbitrary.
-    """
-
-    matrix: Float[Tensor, "3 3"]
-    curl: float
-    certainty: float
 
 
 def wedge(
@@ -81,7 +62,6 @@ def curls(
     pseudo: Float[Tensor, "size pixel"],
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
-    noise: Float[Tensor, "size size"] | None = None,
 ) -> Curls:
     """Assemble the equations of integrability over a raster.
 
@@ -91,7 +71,6 @@ def curls(
 
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
-        noise: Covariance of ``s``, up to a factor; by default white.
     """
     s, w = pseudo.double(), weight.double()
     moment = (w * s) @ s.mT
@@ -125,9 +104,8 @@ def curls(
             f"needed: {2 * pairs} or more. Widen the mask."
         )
     mean = blocks[some, :-1] / total[some, None]
-    spread_of = torch.eye(len(s)).to(s) if noise is None else noise.double()
-    axes = torch.linalg.cholesky(spread_of)
-    parts = [wedge(unit.mT, (inverse * axis[:, None]).mT) for axis in axes.unbind(dim=1)]
+    axes = torch.eye(len(s)).to(s)
+    parts = [wedge(unit.mT, (inverse * axis[:, None]).mT) for axis in axes]
     return Curls(
         across=mean[:, :pairs],
         down=mean[:, pairs:],
@@ -140,14 +118,13 @@ def integrable(
     pseudo: Float[Tensor, "3 pixel"],
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
-    noise: Float[Tensor, "3 3"] | None = None,
-) -> Integrable:
-    """Find the matrix that makes pseudo-normals the normals of a surface.
+) -> Float[Tensor, "3 3"]:
+    """Find ``A`` that makes pseudo-normals the normals of a surface: shading is ``A s``.
 
     The six unknowns are the least generalised eigenvector of the equations' squares against
     those of noise alone (total least squares); equations get Cauchy's weights, as they do not hold
-    across depth edges. The remaining bas-relief transformation is set by orthogonal rows. The third
-    component of most normals is negative. Constant to autograd.
+    across depth edges. The remaining bas-relief transformation is set by orthogonal rows, the
+    factor is free. The third component of most normals is negative. Constant to autograd.
 
     Raises:
         InputError: Fewer than six equations, or a surface (a plane, a cylinder) that
@@ -156,71 +133,40 @@ def integrable(
     Source: Yuille & Snow, CVPR 1997; the noise model, the averaging and the weights are ours.
     """
     with torch.no_grad():
-        found, curl, certainty = _least(curls(pseudo, weight, mask, noise))
-        p, q = _vector(found[:3]), _vector(found[3:])
+        solution = _least(curls(pseudo, weight, mask))
+        p, q = _vector(solution[:3]), _vector(solution[3:])
         third = torch.linalg.cross(p, q)
         size = third.norm().sqrt()
         p, q, third = p / size, q / size, third / size**2
         matrix = torch.stack([torch.linalg.cross(q, third), torch.linalg.cross(third, p), third])
         facing = (weight * (third.to(pseudo) @ pseudo).sign()).sum()
         matrix[2] *= -1 if facing > 0 else 1
-        return Integrable(matrix=matrix.to(pseudo), curl=curl, certainty=certainty)
+        return matrix.to(pseudo)
 
 
-def moments(equations: Curls) -> tuple[Float[Tensor, "both both"], Float[Tensor, "both both"]]:
-    """Return the quadratic forms of the equations' residuals, and of their terms."""
+def _least(equations: Curls) -> Float[Tensor, " both"]:
+    """Solve by reweighted total least squares."""
     both = torch.cat([equations.across, equations.down], dim=1)
-    full = (equations.weight[:, None] * both).mT @ both
-    terms = full.clone()
     pairs = equations.across.shape[1]
-    terms[:pairs, pairs:] = 0
-    terms[pairs:, :pairs] = 0
-    return full, terms
-
-
-def both_ways(noise: Float[Tensor, "pair pair"]) -> Float[Tensor, "both both"]:
-    """Return the joint covariance of ``across`` and ``down``, which are uncorrelated."""
-    return torch.kron(torch.eye(2).to(noise), noise)
-
-
-def reweighted(equations: Curls, solution: Float[Tensor, " both"]) -> Float[Tensor, " equation"]:
-    """Update the equations' weights by their residuals under a solution."""
-    both = torch.cat([equations.across, equations.down], dim=1)
-    residual = both @ solution
-    scale = CAUCHY_TUNING * robust_deviation(residual, equations.weight > 0)
-    return equations.weight * cauchy_weights(residual, scale)
-
-
-def _least(equations: Curls) -> tuple[Float[Tensor, " both"], float, float]:
-    """Solve by reweighted total least squares; give the curl and the certainty, too."""
-    metric = both_ways(equations.noise)
-    eye = torch.eye(len(metric)).to(metric)
-    root = torch.linalg.cholesky(metric + 1e-12 * metric.diagonal().mean() * eye)
-    reweighted_equations = equations
-    for _ in range(_ITERATIONS):
-        full, terms = moments(reweighted_equations)
-        inner = torch.linalg.solve_triangular(root, full, upper=False)
-        inner = torch.linalg.solve_triangular(root, inner.mT, upper=False)
-        values, vectors = torch.linalg.eigh((inner + inner.mT) / 2)
-        vectors = torch.linalg.solve_triangular(root.mT, vectors, upper=True)
-        reweighted_equations = equations.replace(weight=reweighted(equations, vectors[:, 0]))
-    fraction = [_curl(full, terms, vectors[:, one]) for one in (0, 1)]
-    if not fraction[1] > _MIN_SECOND_CURL:
+    # ``across`` and ``down`` are uncorrelated.
+    metric = torch.kron(torch.eye(2).to(both), equations.noise)
+    metric = metric + 1e-12 * metric.diagonal().mean() * torch.eye(len(metric)).to(metric)
+    weight = equations.weight
+    for _ in range(10):
+        full = (weight[:, None] * both).mT @ both
+        vectors = torch.from_numpy(eigh(full.cpu().numpy(), metric.cpu().numpy())[1]).to(full)
+        residual = both @ vectors[:, 0]
+        scale = CAUCHY_TUNING * robust_deviation(residual, weight > 0)
+        weight = equations.weight * cauchy_weights(residual, scale)
+    second = vectors[:, 1]
+    terms = full * torch.kron(torch.eye(2), torch.ones(pairs, pairs)).to(full)
+    # The curl of the second best solution, as a fraction of its terms, is rounding.
+    if not float(second @ full @ second) > 1e-12 * float(second @ terms @ second):
         raise InputError(
             "integrability: more than one matrix makes these pseudo-normals a surface, as for a "
             "plane or a cylinder; needed: curvature in two directions. Widen the mask."
         )
-    least = float(values[0].clamp_min(torch.finfo(values.dtype).tiny))
-    return vectors[:, 0], fraction[0], (float(values[1]) / least) ** 0.5
-
-
-def _curl(
-    full: Float[Tensor, "both both"],
-    terms: Float[Tensor, "both both"],
-    solution: Float[Tensor, " both"],
-) -> float:
-    total = float(solution @ terms @ solution)
-    return (max(0.0, float(solution @ full @ solution)) / total) ** 0.5 if total > 0 else 0.0
+    return vectors[:, 0]
 
 
 def _pairs(size: int) -> tuple[list[int], list[int]]:

@@ -17,6 +17,7 @@ Source: Papadhimitri & Favaro, A new perspective on uncalibrated photometric ste
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
@@ -24,9 +25,6 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
-# Minimum number of equations, for nine unknowns up to scale: a choice.
-_FEWEST = 50
-_REWEIGHTINGS = 4
 # Minimum ratio of the second smallest residual to the smallest: a choice; on a ball it is about 1.
 _DISTINCT = 1.5
 
@@ -63,7 +61,12 @@ def factorize_in_perspective(
     Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, normalization and
     the noise model are ours.
     """
-    _check(images, mask, intrinsics, seen)
+    last = intrinsics.new_tensor([0.0, 0, 1])
+    if not bool((intrinsics[2] == last).all() and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
+        raise InputError(
+            f"intrinsics are {intrinsics.tolist()}; needed: focal lengths above zero on the "
+            "diagonal and (0, 0, 1) in the last row."
+        )
     with torch.no_grad():
         radiance = images.double().sum(dim=1)[:, mask]
         weight = torch.ones_like(radiance) if seen is None else seen.double()
@@ -131,10 +134,11 @@ def _between(
         pad(inside.double(), (radius,) * 4)[None, None], right.new_ones(1, 1, side, side)
     )
     whole = (whole[0, 0] > side * side - 0.5) & inside
-    if int(whole.sum()) < _FEWEST:
+    # Nine unknowns up to scale.
+    if int(whole.sum()) < 50:
         raise InputError(
             f"{int(whole.sum())} squares of {side} x {side} pixels lie inside the mask and are "
-            f"seen in three views; needed: {_FEWEST}. Lower `radius`, or enlarge the mask."
+            f"seen in three views; needed: {50}. Lower `radius`, or enlarge the mask."
         )
     b, bu, bv = value[:, whole], along_u[:, whole], along_v[:, whole]
     rays = _rays(mask, intrinsics)[whole].mT
@@ -143,7 +147,7 @@ def _between(
     noise_covariance = _noise_of_crosses(b, size_raster[whole], white @ white.mT)
     by_u, by_v = _by_derivatives(rays, intrinsics)
     weight = torch.ones_like(b[0])
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(4):
         cofactors, ratio = _least(rows, weight, noise_covariance, by_u, by_v)
         rotated_u, rotated_v = by_u @ cofactors, by_v @ cofactors
         variance = torch.einsum("pi,pij,pj->p", rotated_u, noise_covariance, rotated_u)
@@ -180,13 +184,11 @@ def _least(
     both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
     both = both * weight[:, None, None]
     noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
-    root = torch.linalg.cholesky(noise + 1e-12 * noise.trace() * torch.eye(9).to(noise))
+    noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
     moment = (weight[:, None] * rows).mT @ rows
-    reduced = torch.linalg.solve_triangular(root, moment, upper=False)
-    reduced = torch.linalg.solve_triangular(root, reduced.mT, upper=False)
-    ratios, vectors = torch.linalg.eigh((reduced + reduced.mT) / 2)
-    least = torch.linalg.solve_triangular(root.mT, vectors[:, :1], upper=True)
-    return least.reshape(3, 3), float(ratios[1] / ratios[0].clamp_min(1e-300))
+    ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
+    least = torch.from_numpy(vectors[:, 0].reshape(3, 3)).to(rows)
+    return least, float(ratios[1] / max(ratios[0], 1e-300))
 
 
 def _noise_of_crosses(
@@ -241,26 +243,3 @@ def _rays(
     pixels = pixel_centers(mask.shape[1], mask.shape[0], intrinsics)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
     return homogeneous @ torch.linalg.inv(intrinsics).mT
-
-
-def _check(
-    images: Float[Tensor, "view channel height width"],
-    mask: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"],
-    seen: Bool[Tensor, "view pixel"] | None,
-) -> None:
-    if len(images) < 3:
-        raise InputError(
-            f"{len(images)} views; needed: three at least, each under another point light."
-        )
-    if seen is not None and seen.shape[1] != int(mask.sum()):
-        raise InputError(
-            f"seen has {seen.shape[1]} pixels, and {int(mask.sum())} are inside the mask; "
-            "needed: one column a pixel."
-        )
-    last = intrinsics.new_tensor([0.0, 0, 1])
-    if not bool((intrinsics[2] == last).all() and intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
-        raise InputError(
-            f"intrinsics are {intrinsics.tolist()}; needed: focal lengths above zero on the "
-            "diagonal and (0, 0, 1) in the last row."
-        )

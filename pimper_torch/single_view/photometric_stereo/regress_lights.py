@@ -20,13 +20,12 @@ from pimper_torch.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.low_rank import low_rank_problem
+from pimper_torch.single_view.factorization.bas_relief import BasRelief
+from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
 
 # The scale of the weights starts at this multiple and is multiplied by the second per iteration,
 # down to 1: choices, so that the initial fit does not decide which samples are outliers.
 _WIDEST, _NARROWING = 4.0, 0.7
-# Minimum scale, as a fraction of the brightness: a choice, far below the 4e-3 of 8-bit steps.
-_MIN_SCALE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -48,7 +47,6 @@ def regress(
     lights: Float[Tensor, "view unknown"],
     *,
     robust: bool = True,
-    iterations: int = 15,
 ) -> Regressed:
     r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
 
@@ -70,7 +68,7 @@ def regress(
         if not robust:
             return _fit(x, given, rows)
         found = _fit(x, given * brightness(x, seen), rows)
-        for iteration in range(iterations):
+        for iteration in range(15):
             widen = max(1.0, _WIDEST * _NARROWING**iteration)
             reliability, lit = reweigh(x, given, rows @ found.shading, widen)
             found = _fit(x, reliability * lit, rows)
@@ -94,7 +92,8 @@ def reweigh(
     seen = (weight > 0) & lit
     level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
     scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
-    return weight * cauchy_weights(residual, widen * scale.maximum(_MIN_SCALE * level)), lit
+    # Far below the 4e-3 of 8-bit steps.
+    return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)), lit
 
 
 def brightness(
@@ -111,20 +110,15 @@ def brightness(
 def determined(
     weight: Float[Tensor, "view pixel"],
     lights: Float[Tensor, "view unknown"],
-    least: float = 1e-4,
 ) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
-    """Find which pixels have as many samples as unknowns, and lights that span them.
-
-    Args:
-        least: Smallest eigenvalue of the normal equations over the largest. Below 1e-4, noise of
-            1 % in the images is as large as the solution.
-    """
+    """Find which pixels have as many samples as unknowns, and lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     size = lights.double().norm(dim=0)
     basis = lights.double() / torch.where(size > 0, size, 1)
     unknowns = lights.shape[1]
     values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
-    spanned = values[:, 0] > least * values[:, -1]
+    # With less, noise of 1 % in the images is as large as the solution.
+    spanned = values[:, 0] > 1e-4 * values[:, -1]
     return count >= unknowns, spanned & (values[:, -1] > 0)
 
 
@@ -139,17 +133,22 @@ def _fit(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Calibrated(Record):
-    """Normals and albedo of pixels.
+class StereoSolution(Record):
+    """Normals, albedo and lights, for the pixels inside a mask in raster order, in float64.
 
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
         weight: Final weight of each sample; 0 where missing or in shadow.
+        applied: The transformation that resolved an ambiguity, if any.
+        free: The remaining ambiguity, in words.
     """
 
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
+    lights: Float[Tensor, "view 3"]
     weight: Float[Tensor, "view pixel"]
+    applied: BasRelief | None = None
+    free: str = "nothing"
 
 
 def calibrated_stereo(
@@ -158,7 +157,7 @@ def calibrated_stereo(
     lights: Float[Tensor, "view 3"],
     *,
     robust: bool = True,
-) -> Calibrated:
+) -> StereoSolution:
     r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
 
     Weights are those of the mean of the colours; see :func:`regress`. Normal and albedos are then
@@ -179,7 +178,7 @@ def calibrated_stereo(
         factored = PackedCholesky(packed, 3)
         found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
         normals, albedo = _shared(unpacked(packed, 3), found)
-        return Calibrated(normals=normals, albedo=albedo, weight=heavy)
+        return StereoSolution(normals=normals, albedo=albedo, lights=rows, weight=heavy)
 
 
 def chromatic_albedo(
@@ -219,11 +218,8 @@ def _shared(
     return normal.mT, (sign * albedo).clamp_min(0).mT
 
 
-# Lights are estimated from so many pixels at most, shading for all: a choice.
-_MAX_PIXELS = 4000
 # Steps of variable projection: for the first solution, and after every change of weights: choices.
 _FIRST_STEPS, _NEXT_STEPS = 100, 5
-_ITERATIONS = 20
 _WIDEST_FACTORED, _NARROWING_FACTORED = 4.0, 0.8
 
 
@@ -272,7 +268,8 @@ def factorize_photographs(
         if not robust and bool((given == given[seen].max()).all()):
             left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
             return Factored(lights=left, shading=left.mT @ x, weight=given)
-        some = usable[evenly(len(usable), _MAX_PIXELS).to(usable.device)]
+        # Lights are estimated from these, shading for all.
+        some = usable[evenly(len(usable), 4000).to(usable.device)]
         first = given[:, some]
         if robust:
             first = first * brightness(x[:, some], seen[:, some])
@@ -293,7 +290,7 @@ def _settle(
 ) -> Float[Tensor, "view rank"]:
     """Alternate weights and factors, the scale of the weights falling to its final value."""
     weight = first
-    for iteration in range(_ITERATIONS):
+    for iteration in range(20):
         problem = low_rank_problem(x[None], weight[None], left[None])
         solved = solve_variable_projection(problem, _NEXT_STEPS)
         left = solved.lights[0]
@@ -307,11 +304,8 @@ def _filled(
     x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
 ) -> Float[Tensor, "view rank"]:
     """Impute missing samples by view's times pixel's brightness, and take singular vectors."""
-    gain = (weight * x).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
-    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    albedo = (weight * x).sum(dim=0, keepdim=True) / level
     fraction = weight / weight.amax().clamp_min(1e-300)
-    filled = fraction * x + (1 - fraction) * gain * albedo
+    filled = fraction * x + (1 - fraction) * brightness_guess(x, weight)
     return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
 
 

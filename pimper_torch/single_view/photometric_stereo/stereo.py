@@ -1,10 +1,9 @@
 """Photometric stereo from one viewpoint, by any of the methods."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -12,9 +11,8 @@ from pimper_torch.records import Record
 from pimper_torch.single_view.factorization.bas_relief import (
     BasRelief,
     convex,
-    relief_from_albedo,
     relief_from_strength,
-    rounded_relief,
+    standard_relief,
 )
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,
@@ -24,6 +22,7 @@ from pimper_torch.single_view.photometric_stereo.integrability import integrable
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.regress_lights import (
     Factored,
+    StereoSolution,
     calibrated_stereo,
     chromatic_albedo,
     determined,
@@ -34,20 +33,9 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
 # the default: nearest to known lights on the rendered objects (benchmarks/photometric_stereo.py).
 METHODS: dict[str, tuple[str, ...]] = {
     "calibrated": (),
-    "integrability": ("albedo_entropy", "rounded", "equal_albedo", "equal_strength"),
+    "integrability": ("albedo_entropy", "rounded", "equal_strength"),
     "perspective": (),
 }
-
-
-class PixelStatus(IntEnum):
-    """The status of a pixel."""
-
-    FOUND = 0
-    OUTSIDE = 1  # of the mask
-    TOO_FEW = 2  # samples with weight, for the unknowns of the method
-    FLAT = 3  # the lights that reach it lie in a plane, and do not determine its normal
-    BLACK = 4  # its radiance is zero
-    AVERTED = 5  # its normal does not face the viewer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -60,8 +48,8 @@ class PhotometricStereo(Record):
             length 1.
         lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: seen, in no shadow, no highlight.
-        valid: Where the normal is determined and faces the viewer.
-        finding: A :class:`PixelStatus` for each pixel.
+        valid: Where samples are as many as unknowns, lights span space, and the normal faces the
+            viewer.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -71,10 +59,8 @@ class PhotometricStereo(Record):
     lights: Float[Tensor, "view 3"]
     lit: Bool[Tensor, "view height width"]
     valid: Bool[Tensor, "height width"]
-    finding: Int[Tensor, "height width"]
     applied: BasRelief | None
     free: str
-    unused_views: tuple[int, ...]
 
 
 def photometric_stereo(
@@ -99,7 +85,7 @@ def photometric_stereo(
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ==================  ==========================================  =================
 
-    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_albedo``, ``equal_strength``, or
+    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_strength`` (of the lights), or
     ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
@@ -140,12 +126,8 @@ def photometric_stereo(
         heavy = heavy[used]
         radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
         if lights is not None:
-            own = lights[used].double()
-            _refuse_plane(own)
-            known = calibrated_stereo(radiance, heavy, own, robust=robust)
-            found = _Solution(
-                normals=known.normals, albedo=known.albedo, lights=own, weight=known.weight
-            )
+            _refuse_plane(lights[used])
+            found = calibrated_stereo(radiance, heavy, lights[used].double(), robust=robust)
         elif intrinsics is not None:
             whole = torch.zeros_like(images[used], dtype=torch.float64)
             whole[:, :, mask] = radiance
@@ -161,46 +143,29 @@ def photometric_stereo(
 _FACTOR = "a factor between albedo and light"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Solution(Record):
-    """Output of a method, for the pixels inside the mask in raster order, in float64."""
-
-    normals: Float[Tensor, "3 pixel"]
-    albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view 3"]
-    weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | None = None
-    free: str = "nothing"
-
-
 def _integrable(
     radiance: Float[Tensor, "view channel pixel"],
     weight: Float[Tensor, "view pixel"],
     mask: Bool[Tensor, "height width"],
     resolve: str,
     robust: bool,
-) -> _Solution:
+) -> StereoSolution:
     """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
     enough, spanned = determined(factors.weight, factors.lights)
     total = factors.weight.sum(dim=0)
     reliability = torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
-    matrix = integrable(factors.shading, reliability, mask).matrix
+    matrix = integrable(factors.shading, reliability, mask)
     shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
     if resolve == "rounded":
-        relief = rounded_relief(shading, reliability, mask)
-    elif resolve == "equal_albedo":
-        relief = relief_from_albedo(shading, reliability, mask)
+        relief = standard_relief(shading, reliability)
     elif resolve == "equal_strength":
         relief = relief_from_strength(lights, shading, reliability, mask)
     else:
-        used, inside = reliability > 0, torch.zeros_like(mask)
-        inside[mask] = used
-        images = radiance.new_zeros(*radiance.shape[:2], *mask.shape)
-        images[:, :, mask] = radiance
-        groups = chromaticity_groups(images, inside) if images.shape[1] > 1 else None
+        used = reliability > 0
+        groups = chromaticity_groups(radiance[:, :, used]) if radiance.shape[1] > 1 else None
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
-        relief = convex(relief, shading, reliability, mask)
+    relief = convex(relief, shading, reliability, mask)
     moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
     free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
     return _lambertian(radiance, moved, relief, free)
@@ -211,7 +176,7 @@ def _lambertian(
     factors: Factored,
     applied: BasRelief | None,
     free: str,
-) -> _Solution:
+) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""
     size = factors.shading.norm(dim=0)
     normals = factors.shading / torch.where(size > 0, size, 1)
@@ -220,7 +185,7 @@ def _lambertian(
     length = factors.lights.norm(dim=1)
     shining = length[length > 0]
     factor = shining.median() if len(shining) else length.new_ones(())
-    return _Solution(
+    return StereoSolution(
         normals=normals,
         albedo=albedo * factor,
         lights=factors.lights / factor,
@@ -231,7 +196,7 @@ def _lambertian(
 
 
 def _spread_out(
-    found: _Solution,
+    found: StereoSolution,
     given: Float[Tensor, "view pixel"],
     mask: Bool[Tensor, "height width"],
     used: Bool[Tensor, " view"],
@@ -239,17 +204,8 @@ def _spread_out(
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
     enough, spanned = determined(found.weight, found.lights)
-    finding = torch.full_like(spanned, int(PixelStatus.FOUND), dtype=torch.long)
-    checks = [
-        (found.normals[2] >= 0, PixelStatus.AVERTED),
-        ((found.normals == 0).all(dim=0) | (found.albedo <= 0).all(dim=0), PixelStatus.BLACK),
-        (~spanned, PixelStatus.FLAT),
-        (~enough, PixelStatus.TOO_FEW),
-    ]
-    for wrong, name in checks:  # the last one that applies is reported
-        finding = torch.where(wrong, int(name), finding)
-    raster = torch.full(mask.shape, int(PixelStatus.OUTSIDE), device=mask.device)
-    raster[mask] = finding
+    valid = torch.zeros_like(mask)
+    valid[mask] = enough & spanned & (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
     normals = like.new_zeros(*mask.shape, 3)
     normals[mask] = found.normals.mT.to(like)
     albedo = like.new_zeros(*mask.shape, len(found.albedo))
@@ -265,11 +221,9 @@ def _spread_out(
         albedo=albedo,
         lights=lights,
         lit=lit,
-        valid=raster == int(PixelStatus.FOUND),
-        finding=raster,
+        valid=valid,
         applied=found.applied,
         free=found.free,
-        unused_views=tuple(torch.nonzero(~used)[:, 0].tolist()),
     )
 
 

@@ -73,19 +73,6 @@ def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_p
     assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
 
 
-def test_a_conductor_mirrors_an_environment_that_changes_on_demand(ball, tmp_path, capsys):
-    options = ("--conductor", "copper", "--environment", "changing")
-    assert render(ball, tmp_path / "out", *options) == 0
-    capture = read_rendered(tmp_path / "out")
-    around = ~capture.truth.depth.isfinite()
-    assert around.any()  # nothing is there, and the environment is seen
-    assert capture.views.images.movedim(1, -1)[around].mean() > 0.01
-    assert (capture.truth.albedo[capture.truth.foreground] == 0).all()
-    assert capture.truth.highlight[capture.truth.foreground].float().mean() > 0.5
-    assert render(ball, tmp_path / "other", "--conductor", "copper", "--albedo", *"000") == 2
-    assert "no matte part" in capsys.readouterr().err
-
-
 def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
     assert render(ball, tmp_path / "out") == 0
     assert render(ball, tmp_path / "out") == 2

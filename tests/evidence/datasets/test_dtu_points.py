@@ -108,16 +108,6 @@ def test_another_layout_is_refused_by_what_was_expected_and_found(folder, break_
         read_dtu_points(folder, 4)
 
 
-def test_a_photograph_of_another_size_or_kind_is_refused(folder, paint):
-    path = folder / "SET004" / "Img002_02.bmp"
-    paint(path, 9, width=20)
-    with pytest.raises(InputError, match=r"02\.bmp: is 20 x 12, but Img001_01\.bmp is 16 x 12"):
-        read_dtu_points(folder, 4)
-    paint(path, 9, mode="L")
-    with pytest.raises(InputError, match=r"02\.bmp: has 1 colours, but Img001_01\.bmp has 3"):
-        read_dtu_points(folder, 4)
-
-
 def test_a_calibration_of_the_wrong_shape_is_refused(folder, save_calibration):
     save_calibration(folder / "Calib_Results_11.mat", KK=np.eye(4))
     with pytest.raises(InputError, match=r"KK as finite numbers of shape 3 x 3.*4 x 4"):

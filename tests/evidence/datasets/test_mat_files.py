@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from pimper_torch.evidence.datasets import mat_files
-from pimper_torch.evidence.datasets.mat_files import read_variables
+from pimper_torch.evidence.datasets import matlab
+from pimper_torch.evidence.datasets.matlab import read_variables
 
 GENERATOR = np.random.default_rng(5)
 ARRAYS = {
@@ -56,7 +56,7 @@ def test_what_says_too_much_is_refused_before_memory_is_taken(tmp_path, monkeypa
         path.write_bytes(content)
         with pytest.raises(ValueError, match=why):
             read_variables(path)
-    monkeypatch.setattr(mat_files, "MAX_BYTES", 10**6)
+    monkeypatch.setattr(matlab, "MAX_BYTES", 10**6)
     scipy.io.savemat(path, {"a": np.zeros((500, 500))}, do_compression=True)
     with pytest.raises(ValueError, match="would take more than 1000000 bytes"):
         read_variables(path)

@@ -111,22 +111,6 @@ def test_a_mesh_of_the_table_alone_is_refused(make):
         compare_along_rays(table, capture, 0)
 
 
-def test_maps_on_a_larger_raster_than_the_photograph_are_compared_inside_it(make):
-    sphere, cameras = make.sphere(level=3), make.cameras(count=1)
-    truth = with_maps(make, sphere, cameras)
-    padded = truth.replace(
-        depth=torch.nn.functional.pad(truth.depth, (0, 7, 0, 3), value=torch.inf),
-        normals_world=None,
-        albedo=None,
-    )
-    found = compare_along_rays(sphere, make.capture(padded, cameras=cameras), 0)
-    assert found.coverage == 1.0
-    assert found.relative_error < 1e-4
-    small = truth.replace(depth=truth.depth[:, :20], normals_world=None, albedo=None)
-    with pytest.raises(InputError, match="one and the same size"):
-        compare_along_rays(sphere, make.capture(small, cameras=cameras), 0)
-
-
 def test_nothing_is_compared_where_nothing_is_known(make):
     sphere, cameras = make.sphere(level=2), make.cameras(count=1)
     empty = make.capture(Truth(), cameras=cameras)

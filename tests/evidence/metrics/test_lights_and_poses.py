@@ -79,7 +79,6 @@ def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
     assert found.median_rotation_deg == pytest.approx(0, abs=1e-6)
     assert found.mean_center == pytest.approx(0.1)
     assert found.mean_center_percent == pytest.approx(100 * 0.1 / 5)  # 5 from the centre
-    assert found.mean_center_percent_of_diagonal == pytest.approx(5.0)
     assert found.mean_focal_percent == pytest.approx(10.0)
 
 

@@ -34,7 +34,6 @@ def shot(stage, sensor, seed=0, **changes):
         "irradiance": torch.tensor([0.6], dtype=torch.float64),
         "ambient": torch.tensor([0.1], dtype=torch.float64),
         "target_world": torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64),
-        "flash": torch.zeros(1, dtype=torch.float64),
     }
     generator = torch.Generator().manual_seed(seed)
     lights = Lights(**(settings | changes))

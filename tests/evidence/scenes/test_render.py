@@ -33,7 +33,6 @@ def point_light(position, **changes):
         "irradiance": torch.tensor([1.0], dtype=torch.float64),
         "ambient": torch.tensor([0.0], dtype=torch.float64),
         "target_world": torch.zeros(3, dtype=torch.float64),
-        "flash": torch.tensor([0.0], dtype=torch.float64),
     }
     return Lights(**(settings | changes))
 
@@ -118,16 +117,6 @@ def test_a_point_light_below_the_horizon_gives_no_light_but_the_ambient():
     assert_close(scene.views.images, torch.full_like(scene.views.images, 0.25))
 
 
-def test_a_flash_lights_what_faces_the_camera_without_shadows():
-    lights = point_light([0.0, 0.0, -2.0], flash=torch.tensor([0.5], dtype=torch.float64))
-    generator = torch.Generator().manual_seed(65)
-    scene = render_objects(
-        [SceneObject(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET
-    )
-    assert_close(scene.views.images[0, :, 15, 15], torch.full((3,), 0.5), atol=1e-4, rtol=0)
-    assert (scene.views.images > 0.2).all()
-
-
 def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
     window = torch.tensor([0.3, 0.0, 0.4], dtype=torch.float64)
     colour = torch.tensor([[1.2, 1.0, 0.8]], dtype=torch.float64)
@@ -173,7 +162,6 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
         irradiance=torch.full((2,), 0.7, dtype=torch.float64),
         ambient=torch.full((2,), 0.1, dtype=torch.float64),
         target_world=torch.zeros(3, dtype=torch.float64),
-        flash=torch.zeros(2, dtype=torch.float64),
     )
     texture = random_speckle(generator, cells=(0.5,))
     traced = render_objects(

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError
 from pimper_torch.single_view.integration import raster_system
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem
@@ -280,7 +280,7 @@ def test_known_depths_fix_the_constant_and_bend_what_normals_say(method):
             normals,
             spacing=(2 / 30, 2 / 30),
             known_depth=known,
-            known_weight=torch.full_like(z, weight),
+            weight=torch.full_like(z, 1 / weight),
             method="weighted",
         )
         for weight in (1.0, 1e6)
@@ -365,7 +365,6 @@ def test_float32_normals_give_float32_depth():
     [
         ({"mask": torch.zeros(6, 6, dtype=torch.bool)}, "no pixel"),
         ({"weight": -torch.ones(6, 6)}, "36 values"),
-        ({"known_weight": torch.ones(6, 6)}, "without known_depth"),
         ({"known_depth": torch.zeros(6, 6), "intrinsics": torch.eye(3)}, "not positive"),
         ({"spacing": (1.0, 0.0)}, "spacing"),
     ],
@@ -412,22 +411,3 @@ def test_normals_of_another_convention_are_refused(change, told):
     normals, mask, _ = dome(40)
     with pytest.raises(InputError, match=told):
         integrate_normal_map(change(normals), mask)
-
-
-@pytest.mark.parametrize("noise_deg", [0.0, 3.0])
-def test_normals_whose_y_points_up_are_told(noise_deg):
-    normals, mask, _ = dome()
-    generator = torch.Generator().manual_seed(3)
-    spread = torch.randn(normals.shape, generator=generator, dtype=torch.float64)
-    normals = normals + noise_deg / 57.3 * spread
-    integrate_normal_map(normals, mask, method="weighted")  # silent: warnings are errors here
-    with pytest.warns(PimperWarning, match="as if y pointed up"):
-        integrate_normal_map(normals * torch.tensor([1.0, -1, 1]).double(), mask, method="weighted")
-
-
-def test_a_plane_is_a_surface_whichever_way_y_points():
-    plane = torch.tensor([0.3, 0.2, -0.9]).double().expand(60, 60, 3)
-    generator = torch.Generator().manual_seed(4)
-    rough = plane + 0.05 * torch.randn(60, 60, 3, generator=generator, dtype=torch.float64)
-    for normals in (plane, rough):
-        integrate_normal_map(normals, method="weighted")

@@ -29,27 +29,12 @@ def test_a_surface_is_found_up_to_bas_relief_whatever_its_albedo(
     mixing = torch.randn(3, 3, generator=generator, dtype=torch.float64)
     for albedo in (even(bumpy), patchwork(bumpy)):
         pseudo = mixing @ (albedo * bumpy.columns)
-        found = integrable(pseudo, even(bumpy), bumpy.mask, mixing @ mixing.mT)
-        shading = found.matrix @ pseudo
+        found = integrable(pseudo, even(bumpy), bumpy.mask)
+        shading = found @ pseudo
         best = align_reliefs(shading, bumpy.columns, even(bumpy)).on_shading(shading)
         # Over cells of 1/56 of the surface its slopes are not quite linear.
         assert angles_deg(best, bumpy.columns).mean() < 0.5
-        assert found.curl < 0.02
-        assert found.certainty > 5
-        assert ((found.matrix @ pseudo)[2] < 0).double().mean() > 0.9
-
-
-def test_another_basis_gives_the_same_surface(bumpy, generator, angles_deg):
-    noisy = bumpy.columns + 0.01 * torch.randn(
-        bumpy.columns.shape, generator=generator, dtype=torch.float64
-    )
-    mixing = torch.randn(3, 3, generator=generator, dtype=torch.float64)
-    one = integrable(noisy, even(bumpy), bumpy.mask)
-    other = integrable(mixing @ noisy, even(bumpy), bumpy.mask, mixing @ mixing.mT)
-    shading = other.matrix @ mixing @ noisy
-    best = align_reliefs(shading, one.matrix @ noisy, even(bumpy)).on_shading(shading)
-    assert angles_deg(best, one.matrix @ noisy).max() < 1e-4
-    assert other.certainty == pytest.approx(one.certainty)
+        assert (shading[2] < 0).double().mean() > 0.9
 
 
 def test_pixels_outside_the_mask_or_without_weight_do_not_enter(bumpy, generator):
@@ -78,7 +63,7 @@ def test_depth_edges_are_outliers(bumpy, angles_deg):
     normals = bumpy.normals.clone()
     normals[:, 28:, 0] += 0.7 * normals[:, 28:, 2]
     pseudo = normals[bumpy.mask].mT
-    shading = integrable(pseudo, even(bumpy), bumpy.mask).matrix @ pseudo
+    shading = integrable(pseudo, even(bumpy), bumpy.mask) @ pseudo
     best = align_reliefs(shading, pseudo, even(bumpy)).on_shading(shading)
     assert angles_deg(best, pseudo).mean() < 0.5
 

@@ -137,8 +137,6 @@ def test_what_does_not_fit_is_refused(generator):
     images, mask = made.images, made.mask
     with pytest.raises(InputError, match="2 views"):
         factorize_in_perspective(images[:2], mask, intrinsics)
-    with pytest.raises(InputError, match="one column a pixel"):
-        factorize_in_perspective(images, mask, intrinsics, lit(made)[:, 1:])
     with pytest.raises(InputError, match="focal lengths"):
         factorize_in_perspective(images, mask, -intrinsics)
     thin = torch.zeros_like(mask)
