@@ -17,12 +17,6 @@ from pimper_torch.records import Record
 # a view.
 RELATIVE_NOISE = 0.03
 
-# No guess of a sample counts as more views than this: a choice, so that photographs overrule it.
-MOST_VIEWS = 1.0
-
-# Relative mean square error of the light field: a choice, 6 degrees.
-FIELD_VARIANCE = 0.01
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchSamples(Record):
@@ -124,58 +118,59 @@ class SurfaceNormals(FactorPrior):
         return Known(normals=samples.normals, normal_weight=weight)
 
 
-class GuessedNormals(FactorPrior):
-    """Normals are those that views carry, to their variance."""
+class Guesses(FactorPrior):
+    """Normals, albedo, lights and inliers are those that views carry, to their variance.
+
+    Albedo and lights are taken up to a factor for each patch.
+    """
 
     def forward(self, samples: PatchSamples) -> Known:
-        """Return the guesses."""
+        """Return the guesses in units of the light field and the albedo under it."""
+        albedo, albedo_weight = _guessed_albedo(samples)
+        lights, light_weight = _guessed_lights(samples)
         information = samples.guessed_information
-        if information is None:
-            return Known()
-        return Known(normals=samples.guessed_normals, normal_weight=views_worth(information))
+        return Known(
+            normals=samples.guessed_normals,
+            normal_weight=None if information is None else views_worth(information),
+            albedo=albedo,
+            albedo_weight=albedo_weight,
+            lights=lights,
+            light_weight=light_weight,
+            inlier=samples.guessed_inlier,
+        )
 
 
-class GuessedAlbedo(FactorPrior):
-    """Albedo is that which views carry, to its variance, up to a factor for each patch."""
-
-    def forward(self, samples: PatchSamples) -> Known:
-        """Return the guesses, in the unit of the albedo that suits the light."""
-        guess, variance = samples.guessed_albedo, samples.guessed_albedo_variance
-        if guess is None or variance is None:
-            return Known()
-        both = (guess > 0) & (samples.albedo > 0)
-        if not bool(both.any()):
-            return Known()
-        ratio = torch.where(both, samples.albedo / torch.where(both, guess, 1), torch.nan)
-        factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-        weight = torch.where(both, views_worth(1 / variance), 0)
-        return Known(albedo=factor * guess, albedo_weight=weight)
+def _guessed_albedo(
+    samples: PatchSamples,
+) -> tuple[Float[Tensor, "patch sample"] | None, Float[Tensor, "patch sample"] | None]:
+    guess, variance = samples.guessed_albedo, samples.guessed_albedo_variance
+    if guess is None or variance is None:
+        return None, None
+    both = (guess > 0) & (samples.albedo > 0)
+    if not bool(both.any()):
+        return None, None
+    ratio = torch.where(both, samples.albedo / torch.where(both, guess, 1), torch.nan)
+    factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+    return factor * guess, torch.where(both, views_worth(1 / variance), 0)
 
 
-class GuessedInliers(FactorPrior):
-    """Entries count by the probability of diffuse reflection that views carry."""
-
-    def forward(self, samples: PatchSamples) -> Known:
-        """Return the guesses."""
-        return Known(inlier=samples.guessed_inlier)
-
-
-class GuessedLights(FactorPrior):
-    """Lights are those that views carry, to their variance, up to a factor for each patch."""
-
-    def forward(self, samples: PatchSamples) -> Known:
-        """Return the guesses, in the unit of the field's lights."""
-        lights, variance = samples.guessed_lights, samples.guessed_light_variance
-        if lights is None or variance is None:
-            return Known()
-        length = lights.norm(dim=2)
-        known = variance.isfinite() & (length > 0)
-        ratio = samples.lights.norm(dim=2) / torch.where(known, length, torch.nan)
-        factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-        weight = torch.where(known, FIELD_VARIANCE / torch.where(known, variance, 1), 0)
-        return Known(lights=factor[..., None] * lights, light_weight=weight)
+def _guessed_lights(
+    samples: PatchSamples,
+) -> tuple[Float[Tensor, "patch view 4"] | None, Float[Tensor, "patch view"] | None]:
+    lights, variance = samples.guessed_lights, samples.guessed_light_variance
+    if lights is None or variance is None:
+        return None, None
+    length = lights.norm(dim=2)
+    known = variance.isfinite() & (length > 0)
+    ratio = samples.lights.norm(dim=2) / torch.where(known, length, torch.nan)
+    factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+    # The field itself is 6 degrees off: a variance of 0.01 of its square.
+    return factor[..., None] * lights, torch.where(known, 0.01 / torch.where(known, variance, 1), 0)
 
 
 def views_worth(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Return the number of views that tell as much of an angle, or of albedo relative to itself."""
-    return (RELATIVE_NOISE**2 * information).clamp_max(MOST_VIEWS)
+    """Return the views that tell as much of an angle or of relative albedo; one at most.
+
+    So photographs overrule guesses.
+    """
+    return (RELATIVE_NOISE**2 * information).clamp_max(1)

@@ -9,16 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# Reweighted least squares for the albedo, after the median.
-ALBEDO_ITERATIONS = 2
-
 
 def inconsistency(
     radiance: Float[Tensor, "sample view hypothesis"],
     shading: Float[Tensor, "sample view"],
     seen: Bool[Tensor, "sample view"],
     scale: Float[Tensor, " sample"],
-    iterations: int = ALBEDO_ITERATIONS,
+    iterations: int = 2,
 ) -> Float[Tensor, "sample hypothesis"]:
     r"""Return the robust cost of every hypothesis.
 

@@ -296,17 +296,6 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
         assert (bucket.albedo == 0).all()
 
 
-def test_parts_make_no_difference(scene, monkeypatch):
-    true = scene()
-    whole = Factorize()(true.seen)
-    monkeypatch.setattr("pimper_torch.photometry.factorize.PART_ENTRIES", 1)
-    single = Factorize()(true.seen)
-    for one, other in zip(whole.buckets, single.buckets, strict=True):
-        assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-8)
-        assert_close(one.albedo, other.albedo, rtol=0, atol=1e-8)
-        assert_close(one.convergence.iterations, other.convergence.iterations)
-
-
 def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
     true = scene(bumps=0.0)  # lights fitted to the mesh are exact but for the noise
     buckets = tuple(
