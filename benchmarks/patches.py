@@ -16,9 +16,9 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.photometry.bilinear import Bilinear, objective
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factorize import SOLVERS
-from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.photometry.robust import Cauchy, Squares
 
 # How strongly lights are held to their start, as a fraction of what the data say, and the loss.

@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
-from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
+from pimper_torch.kernels.robust_scale import robust_variance
+from pimper_torch.kernels.twin_constants import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    INITIAL_DAMPING,
+    MIN_DEVIATION,
+    SHADING_STEPS,
+    ZERO_ROUNDINGS,
+)
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# As in ``variable_projection`` and ``bilinear``: damping, steps of the samples, the residual that
-# counts as zero in roundings, minimum deviation; and the codes of StopCause.
-_INITIAL_DAMPING, _DAMPING_DECREASE, _DAMPING_INCREASE = 1e-2, 0.2, 5.0
-_SHADING_STEPS = 2
-_ZERO_ROUNDINGS = 30.0
 _EPS = float(np.finfo(np.float32).eps)
-_MIN_DEVIATION = 1e-4
+
+# The codes of StopCause.
 _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 
 # Row and column of each entry of a packed matrix.
@@ -160,7 +164,7 @@ def _packed(
         slack=max(slack, 0.0),
         num_views=len(regularization),
         num_scale=num_scale,
-        level=_MIN_DEVIATION * size / max(count, 1.0),
+        level=MIN_DEVIATION * size / max(count, 1.0),
         scale=scale,
     )
 
@@ -182,10 +186,10 @@ def _solve(
     scale_start = _robust_weights(patch, lights, shading, 0.0)
     energy = _energy(patch)
     _equations(patch, lights)
-    update_shading(patch.equations, shading, _SHADING_STEPS)
+    update_shading(patch.equations, shading, SHADING_STEPS)
     cost = _evaluate(patch, lights, shading, slope)
     _curvature(patch, lights, shading, curvature_samples, curvature)
-    damping, small = _INITIAL_DAMPING, 0
+    damping, small = INITIAL_DAMPING, 0
     for taken in range(1, max_iterations + 1):
         for f in range(len(lights)):
             for i in range(4):
@@ -202,13 +206,13 @@ def _solve(
             _overwrite(new_shading, shading)
             _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
-            update_shading(patch.equations, new_shading, _SHADING_STEPS)
+            update_shading(patch.equations, new_shading, SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
         better = after < cost
-        exact = cost <= (_ZERO_ROUNDINGS * _EPS) ** 2 * energy
+        exact = cost <= (ZERO_ROUNDINGS * _EPS) ** 2 * energy
         if better:
             small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
-        damping *= _DAMPING_DECREASE if better else _DAMPING_INCREASE
+        damping *= DAMPING_DECREASE if better else DAMPING_INCREASE
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:

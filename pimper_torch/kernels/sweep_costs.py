@@ -14,12 +14,6 @@ from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrink
 
 Array = NDArray[Any]
 
-# As in ``sweep.consistency``: reweighted least squares for the albedo, after the median.
-_ALBEDO_ITERATIONS = 2
-
-# Factors multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
-_FACTORS = 8
-
 
 @compiled(
     "float32(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,::1], int64, int64, float32,"
@@ -85,12 +79,12 @@ def _inconsistency(
     ratios: Array,
     order: Array,
 ) -> float:
-    """See :func:`~pimper_torch.sweep.consistency.inconsistency`; for one sample and height."""
+    """See :func:`~pimper_torch.sweep.costs.inconsistency`; for one sample and height."""
     for view in range(count):
         ratios[view] = radiance[step, view] * per_shading[view]
     albedo = np.float32(_lower_median(ratios, order, count))
     one = np.float32(1)
-    for _ in range(_ALBEDO_ITERATIONS):
+    for _ in range(2):
         square, product = np.float32(0), np.float32(0)
         for view in range(count):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale
@@ -99,9 +93,9 @@ def _inconsistency(
             product += lit * radiance[step, view]
         albedo = product / square if square > 0 else product
     cost = 0.0
-    for first in range(0, count, _FACTORS):
+    for first in range(0, count, 8):  # products of eight do not overflow
         factors = 1.0
-        for view in range(first, min(first + _FACTORS, count)):
+        for view in range(first, min(first + 8, count)):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale
             factors *= 1.0 + np.float64(residual) * np.float64(residual)
         cost += math.log(factors)
@@ -110,7 +104,7 @@ def _inconsistency(
 
 @compiled("int64(float32[::1], int64[::1], float32[::1])")
 def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
-    """See :func:`~pimper_torch.sweep.selection.poses_first`; views of rating 0 are not usable.
+    """See :func:`~pimper_torch.sweep.costs.poses_first`; views of rating 0 are not usable.
 
     Returns:
         How many poses have a usable view.

@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 
-# Bytes of window weights that are read again for every hypothesis: those of a core's cache.
-_CACHED = 3 << 18
-
 _ROW = "float32[::1]"
 
 
@@ -164,7 +161,8 @@ def window_scores(
     side = int(math.sqrt(num_entries) + 0.5)
     radius = side // 2
     best = min(best, num_sources)
-    band = max(8, _CACHED // (8 * num_entries * width))
+    # Weights that are read again for every hypothesis fit a core's cache, 768 kB.
+    band = max(8, (3 << 18) // (8 * num_entries * width))
     seen = np.zeros((num_sources, band + 2 * radius, width + 2 * radius), dtype=np.float32)
     there = np.zeros((num_sources, band + 2 * radius, width), dtype=np.bool_)
     across, down = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)

@@ -20,7 +20,17 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.light_field import (
+    LightField,
+    faces_light,
+    harmonics,
+    is_strong,
+    rotate_lights,
+)
+from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.factor_priors import (
     RELATIVE_NOISE,
     FactorPrior,
@@ -30,14 +40,16 @@ from pimper_torch.photometry.factor_priors import (
     PatchSamples,
     SurfaceNormals,
 )
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.learned import LearnedPrior
-from pimper_torch.photometry.light_field import LightField, faces_light, is_strong
-from pimper_torch.photometry.lights import light_of_mesh
-from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
-from pimper_torch.photometry.rows import Rows, in_row, on_raster, rows_of
-from pimper_torch.photometry.sample_estimates import fit_albedo, initial_shading, refine_on_manifold
+from pimper_torch.photometry.sample_estimates import (
+    Rows,
+    fit_albedo,
+    in_row,
+    initial_shading,
+    on_raster,
+    refine_on_manifold,
+    rows_of,
+)
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.photometry.status import light_varies, patch_status, warn_of_undetermined
 from pimper_torch.photometry.variable_projection import solve_variable_projection

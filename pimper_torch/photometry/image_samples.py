@@ -1,5 +1,9 @@
-"""Radiance of samples in all views, and residuals of a model under Cauchy's loss."""
+"""Radiance of samples in all views, and residuals of a model under Cauchy's loss.
 
+Parameters of a model are paid for by radiance that was left out of the fit.
+"""
+
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,10 +11,33 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
+from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
 
-# Minimum standard deviation of residuals, in brightnesses of their view: a choice.
-MIN_SPREAD = 1e-4
+# Residuals have to fall by so many standard errors over the views, 99.7 % confidence, and by this
+# fraction at least, a choice: what won less on glossy scenes was no light.
+_CONFIDENCE, _LEAST = 3.0, 0.05
+
+
+def left_out(seen: Bool[Tensor, "sample view"]) -> Bool[Tensor, "sample view"]:
+    """Choose what to leave out: of each sample and each view a fifth."""
+    sample, view = (torch.arange(size, device=seen.device) for size in seen.shape)
+    return seen & ((sample[:, None] + view) % 5 == 0)
+
+
+def predicts_better(misfit: Float[Tensor, " view"], simpler: Float[Tensor, " view"]) -> bool:
+    """Decide whether a model predicts better than a simpler one, significantly.
+
+    Args:
+        misfit: Residuals of what was left out, one a view; NaN where there is none.
+        simpler: Those of the simpler model.
+    """
+    gain = (simpler / misfit).log()
+    gain = gain[gain.isfinite()]
+    if len(gain) < 2:
+        return False
+    error = float(gain.std()) / math.sqrt(len(gain))
+    return float(gain.mean()) > max(_CONFIDENCE * error, _LEAST)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +65,7 @@ class ImageSamples:
 
     def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
         """Return the scale of Cauchy's loss for each view."""
-        least = MIN_SPREAD * self.level
+        least = MIN_DEVIATION * self.level
         return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
     def weights(

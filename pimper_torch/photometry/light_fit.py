@@ -11,18 +11,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pimper_torch.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.image_samples import MIN_SPREAD, ImageSamples
+from pimper_torch.photometry.image_samples import ImageSamples
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's
 # method converges to rounding (`tests/photometry/test_factor_gradients.py`).
 _MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
-
-# Fraction of the diagonal added to the normal equations as a preconditioner, a choice: the free
-# factor of light and albedo makes them singular.
-_PRECONDITIONER_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +39,7 @@ class LightFit:
         """
         residual = samples.radiance - self.albedo[:, None] * self.model.shade(self.lights)
         relative = residual.abs() / samples.level.clamp_min(1e-300)
-        missing = torch.where(some, relative.clamp_min(MIN_SPREAD), torch.nan)
+        missing = torch.where(some, relative.clamp_min(MIN_DEVIATION), torch.nan)
         return missing.nanmedian(dim=0).values
 
 
@@ -130,7 +127,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
         residual = samples.residual(found.albedo, shading)
         weight = samples.weights(residual, samples.scale(residual))
         by_lights = found.albedo[:, None, None] * model.jacobian(found.lights)
-        normal = _normal_equations(shading, by_lights, weight, _PRECONDITIONER_DAMPING)
+        normal = _normal_equations(shading, by_lights, weight)
         observed = (weight * shading**2).sum(dim=1) > 0
         fixed = ~torch.cat([model.inside_bounds(found.lights).flatten(), observed])
         flat = found.lights.abs().flatten()
@@ -180,15 +177,14 @@ def _normal_equations(
     shading: Float[Tensor, "sample view"],
     jacobian: Float[Tensor, "sample view parameter"],
     weight: Float[Tensor, "sample view"],
-    damping: float,
 ) -> _NormalEquations:
     """Assemble Gauss-Newton's equations, and factor their Schur complement.
 
     Args:
         shading: Radiance of albedo 1, which is the derivative by the albedos.
         jacobian: The derivatives by the parameters of the lights.
-        damping: Fraction of the diagonal that is added to it.
     """
+    damping = 1e-6  # the free factor of light and albedo makes them singular
     _, num_views, size = jacobian.shape
     heavy = weight[..., None] * jacobian
     blocks = heavy.permute(1, 2, 0) @ jacobian.transpose(0, 1)

@@ -11,8 +11,7 @@ from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.light_field import LightField, harmonics
 from pimper_torch.records import PatchStatus, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)

@@ -5,8 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.harmonics import harmonics, second_harmonics
-from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.light_field import LightField, harmonics, second_harmonics
 from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
 
 
