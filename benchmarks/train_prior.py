@@ -27,8 +27,6 @@ from pimper_torch.evidence.scenes import SceneConfig, render_scene
 from pimper_torch.patches.transfer import transfer, transferred_normals
 from pimper_torch.photometry import Factorize, FactorizeConfig, Illumination
 from pimper_torch.photometry.cone import tangents
-from pimper_torch.photometry.learned import LearnedPrior
-from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.photometry.factor_priors import (
     RELATIVE_NOISE,
     FactorPrior,
@@ -37,6 +35,8 @@ from pimper_torch.photometry.factor_priors import (
     PatchSamples,
     SurfaceNormals,
 )
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.photometry.sample_estimates import rows_of
 from pimper_torch.records import PatchViews, PhotometricPatches
 

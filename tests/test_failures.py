@@ -511,21 +511,6 @@ def test_with_too_little_memory_for_a_batch_the_result_is_the_same(
                 assert_close(one, other, rtol=0, atol=1e-4 * size)
 
 
-def test_soft_light_stands_in_where_a_point_light_cannot_be_fitted(given, monkeypatch):
-    fit = factorization.light_of_mesh
-
-    def broken(seen, coarse, min_views, model, **settings):
-        if model != "soft":
-            raise torch.linalg.LinAlgError("singular")
-        return fit(seen, coarse, min_views, model, **settings)
-
-    monkeypatch.setattr(factorization, "light_of_mesh", broken)
-    with collecting() as failures:
-        light = Factorize().light(Warp()(*given))
-    assert light.field.soft.abs().max() > 0
-    assert [each.name for each in failures] == ["fit of auto light"]
-
-
 # --- whole runs --------------------------------------------------------------------------------
 
 

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.kernels.arrays import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
-from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 from pimper_torch.kernels.robust_scale import robust_variance
+from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 from pimper_torch.kernels.twin_constants import (
     DAMPING_DECREASE,
     DAMPING_INCREASE,
@@ -37,6 +38,43 @@ _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 # Row and column of each entry of a packed matrix.
 _ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
 _COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
+
+
+class ConeProblem(NamedTuple):
+    """A batch of problems: see ``photometry.bilinear``; ``given`` are the weights."""
+
+    radiance: Floats3
+    given: Floats3
+    anchor: Floats3
+    regularization: Floats2
+    prior: Floats3
+
+
+class Limits(NamedTuple):
+    """See ``solve_variable_projection``; all samples count where ``curvature_samples`` is 0."""
+
+    max_iterations: int
+    tolerance: float
+    small_steps: int
+    curvature_samples: int
+
+
+class ConeSolution(NamedTuple):
+    """The solution of a batch.
+
+    Attributes:
+        shading: Samples without weight keep the start.
+        weight: The final ones, zero before.
+        residual: Root mean square.
+        cause: Code of the stop cause.
+    """
+
+    lights: Floats3
+    shading: Floats3
+    weight: Floats3
+    iterations: Integers1
+    residual: Floats1
+    cause: Integers1
 
 
 class Patch(NamedTuple):
@@ -170,9 +208,7 @@ def _packed(
 
 
 @compiled()
-def _solve(
-    patch: Patch, lights: Floats, shading: Floats, limits: tuple[int, float, int, int]
-) -> tuple[int, int]:
+def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tuple[int, int]:
     """Iterate one patch; lights and shading are replaced by the solution.
 
     Returns:
@@ -450,47 +486,19 @@ def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[fl
     return (math.sqrt(total / count) if count > 0 else 0.0), count > 0
 
 
-@compiled(
-    "void(float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,::1],"
-    " float64, int64, int64, float64, int64, int64,"
-    " float32[:,:,::1], float32[:,:,::1], float32[:,:,::1],"
-    " int64[::1], float32[::1], int64[::1])"
-)
+@compiled(annotated=True)
 def solve_on_cone(
-    radiance: Floats,
-    given: Floats,
-    anchor: Floats,
-    regularization: Floats,
-    prior: Floats,
-    scale: float,
-    stride: int,
-    max_iterations: int,
-    tolerance: float,
-    small_steps: int,
-    curvature_samples: int,
-    lights: Floats,
-    shading: Floats,
-    weight: Floats,
-    iterations: Integers,
-    residual: Floats,
-    cause: Integers,
+    problem: ConeProblem, scale: float, stride: int, limits: Limits, solution: ConeSolution
 ) -> None:
     """Factorize a batch of patches, one after the other.
 
     Args:
-        radiance: Patch, view, sample; zero where missing.
-        given: The weights; 0 where missing.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The deviation is estimated from every ``stride``-th sample.
-        curvature_samples: See the twin; 0 for all.
-        lights: The start, replaced by the solution.
-        shading: The start, replaced by the solution; samples without weight keep it.
-        weight: Result, zero before: final weights.
-        iterations: Result: number of steps.
-        residual: Result: root mean square.
-        cause: Result: code of the stop cause.
+        solution: Its lights and shading are the start.
     """
-    limits = (max_iterations, tolerance, small_steps, curvature_samples)
+    radiance, given, anchor, regularization, prior = problem
+    lights, shading, weight, iterations, residual, cause = solution
     for p in range(len(radiance)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
         samples, num_scale = _samples_that_count(given[p], stride)

@@ -377,10 +377,7 @@ def fit(
             normals and of the points, too.
         radiance: View by sample; zero where not seen.
         level: Mean brightness of each view.
-        max_closeness: Upper bound of a point light's inverse distance.
         min_gain: A step that lowers the loss by less than this fraction is the last.
-        lights: View by parameter; the start, replaced by the solution.
-        albedo: Of each sample; the start, replaced by the solution.
     """
     shading, residual = np.empty_like(radiance), np.empty_like(radiance)
     trial_shading, new_residual = np.empty_like(radiance), np.empty_like(radiance)

@@ -142,19 +142,15 @@ def window_scores(
     and sources.
 
     Args:
-        field: Inverse depths, ``height width``.
-        offsets: Added to the field, the sum clamped to the smallest positive float.
-        ray: See :class:`~pimper_torch.coarse.window_matching.Pairing`, ``source 3 height width``.
-        shift: Of the same, ``source 3``.
-        tone: Of the sources, ``source height width``.
-        usable: Valid pixels of the sources.
+        field: Inverse depths; the sum with an offset is clamped to the smallest positive float.
+        ray: See :class:`~pimper_torch.coarse.window_matching.Pairing`, as for ``shift``.
+        tone: Of the sources, as ``usable``.
         weight: Of the pixels of every window, ``entry height width``; adds up to 1.
         deviation: That weight times the tone's difference to the window's mean.
         power: Variance of the tone in every window.
         valid: Of the reference view; elsewhere the score is 0.
         floor: Added to variances: regularization of windows without texture.
         best: The score is the mean of so many largest correlations.
-        scores: Result, ``offset height width``.
     """
     num_sources, height, width = tone.shape
     num_entries = weight.shape[0]

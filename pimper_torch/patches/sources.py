@@ -4,19 +4,19 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from kornia.geometry.transform import pyrdown, remap
-from numpy.typing import NDArray
+from kornia.geometry.transform import pyrdown
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import conv2d, grid_sample, pad
 
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.kernels.arrays import as_array
+from pimper_torch.kernels.arrays import FractionRows, PictureRows, Projection, Samples, as_array
 from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
@@ -29,6 +29,7 @@ from pimper_torch.records import (
     Mesh,
     NormalPrior,
     Record,
+    Templates,
     Views,
 )
 
@@ -82,27 +83,15 @@ def look_up(
         weight = (1 - (level - index).abs()).clamp_min(0)
         (some,) = torch.nonzero(weight > 0, as_tuple=True)
         if len(some) > 0:
-            blended = weight[some, None] * _bilinear(image, grid[some])
-            total = total.index_add(0, some, blended)
+            looked_up = grid_sample(
+                image[None],
+                grid[some][None, None],
+                mode="bilinear",
+                padding_mode="border",
+                align_corners=False,
+            )[0, :, 0].mT
+            total = total.index_add(0, some, weight[some, None] * looked_up)
     return total
-
-
-def _bilinear(
-    image: Float[Tensor, "channels _ _"], grid: Float[Tensor, "sample 2"]
-) -> Float[Tensor, "sample channels"]:
-    """Look up in as many batches as there are threads: each is one thread's on the CPU."""
-    threads = torch.get_num_threads()
-    filled = pad(grid, (0, 0, 0, -len(grid) % threads)).reshape(threads, -1, 1, 2)
-    found = remap(
-        image.expand(threads, -1, -1, -1),
-        filled[..., 0],
-        filled[..., 1],
-        mode="bilinear",
-        padding_mode="border",
-        align_corners=False,
-        normalized_coordinates=True,
-    )
-    return found[..., 0].transpose(1, 2).reshape(-1, len(image))[: len(grid)]
 
 
 def _difference(
@@ -146,9 +135,14 @@ class Pyramid(Record):
         return [self.finest[view], *(level.reshape(channels, *size) for level, size in coarser)]
 
     @property
-    def arrays(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the finest level and the others as kernels take them: a row a view."""
-        return as_array(self.finest.flatten(1)), as_array(self.coarser)
+    def pictures(self) -> PictureRows:
+        """The levels as kernels take them."""
+        return PictureRows(as_array(self.finest.flatten(1)), as_array(self.coarser))
+
+    @property
+    def fractions(self) -> FractionRows:
+        """Levels of fractions as kernels take them."""
+        return FractionRows(as_array(self.finest.flatten(1)), as_array(self.coarser))
 
     @property
     def table(self) -> Int[Tensor, "level 3"]:
@@ -214,6 +208,35 @@ class PriorMaps(Record):
         own = cameras.take(self.view)
         zoom = torch.cat([self.zoom, torch.ones_like(self.zoom[:, :1])], dim=1).to(own.intrinsics)
         return own.replace(intrinsics=zoom[:, :, None] * own.intrinsics, sizes_px=self.sizes_px)
+
+
+def kernel_geometry(
+    cameras: Cameras,
+    rows: Int[Tensor, " view"],
+    templates: Templates,
+    outward: Float[Tensor, "patch height width 3"],
+) -> tuple[Projection, Samples]:
+    """Lay cameras and samples out for kernels; pixels are computed in float64.
+
+    Args:
+        rows: Where each camera's photograph is among the sources.
+        outward: Unit normals of the samples, patch frame.
+    """
+    patch_from_world = templates.patch_from_world.double()
+    exact = cameras.to(torch.float64)
+    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
+    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
+    centers = transform(patch_from_world, exact.centers_world)
+    projection = Projection(
+        as_array(rows), as_array(image_from_patch.flatten(0, 1)), as_array(centers.flatten(0, 1))
+    )
+    samples = Samples(
+        as_array(templates.origin, torch.float64),
+        as_array(templates.spacing, torch.float64),
+        as_array(templates.depth, torch.float32),
+        as_array(outward, torch.float32),
+    )
+    return projection, samples
 
 
 def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEVELS) -> Sources:

@@ -12,15 +12,23 @@ from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
+from pimper_torch.patches.sources import (
+    LEVELS,
+    PriorMaps,
+    Sources,
+    kernel_geometry,
+    look_up,
+    prepare,
+    pyramid_level,
+)
 from pimper_torch.patches.template_priors import merged
-from pimper_torch.patches.sources import LEVELS, PriorMaps, Sources, look_up, prepare, pyramid_level
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,
@@ -53,10 +61,6 @@ def resampled(
     """
     from pimper_torch.kernels import resampling
 
-    patch_from_world = templates.patch_from_world.double()
-    exact = cameras.to(torch.float64)
-    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
-    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
     outward = templates.normals_patch
     if outward is None:
         outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
@@ -65,17 +69,11 @@ def resampled(
     radiance = torch.empty(*shape, sources.images.finest.shape[1], height, width)
     valid = torch.empty(*shape, height, width, dtype=torch.bool)
     resampling.register(
-        *sources.images.arrays,
-        *sources.unusable.arrays,
+        sources.images.pictures,
+        sources.unusable.fractions,
         as_array(sources.images.table),
-        as_array(rows),
-        as_array(image_from_patch.flatten(0, 1)),
-        as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
+        *kernel_geometry(cameras, rows, templates, outward),
         as_array(cameras.sizes_px),
-        as_array(templates.origin, torch.float64),
-        as_array(templates.spacing, torch.float64),
-        as_array(templates.depth, torch.float32),
-        as_array(outward, torch.float32),
         as_array(templates.inside),
         min_facing,
         dark_level,

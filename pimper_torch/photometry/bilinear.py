@@ -151,23 +151,13 @@ def curvature_of_views(
     return whole.reshape(batch, views * rank, views * rank)
 
 
-def objective(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-) -> Float[Tensor, " patch"]:
-    """Evaluate the objective, with the robust weights fixed to ``weight``."""
-    return evaluate(problem, lights, shading, weight)[0]
-
-
 def evaluate(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
-    """Return the :func:`objective`, and minus half its gradient by the lights."""
+    """Return the objective, its robust weights given, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
     cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
@@ -256,25 +246,6 @@ def keep_scale(
     return lights * factor, shading / factor
 
 
-def to_factors(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-    iterations: Int[Tensor, " patch"],
-    cause: Int[Tensor, " patch"],
-) -> Factors:
-    """Return a solver's result, with its residuals; patches without data are marked empty."""
-    has_data = problem.weight.sum(dim=(1, 2)) > 0
-    empty = torch.full_like(cause, int(StopCause.EMPTY))
-    convergence = Convergence(
-        iterations=iterations,
-        residual=root_mean_square(problem, lights, shading),
-        cause=torch.where(has_data, cause, empty),
-    )
-    return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
-
-
 def root_mean_square(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
@@ -357,7 +328,18 @@ def iterate(
             state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
             running = running[keep]
     _store(final, state, names, patches, running)
-    return to_factors(whole, final.lights, final.shading, final.weight, taken, causes)
+    has_data = whole.weight.sum(dim=(1, 2)) > 0
+    convergence = Convergence(
+        iterations=taken,
+        residual=root_mean_square(whole, final.lights, final.shading),
+        cause=torch.where(has_data, causes, int(StopCause.EMPTY)),
+    )
+    return Factors(
+        lights=final.lights,
+        shading=final.shading,
+        weight=final.weight,
+        convergence=convergence,
+    )
 
 
 def _store(

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
 from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.failures import over_patches, skipped_patches, solved_or
+from pimper_torch.failures import over_patches, skipped_patches
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
@@ -22,15 +22,6 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
-from pimper_torch.photometry.learned import LearnedPrior
-from pimper_torch.photometry.light_field import (
-    LightField,
-    faces_light,
-    harmonics,
-    is_strong,
-    rotate_lights,
-)
-from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.factor_priors import (
     RELATIVE_NOISE,
     FactorPrior,
@@ -40,6 +31,15 @@ from pimper_torch.photometry.factor_priors import (
     PatchSamples,
     SurfaceNormals,
 )
+from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.light_field import (
+    LightField,
+    faces_light,
+    harmonics,
+    is_strong,
+    rotate_lights,
+)
+from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, Loss, Squares
 from pimper_torch.photometry.sample_estimates import (
     Rows,
@@ -256,19 +256,9 @@ class Factorize(Stage):
             caster = RayCaster(mesh.vertices_world, mesh.faces)
         return Illumination(field=field, caster=caster, guess_variance=variance)
 
-    def _field(self, seen: PatchViews, coarse: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
-        """Fit the light field; soft light, which is simpler, where what was asked for fails."""
-        config, model = self.config, self.config.light
-        fit = partial(light_of_mesh, seen, coarse, config.min_views, colours=config.colours)
-        if model == "soft":
-            return fit(model)
-        return solved_or(
-            partial(fit, model),
-            partial(fit, "soft"),
-            stage="factorize",
-            name=f"fit of {model} light",
-            done="Soft light was fitted instead",
-        )
+    def _field(self, seen: PatchViews, normals: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
+        config = self.config
+        return light_of_mesh(seen, normals, config.min_views, config.light, config.colours)
 
     def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
         """Factorize some patches, independently of others.
@@ -330,24 +320,13 @@ class Factorize(Stage):
 
         There shadows are at rest on the surface; elsewhere they move over it as false texture.
         """
-        config, field, variance = self.config, light.field, light.guess_variance
+        config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
-        centre = invert_rigid(patch_from_world)[:, :3, 3]
-        anchor = rotate_lights(
-            patch_from_world, field.lights_at(centre, -patch_from_world[:, 2, :3])
-        )
-        point_light = rotate(patch_from_world, field.point_light_at(centre))
         rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
-        observed = bucket.registered.valid & bucket.templates.inside[:, None]
-        lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
-        # What is mostly in shadow of the lamp has the room's light in that view.
-        soft = rotate_lights(patch_from_world, field.soft_at(-patch_from_world[:, 2, :3]))
-        shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
-        by_soft = shaded & rows.seen & is_strong(soft, point_light)[..., None]
-        in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
-        lit, anchor = torch.where(in_room, by_soft, lit), torch.where(in_room, soft, anchor)
+        lit, anchor = _lit(rows, light.field, patch_from_world, illuminated, shadowed)
         dark = int((rows.seen & ~lit).sum())
         leave_out("photometry.shadows", dark, total=int(rows.seen.sum()))
+        observed = bucket.registered.valid & bucket.templates.inside[:, None]
         status = patch_status(
             observed.flatten(1).any(dim=1),
             rows.seen.flatten(1).any(dim=1),
@@ -362,6 +341,7 @@ class Factorize(Stage):
         at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
         anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
+        variance = light.guess_variance
         problem = self._problem(rows, anchor, refused, raster, bucket.registered, variance)
         return rows, status, problem
 
@@ -485,15 +465,43 @@ def _balanced(registered: Observations, field: LightField) -> Observations:
     return registered.replace(radiance=balanced)
 
 
+def _lights_in_patches(
+    field: LightField, patch_from_world: Float[Tensor, "patch 4 4"]
+) -> tuple[
+    Float[Tensor, "patch view 4"], Float[Tensor, "patch view 4"], Float[Tensor, "patch view 3"]
+]:
+    """Return first-order light at the centres of patches, soft light alone, and the point light."""
+    centre, outward = invert_rigid(patch_from_world)[:, :3, 3], -patch_from_world[:, 2, :3]
+    both, soft = field.lights_at(centre, outward), field.soft_at(outward)
+    point_light = rotate(patch_from_world, field.point_light_at(centre))
+    return rotate_lights(patch_from_world, both), rotate_lights(patch_from_world, soft), point_light
+
+
+def _lit(
+    rows: Rows,
+    field: LightField,
+    patch_from_world: Float[Tensor, "patch 4 4"],
+    illuminated: Bool[Tensor, "patch view height width"],
+    shadowed: Bool[Tensor, "patch view height width"],
+) -> tuple[Bool[Tensor, "patch view sample"], Float[Tensor, "patch view 4"]]:
+    """Find samples under first-order light, and that light.
+
+    What is mostly in shadow of the lamp has the room's light in that view.
+    """
+    lights, soft, point_light = _lights_in_patches(field, patch_from_world)
+    lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
+    shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
+    by_soft = shaded & rows.seen & is_strong(soft, point_light)[..., None]
+    in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
+    return torch.where(in_room, by_soft, lit), torch.where(in_room, soft, lights)
+
+
 def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ _ _ 3"]]) -> float:
     """Return the median residual of normals under a light field, over what it predicts."""
     found = []
     for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
         rows = rows_of(templates, registered, own)
-        patch_from_world = templates.patch_from_world.to(own)
-        centre = invert_rigid(patch_from_world)[:, :3, 3]
-        lights = templates.own(field).lights_at(centre, -patch_from_world[:, 2, :3])
-        lights = rotate_lights(patch_from_world, lights)
+        lights, _, _ = _lights_in_patches(templates.own(field), templates.patch_from_world.to(own))
         gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
         some = rows.seen & (predicted > 0)

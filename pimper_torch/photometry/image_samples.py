@@ -52,6 +52,10 @@ class ImageSamples:
     radiance: Float[Tensor, "sample view"]
     seen: Bool[Tensor, "sample view"]
 
+    def at(self, index: slice | tuple[slice, slice]) -> "ImageSamples":
+        """Take some samples, or some samples in some views."""
+        return ImageSamples(radiance=self.radiance[index], seen=self.seen[index])
+
     @cached_property
     def level(self) -> Float[Tensor, " view"]:
         """Mean brightness of each view."""

@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.errors import InputError
 from pimper_torch.photometry.cone import tangents
-from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.photometry.factor_priors import FactorPrior, Known, PatchSamples
+from pimper_torch.photometry.light_field import harmonics
 
 # That come with the package: 6,000 steps as in `benchmarks/train_prior.py`, see docs/priors.md.
 WEIGHTS = Path(__file__).with_name("learned.safetensors")

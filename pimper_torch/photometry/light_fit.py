@@ -4,6 +4,7 @@ By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the 
 with Cauchy's loss; gradients by the implicit function theorem at the optimum.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -127,7 +128,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
         residual = samples.residual(found.albedo, shading)
         weight = samples.weights(residual, samples.scale(residual))
         by_lights = found.albedo[:, None, None] * model.jacobian(found.lights)
-        normal = _normal_equations(shading, by_lights, weight)
+        solve = _gauss_newton(shading, by_lights, weight)
         observed = (weight * shading**2).sum(dim=1) > 0
         fixed = ~torch.cat([model.inside_bounds(found.lights).flatten(), observed])
         flat = found.lights.abs().flatten()
@@ -138,7 +139,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
 
     def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
         inner = torch.where(fixed, 0, side)
-        lights, albedo = normal.solve(inner[:count].reshape(found.lights.shape), inner[count:])
+        lights, albedo = solve(inner[:count].reshape(found.lights.shape), inner[count:])
         return -torch.where(fixed, side, torch.cat([lights.flatten(), albedo]))
 
     solution = newton_solution(equations, start, precondition)
@@ -150,39 +151,19 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NormalEquations:
-    """The normal equations of lights and albedos, albedos eliminated (Schur).
-
-    Attributes:
-        cross: Block of albedos and lights' parameters.
-        inverse: Of the diagonal block of the albedos.
-        factor: Of the Schur complement, by ``torch.linalg.lu_factor``.
-    """
-
-    cross: Float[Tensor, "sample unknown"]
-    inverse: Float[Tensor, " sample"]
-    factor: tuple[Tensor, Tensor]
-
-    def solve(
-        self, on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
-    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-        """Solve for both."""
-        rhs = on_lights.flatten() - self.cross.mT @ (self.inverse * on_albedo)
-        step = torch.linalg.lu_solve(*self.factor, rhs[:, None])[:, 0]
-        return step.reshape(on_lights.shape), self.inverse * (on_albedo - self.cross @ step)
-
-
-def _normal_equations(
+def _gauss_newton(
     shading: Float[Tensor, "sample view"],
     jacobian: Float[Tensor, "sample view parameter"],
     weight: Float[Tensor, "sample view"],
-) -> _NormalEquations:
-    """Assemble Gauss-Newton's equations, and factor their Schur complement.
+) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Factor Gauss-Newton's equations of lights and albedos, these eliminated (Schur).
 
     Args:
         shading: Radiance of albedo 1, which is the derivative by the albedos.
         jacobian: The derivatives by the parameters of the lights.
+
+    Returns:
+        The solution by right-hand sides of lights and albedos.
     """
     damping = 1e-6  # the free factor of light and albedo makes them singular
     _, num_views, size = jacobian.shape
@@ -202,6 +183,13 @@ def _normal_equations(
     blocks_of_views[view, :, view, :] = damped
     schur = blocks_of_views.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
-    return _NormalEquations(
-        cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge)
-    )
+    factor = torch.linalg.lu_factor(schur + ridge)
+
+    def solve(
+        on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
+    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+        rhs = on_lights.flatten() - cross.mT @ (inverse * on_albedo)
+        step = torch.linalg.lu_solve(*factor, rhs[:, None])[:, 0]
+        return step.reshape(on_lights.shape), inverse * (on_albedo - cross @ step)
+
+    return solve

@@ -43,7 +43,7 @@ def search_point_lights(
         the samples' albedo. A constant to autograd.
     """
     stride = -(-len(normals) // _SAMPLES)
-    subset = ImageSamples(radiance=samples.radiance[::stride], seen=samples.seen[::stride])
+    subset = samples.at(slice(None, None, stride))
     directions = even_directions(_DIRECTIONS).to(normals)
     facing = (normals[::stride] @ directions.mT).clamp_min(0)
     mean = normals.mean(dim=0)

@@ -30,6 +30,9 @@ from pimper_torch.records import PatchSet, PatchViews, Templates
 LightName = Literal["auto", "soft", "point_light", "room"]
 _MODELS = "soft", "point_light", "room"
 
+# Maximum number of views whose lights are fitted together, as time grows with its cube: a choice.
+_TOGETHER = 80
+
 # Maximum number of samples that the light is fitted to: a choice, 2,000 per parameter.
 LIGHT_SAMPLES = 10_000
 
@@ -153,8 +156,8 @@ def fit_light_field(
     origin = positions.mean(dim=0)
     size = _mean_distance(positions - origin)
     geometry = own_normals, (positions - origin) / size
-    step = -(-views // 80)  # the fit's time grows with the cube of its views
-    groups = [_every(samples, step, first) for first in range(step)]
+    step = -(-views // _TOGETHER)
+    groups = [samples.at((slice(None), slice(first, None, step))) for first in range(step)]
     name = _selected(groups[0], *geometry, iterations) if model == "auto" else model
     fits = [_lights(name, group, *geometry, iterations) for group in groups]
     scales = [1.0, *(_ratio(each[2], fits[0][2]) for each in fits[1:])]
@@ -172,12 +175,6 @@ def fit_light_field(
         point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
-
-
-def _every(samples: ImageSamples, step: int, first: int) -> ImageSamples:
-    """Take every so many-th view."""
-    some = slice(first, None, step)
-    return ImageSamples(radiance=samples.radiance[:, some], seen=samples.seen[:, some])
 
 
 def _ratio(
@@ -272,7 +269,7 @@ def _selected(
     """Select the model by its residuals where radiance is left out of the fit."""
     few = slice(None, None, -(-len(normals) // 2500))
     normals, points = normals[few], points[few]
-    every = ImageSamples(radiance=samples.radiance[few], seen=samples.seen[few])
+    every = samples.at(few)
     test = left_out(every.seen)
     seen = every.seen & ~test
     rest = ImageSamples(radiance=torch.where(seen, every.radiance, 0), seen=seen)

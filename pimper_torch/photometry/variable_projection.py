@@ -278,7 +278,7 @@ def _solve_by_kernel(
     small_steps: int,
     curvature_samples: int | None,
 ) -> Factors:
-    from pimper_torch.kernels.factorization import solve_on_cone
+    from pimper_torch.kernels import factorization
 
     J, prior = problem.radiance, problem.prior
     if prior is None:
@@ -290,24 +290,14 @@ def _solve_by_kernel(
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
-    solve_on_cone(
-        as_array(J),
-        as_array(problem.weight),
-        as_array(problem.anchor),
-        as_array(problem.regularization),
-        as_array(prior),
+    data = J, problem.weight, problem.anchor, problem.regularization, prior
+    results = lights, shading, weight, taken, residual, cause
+    factorization.solve_on_cone(
+        factorization.ConeProblem(*map(as_array, data)),
         0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
         problem.stride,
-        max_iterations,
-        tolerance,
-        small_steps,
-        curvature_samples or 0,
-        lights.numpy(),
-        shading.numpy(),
-        weight.numpy(),
-        taken.numpy(),
-        residual.numpy(),
-        cause.numpy(),
+        factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
+        factorization.ConeSolution(*(each.numpy() for each in results)),
     )
     convergence = Convergence(iterations=taken, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)

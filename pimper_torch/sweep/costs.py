@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.patches.sources import Sources, look_up
+from pimper_torch.patches.sources import Sources, kernel_geometry, look_up
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
 
@@ -196,36 +196,35 @@ def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
     from pimper_torch.kernels import sweep_costs
 
     templates, photometry = given.templates, given.photometry
-    patch_from_world = templates.patch_from_world.double()
-    exact = given.cameras.to(torch.float64)
-    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
-    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
+    intrinsics = given.cameras.intrinsics.double()
+    projection, samples = kernel_geometry(given.cameras, given.images, templates, given.outward)
     lights, gains = given.lights
-    shape = templates.depth.shape
-    cost = torch.zeros(shape[0], len(given.ladder), *shape[1:])
-    swept = torch.zeros(shape)
-    sweep_costs.costs(
-        *given.sources.gray.arrays,
-        as_array(given.sources.gray.table),
-        as_array(given.images),
-        as_array(image_from_patch.flatten(0, 1)),
-        as_array(transform(patch_from_world, exact.centers_world).flatten(0, 1)),
-        as_array((exact.intrinsics[:, 0, 0] * exact.intrinsics[:, 1, 1]).sqrt()),
-        as_array(templates.origin, torch.float64),
-        as_array(templates.spacing, torch.float64),
-        as_array(templates.depth, torch.float32),
-        as_array(given.outward, torch.float32),
+    shading = sweep_costs.Shading(
         as_array(photometry.normals_patch, torch.float32),
         as_array(lights, torch.float32),
         as_array(gains, torch.float32),
-        as_array(given.registered.valid),
+    )
+    trial = sweep_costs.Trial(
         as_array(photometry.observed & templates.inside),
+        as_array(given.registered.valid),
         as_array(given.scale, torch.float32),
         as_array(STEP * given.ladder, torch.float64),
         as_array(torch.zeros(0, dtype=torch.long) if given.poses is None else given.poses),
         num_views,
         min_views,
         _MIN_FACING,
+    )
+    shape = templates.depth.shape
+    cost = torch.zeros(shape[0], len(given.ladder), *shape[1:])
+    swept = torch.zeros(shape)
+    sweep_costs.costs(
+        given.sources.gray.pictures,
+        as_array(given.sources.gray.table),
+        projection,
+        as_array((intrinsics[:, 0, 0] * intrinsics[:, 1, 1]).sqrt()),
+        samples,
+        shading,
+        trial,
         as_array(cost),
         as_array(swept),
     )
