@@ -28,10 +28,10 @@ from pimper_torch.photometry.factor_priors import (
     FieldLights,
     Guesses,
     Known,
+    LearnedPrior,
     PatchSamples,
     SurfaceNormals,
 )
-from pimper_torch.photometry.learned import LearnedPrior
 from pimper_torch.photometry.light_field import (
     LightField,
     faces_light,

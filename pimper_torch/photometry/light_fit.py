@@ -14,8 +14,7 @@ from torch.nn.functional import pad
 
 from pimper_torch.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.image_samples import ImageSamples
-from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
+from pimper_torch.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's

@@ -19,11 +19,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.geometry.rigid import invert_rigid, transform
-from pimper_torch.photometry.image_samples import ImageSamples, left_out, predicts_better
 from pimper_torch.photometry.light_colour import exposures, light_colours
 from pimper_torch.photometry.light_field import LightField, harmonics, second_harmonics
 from pimper_torch.photometry.light_fit import LightFit, fit_lights, with_gradients
-from pimper_torch.photometry.light_models import LightModel
+from pimper_torch.photometry.light_models import ImageSamples, LightModel, left_out, predicts_better
 from pimper_torch.records import PatchSet, PatchViews, Templates
 
 # Models by their number of parameters.

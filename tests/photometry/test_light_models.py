@@ -84,7 +84,7 @@ def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(sam
 
 
 def test_the_initial_soft_light_has_the_brightness_of_every_view(samples, generator):
-    from pimper_torch.photometry.image_samples import ImageSamples
+    from pimper_torch.photometry.light_models import ImageSamples
 
     normals = normalize(samples[0] + torch.tensor([0.0, 0, -3]).double(), dim=1)
     gain = torch.tensor([0.5, 1.0, 3.0]).double()
