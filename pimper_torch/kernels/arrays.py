@@ -36,7 +36,7 @@ class FractionRows(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """How views see patches.
+    """Projection of patches into views.
 
     Attributes:
         rows: Where each camera's photograph is among the pictures.
