@@ -16,9 +16,9 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.photometry.bilinear import Bilinear, objective
-from pimper_torch.photometry.factorize import PART_ENTRIES, SOLVERS
-from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.cone import Cone
+from pimper_torch.photometry.factorize import SOLVERS
+from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.photometry.robust import Cauchy, Squares
 
 # How strongly lights are held to their start, as a fraction of what the data say, and the loss.
@@ -58,7 +58,7 @@ def main() -> None:
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
             began, spent = time.perf_counter(), time.process_time()
             steps, cost, error, limited = 0, 0.0, [], 0
-            chunk = max(1, PART_ENTRIES // (options.views * options.samples))
+            chunk = max(1, 400_000 // (options.views * options.samples))
             for first in range(0, options.patches, chunk):
                 some = torch.arange(first, min(first + chunk, options.patches))
                 problem = pose(radiance[some], seen[some], lights[some], normals[some])

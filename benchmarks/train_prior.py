@@ -32,12 +32,12 @@ from pimper_torch.photometry.factor_priors import (
     FactorPrior,
     FieldLights,
     Known,
+    LearnedPrior,
     PatchSamples,
     SurfaceNormals,
 )
-from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.learned import LearnedPrior
-from pimper_torch.photometry.rows import rows_of
+from pimper_torch.photometry.light_field import harmonics
+from pimper_torch.photometry.sample_estimates import rows_of
 from pimper_torch.records import PatchViews, PhotometricPatches
 
 # Objects, and what differs from 10 photographs of 200x150. The jar is held out.

@@ -36,8 +36,8 @@ from .patches.decompose import Decompose as Decompose
 from .patches.warp import Warp as Warp
 from .photometry.factorize import Factorize as Factorize
 from .photometry.factorize import FactorizeConfig as FactorizeConfig
-from .prior_files.read_depth import read_depth as read_depth
-from .prior_files.read_normals import read_normals as read_normals
+from .prior_files.read_maps import read_depth as read_depth
+from .prior_files.read_maps import read_normals as read_normals
 from .prior_files.read_silhouettes import object_at as object_at
 from .prior_files.read_silhouettes import read_silhouettes as read_silhouettes
 from .priors.network import priors_of as priors_of

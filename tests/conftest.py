@@ -223,7 +223,7 @@ def lift():
     from pimper_torch.geometry.rigid import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
-    from pimper_torch.photometry.harmonics import rotate_lights
+    from pimper_torch.photometry.light_field import rotate_lights
     from pimper_torch.records import (
         CoarseMesh,
         Convergence,
@@ -344,7 +344,7 @@ def problem(generator):
 
     from pimper_torch.photometry.bilinear import Bilinear
     from pimper_torch.photometry.cone import project_to_cone
-    from pimper_torch.photometry.harmonics import harmonics
+    from pimper_torch.photometry.light_field import harmonics
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)

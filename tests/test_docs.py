@@ -28,7 +28,7 @@ from pimper_torch.evidence.scenes.render_in_memory import Sphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import wandering_lights
 from pimper_torch.evidence.scenes.textures import random_speckle
-from pimper_torch.photometry.harmonics import harmonics
+from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
 from tests.relighting import ball

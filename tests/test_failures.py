@@ -410,19 +410,6 @@ def test_heights_that_are_not_finite_are_none(given, expected, monkeypatch):
         assert torch.equal(one.offset[1:], other.offset[1:])
 
 
-def test_soft_light_stands_in_where_a_point_light_cannot_be_fitted(given, monkeypatch):
-    fit = factorization.light_of_mesh
-
-    def broken(seen, coarse, min_views, model, **settings):
-        if model != "soft":
-            raise torch.linalg.LinAlgError("singular")
-        return fit(seen, coarse, min_views, model, **settings)
-
-    monkeypatch.setattr(factorization, "light_of_mesh", broken)
-    with collecting() as failures:
-        light = Factorize().light(Warp()(*given))
-    assert light.field.soft.abs().max() > 0
-    assert [each.name for each in failures] == ["fit of auto light"]
 
 
 # --- whole runs --------------------------------------------------------------------------------

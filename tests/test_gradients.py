@@ -6,7 +6,7 @@ from derivatives import check_derivatives
 from probes import probes, small_scene
 
 import pimper_torch as pt
-from pimper_torch.photometry.learned import LearnedPrior
+from pimper_torch.photometry.factor_priors import LearnedPrior
 from pimper_torch.records import Silhouettes
 from pimper_torch.stage import Given
 

@@ -28,8 +28,7 @@ from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.outputs.marker import STAGES
 from pimper_torch.outputs.stages import PREVIEW
-from pimper_torch.prior_files.read_depth import read_depth
-from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.reporting import accounted, reported, stage

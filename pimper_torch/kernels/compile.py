@@ -17,7 +17,7 @@ from functools import cache
 from importlib import import_module
 from inspect import unwrap
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar, get_origin, get_type_hints
 
 import pimper_torch.kernels
 from pimper_torch.progress import report
@@ -47,7 +47,9 @@ _NICENESS = 10  # of the child: what the run itself does comes first
 _blocking: ContextVar[bool] = ContextVar("blocking", default=True)
 
 
-def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Function]:
+def compiled(
+    *signatures: str, fast: bool = False, annotated: bool = False
+) -> Callable[[Function], Function]:
     """Compile a function for the given types when its module is imported.
 
     The machine code is cached on disk. The function releases the interpreter's lock (GIL).
@@ -55,6 +57,8 @@ def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Funct
     Args:
         signatures: Without any, the function is inlined into the kernels that call it.
         fast: Whether sums may be reordered, as vectorization needs.
+        annotated: Whether it is compiled for the types that its annotations name, see
+            :mod:`~pimper_torch.kernels.arrays`; it returns nothing.
 
     Raises:
         filelock.Timeout: Another process compiles its module, and :func:`load` has others to do.
@@ -69,22 +73,47 @@ def compiled(*signatures: str, fast: bool = False) -> Callable[[Function], Funct
         cache=True,
         nogil=True,
         error_model="numpy",
-        forceinline=not signatures,
+        forceinline=not (signatures or annotated),
         fastmath=_FAST if fast else False,
     )
 
     def compile_now(function: Function) -> Function:
         # Shape checkers wrap functions; their wrappers cannot be compiled.
         kernel = decorate(unwrap(function))
-        if signatures:
+        wanted = [numba.void(*_numba_types(unwrap(function)))] if annotated else [*signatures]
+        if wanted:
             module = function.__module__.rpartition(".")[2]
             with FileLock(cache_folder() / f"{module}.lock", blocking=_blocking.get()):
-                for signature in signatures:
+                for signature in wanted:
                     kernel.compile(signature)
             kernel.disable_compile()
         return kernel
 
     return compile_now
+
+
+def _numba_types(annotated: object) -> list[object]:
+    """Return numba's types of arguments of a function, or of fields of a named tuple."""
+    from numba import types
+    from numba.core.sigutils import normalize_signature
+
+    found: list[object] = []
+    for name, hint in get_type_hints(annotated, include_extras=True).items():
+        if name == "return":
+            continue
+        if get_origin(hint) is Annotated:
+            found.append(normalize_signature(f"void({hint.__metadata__[0]})")[0][0])
+        elif issubclass(hint, tuple):
+            fields = _numba_types(hint)
+            alike = len({*fields}) == 1
+            found.append(
+                types.NamedUniTuple(fields[0], len(fields), hint)
+                if alike
+                else types.NamedTuple(fields, hint)
+            )
+        else:
+            found.append(types.int64 if hint is int else types.float64)
+    return found
 
 
 @cache

@@ -12,27 +12,69 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.kernels.arrays import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
+from pimper_torch.kernels.twin_constants import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    INITIAL_DAMPING,
+    MIN_DEVIATION,
+    SHADING_STEPS,
+    ZERO_ROUNDINGS,
+)
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# As in ``variable_projection`` and ``bilinear``: damping, steps of the samples, the residual that
-# counts as zero in roundings, minimum deviation; and the codes of StopCause.
-_INITIAL_DAMPING, _DAMPING_DECREASE, _DAMPING_INCREASE = 1e-2, 0.2, 5.0
-_SHADING_STEPS = 2
-_ZERO_ROUNDINGS = 30.0
 _EPS = float(np.finfo(np.float32).eps)
-_MIN_DEVIATION = 1e-4
+
+# The codes of StopCause.
 _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 
 # Row and column of each entry of a packed matrix.
 _ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
 _COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
+
+
+class ConeProblem(NamedTuple):
+    """A batch of problems: see ``photometry.bilinear``; ``given`` are the weights."""
+
+    radiance: Floats3
+    given: Floats3
+    anchor: Floats3
+    regularization: Floats2
+    prior: Floats3
+
+
+class Limits(NamedTuple):
+    """See ``solve_variable_projection``; all samples count where ``curvature_samples`` is 0."""
+
+    max_iterations: int
+    tolerance: float
+    small_steps: int
+    curvature_samples: int
+
+
+class ConeSolution(NamedTuple):
+    """The solution of a batch.
+
+    Attributes:
+        shading: Samples without weight keep the start.
+        weight: The final ones, zero before.
+        residual: Root mean square.
+        cause: Code of the stop cause.
+    """
+
+    lights: Floats3
+    shading: Floats3
+    weight: Floats3
+    iterations: Integers1
+    residual: Floats1
+    cause: Integers1
 
 
 class Patch(NamedTuple):
@@ -160,15 +202,13 @@ def _packed(
         slack=max(slack, 0.0),
         num_views=len(regularization),
         num_scale=num_scale,
-        level=_MIN_DEVIATION * size / max(count, 1.0),
+        level=MIN_DEVIATION * size / max(count, 1.0),
         scale=scale,
     )
 
 
 @compiled()
-def _solve(
-    patch: Patch, lights: Floats, shading: Floats, limits: tuple[int, float, int, int]
-) -> tuple[int, int]:
+def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tuple[int, int]:
     """Iterate one patch; lights and shading are replaced by the solution.
 
     Returns:
@@ -182,10 +222,10 @@ def _solve(
     scale_start = _robust_weights(patch, lights, shading, 0.0)
     energy = _energy(patch)
     _equations(patch, lights)
-    update_shading(patch.equations, shading, _SHADING_STEPS)
+    update_shading(patch.equations, shading, SHADING_STEPS)
     cost = _evaluate(patch, lights, shading, slope)
     _curvature(patch, lights, shading, curvature_samples, curvature)
-    damping, small = _INITIAL_DAMPING, 0
+    damping, small = INITIAL_DAMPING, 0
     for taken in range(1, max_iterations + 1):
         for f in range(len(lights)):
             for i in range(4):
@@ -202,13 +242,13 @@ def _solve(
             _overwrite(new_shading, shading)
             _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
-            update_shading(patch.equations, new_shading, _SHADING_STEPS)
+            update_shading(patch.equations, new_shading, SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
         better = after < cost
-        exact = cost <= (_ZERO_ROUNDINGS * _EPS) ** 2 * energy
+        exact = cost <= (ZERO_ROUNDINGS * _EPS) ** 2 * energy
         if better:
             small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
-        damping *= _DAMPING_DECREASE if better else _DAMPING_INCREASE
+        damping *= DAMPING_DECREASE if better else DAMPING_INCREASE
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:
@@ -446,47 +486,19 @@ def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[fl
     return (math.sqrt(total / count) if count > 0 else 0.0), count > 0
 
 
-@compiled(
-    "void(float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[:,::1], float32[:,:,::1],"
-    " float64, int64, int64, float64, int64, int64,"
-    " float32[:,:,::1], float32[:,:,::1], float32[:,:,::1],"
-    " int64[::1], float32[::1], int64[::1])"
-)
+@compiled(annotated=True)
 def solve_on_cone(
-    radiance: Floats,
-    given: Floats,
-    anchor: Floats,
-    regularization: Floats,
-    prior: Floats,
-    scale: float,
-    stride: int,
-    max_iterations: int,
-    tolerance: float,
-    small_steps: int,
-    curvature_samples: int,
-    lights: Floats,
-    shading: Floats,
-    weight: Floats,
-    iterations: Integers,
-    residual: Floats,
-    cause: Integers,
+    problem: ConeProblem, scale: float, stride: int, limits: Limits, solution: ConeSolution
 ) -> None:
     """Factorize a batch of patches, one after the other.
 
     Args:
-        radiance: Patch, view, sample; zero where missing.
-        given: The weights; 0 where missing.
         scale: Of Cauchy's loss, in standard deviations; 0 for squares.
         stride: The deviation is estimated from every ``stride``-th sample.
-        curvature_samples: See the twin; 0 for all.
-        lights: The start, replaced by the solution.
-        shading: The start, replaced by the solution; samples without weight keep it.
-        weight: Result, zero before: final weights.
-        iterations: Result: number of steps.
-        residual: Result: root mean square.
-        cause: Result: code of the stop cause.
+        solution: Its lights and shading are the start.
     """
-    limits = (max_iterations, tolerance, small_steps, curvature_samples)
+    radiance, given, anchor, regularization, prior = problem
+    lights, shading, weight, iterations, residual, cause = solution
     for p in range(len(radiance)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
         samples, num_scale = _samples_that_count(given[p], stride)

@@ -12,20 +12,15 @@ from numpy.typing import NDArray
 from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.robust_scale import robust_variance
+from pimper_torch.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
 
 Doubles = NDArray[np.float64]
 
 # Samples whose equations are summed together: those of 24 views then fit the cache.
 TILE = 256
 
-# As in ``light_fit`` and ``image_samples``: Cauchy's scale in standard deviations, its minimum in
-# mean brightnesses; the damping; and the fraction of a view's diagonal added to each entry.
-_TUNING, _MIN_SCALE = 2.385, 1e-4
+# The damping at first, when a step is taken and when not, and its bounds.
 _DAMPING, _LESS, _MORE, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
-_FLOOR = 1e-9
-
-# Products above this are replaced by their logarithm: a factor more does not overflow float64.
-_LARGE = 1e100
 
 
 @compiled(fast=True)
@@ -140,7 +135,7 @@ def _weigh(residual: Doubles, seen: Doubles, scale: Doubles, weight: Doubles) ->
         for i in range(len(left)):
             relative = left[i] * inverse
             product *= 1 + relative * relative
-            if product > _LARGE:
+            if product > 1e100:  # a factor more does not overflow
                 logarithm += math.log(product)
                 product = 1.0
         total += scale[v] * scale[v] * (logarithm + math.log(product))
@@ -158,7 +153,7 @@ def _scales(
             squares[count] = left[i] * left[i]
             count += visible[i] > 0
         variance, guess[v] = robust_variance(squares[:count], guess[v])
-        scale[v] = widen * _TUNING * max(math.sqrt(variance), _MIN_SCALE * level[v])
+        scale[v] = widen * CAUCHY_TUNING * max(math.sqrt(variance), MIN_DEVIATION * level[v])
 
 
 @compiled(fast=True)
@@ -322,7 +317,7 @@ def _step(
         for p in range(size):
             index = v * size + p
             matrix[index, index] += damping * matrix[index, index] + (
-                _FLOOR * total if total > 0 else 1.0
+                1e-9 * total if total > 0 else 1.0
             )
     for i in range(num_samples):
         own[i] = 1 / (own[i] * (1 + damping)) if own[i] > 0 else 0.0
@@ -382,10 +377,7 @@ def fit(
             normals and of the points, too.
         radiance: View by sample; zero where not seen.
         level: Mean brightness of each view.
-        max_closeness: Upper bound of a point light's inverse distance.
         min_gain: A step that lowers the loss by less than this fraction is the last.
-        lights: View by parameter; the start, replaced by the solution.
-        albedo: Of each sample; the start, replaced by the solution.
     """
     shading, residual = np.empty_like(radiance), np.empty_like(radiance)
     trial_shading, new_residual = np.empty_like(radiance), np.empty_like(radiance)

@@ -5,55 +5,49 @@ Pyramids are rows of pixels (see ``patches.sources``), the finest level in an ar
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pimper_torch.kernels.arrays import (
+    Floats5,
+    FractionRows,
+    Integers2,
+    Masks3,
+    Masks4,
+    PictureRows,
+    Projection,
+    Samples,
+)
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
-Array = NDArray[Any]
 
-
-@compiled(
-    "void(float32[:,::1], float32[:,::1], uint8[:,::1], uint8[:,::1], int64[:,::1],"
-    "int64[::1], float64[:,:,::1], float64[:,::1], int64[:,::1], float64[:,::1], float64[::1],"
-    "float32[:,:,::1], float32[:,:,:,::1], boolean[:,:,::1], float64, float64,"
-    "float32[:,:,:,:,::1], boolean[:,:,:,::1])"
-)
+@compiled(annotated=True)
 def register(
-    finest: Array,
-    coarser: Array,
-    unusable_finest: Array,
-    unusable_coarser: Array,
-    levels: Array,
-    rows: Array,
-    image_from_patch: Array,
-    centers_patch: Array,
-    sizes_px: Array,
-    origin: Array,
-    spacing: Array,
-    depth: Array,
-    outward: Array,
-    inside: Array,
+    images: PictureRows,
+    unusable: FractionRows,
+    levels: Integers2,
+    projection: Projection,
+    samples: Samples,
+    sizes_px: Integers2,
+    inside: Masks3,
     min_facing: float,
     dark_level: float,
-    radiance: Array,
-    valid: Array,
+    radiance: Floats5,
+    valid: Masks4,
 ) -> None:
     """Resample the views, and mark valid samples, occlusion aside.
 
     Args:
-        finest: Images, one in a row.
-        unusable_finest: Fraction of every pixel that is unusable, in 255ths.
-        levels: Height, width and offset in a row of ``coarser``, in pixels of one channel.
-        image_from_patch: Three by four, for every patch and view.
-        centers_patch: Of the cameras, for every patch and view.
-        outward: Unit normals, patch frame.
+        levels: Height, width and offset of every level in a row of ``coarser``, in pixels of one
+            channel.
         min_facing: Cosine of the steepest viewing angle.
         dark_level: Mean over the channels below which a sample is invalid.
     """
+    rows, image_from_patch, centers_patch = projection
+    origin, spacing, depth, outward = samples
+    finest, coarser = images
+    unusable_finest, unusable_coarser = unusable
     patches, views, channels, height, width = radiance.shape
     fine_plane = levels[0, 0] * levels[0, 1]
     count = len(levels)
@@ -121,7 +115,7 @@ def register(
                             and margin <= v <= sizes_px[view, 1] - margin
                         ):
                             level, blend = blended_level(area, count)
-                            unusable = np.float32(0)
+                            lost = np.float32(0)
                             for step in range(2 if blend > 0 else 1):
                                 weight = blend if step == 1 else np.float32(1) - blend
                                 here = level + step
@@ -136,7 +130,7 @@ def register(
                                     v * fractions[here, 0] - 0.5,
                                 )
                                 if here == 0:
-                                    unusable += weight * bilinear(
+                                    lost += weight * bilinear(
                                         unusable_finest, image, at, aside, under, across, down
                                     )
                                     for channel in range(channels):
@@ -146,7 +140,7 @@ def register(
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
-                                unusable += weight * bilinear(
+                                lost += weight * bilinear(
                                     unusable_coarser, image, start + at, aside, under, across, down
                                 )
                                 at += channels * start
@@ -161,7 +155,7 @@ def register(
                             mean = np.float32(0)
                             for channel in range(channels):
                                 mean += blended[channel]
-                            usable = bool(unusable < np.float32(25.5)) and bool(
+                            usable = bool(lost < np.float32(25.5)) and bool(
                                 mean > channels * dark_level
                             )
                     valid[patch, view, row, column] = usable

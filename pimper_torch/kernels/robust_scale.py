@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
+from pimper_torch.kernels.twin_constants import (
+    GAUSSIAN_SCALE,
+    LONGEST_NEWTON_STEP,
+    NEWTON_STEPS,
+)
 
 Floats = NDArray[np.float32]
 
-# As in ``photometry.robust``: the scale of Gaussian noise of unit deviation, the limits on number
-# and length of Newton's steps, and the step at which they end.
-_GAUSSIAN_SCALE = 0.6472404
-_NEWTON_STEPS, _MAX_STEP = 40, 1.5
+# The step at which they end.
 _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
 
 
@@ -34,15 +36,15 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
     if not num_positive > half:
         return 0.0, 0.0
     scale = guess if guess > 0 else total / len(squares)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         fraction, slope = _fractions(squares, np.float32(1 / scale))
         step = (fraction - half) / max(slope, 1e-7)
-        scale *= math.exp(min(max(step, -_MAX_STEP), _MAX_STEP))
+        scale *= math.exp(min(max(step, -LONGEST_NEWTON_STEP), LONGEST_NEWTON_STEP))
         if abs(step) < _CLOSE:
             break
     fraction, slope = _fractions(squares, np.float32(1 / scale))
     correction = (fraction - half) / slope if slope > 0 else 0.0
-    return max(scale * (1 + correction), 0.0) / _GAUSSIAN_SCALE**2, scale
+    return max(scale * (1 + correction), 0.0) / GAUSSIAN_SCALE**2, scale
 
 
 @compiled(fast=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
+from pimper_torch.kernels.twin_constants import MAX_STEP
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -22,8 +23,7 @@ Ten = tuple[float, float, float, float, float, float, float, float, float, float
 TILE = 32
 
 # As in ``photometry.bilinear`` and ``photometry.quadratics``.
-MAX_STEP = 0.3
-_ZERO_ROUNDINGS = 8 * float(np.finfo(np.float32).eps)
+_ROUNDING = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
 
 
@@ -69,7 +69,7 @@ def _step(tile: Doubles) -> None:
             a, (b[0] - image[0], b[1] - image[1], b[2] - image[2], b[3] - image[3]), s
         )
         after = objective(moved, apply(a, moved), b)
-        better = after <= value + _ZERO_ROUNDINGS * abs(value)
+        better = after <= value + _ROUNDING * abs(value)
         tile[14 * TILE + k] = moved[0] if better else s[0]
         tile[15 * TILE + k] = moved[1] if better else s[1]
         tile[16 * TILE + k] = moved[2] if better else s[2]

@@ -4,21 +4,29 @@ Arguments are documented there; images are laid out as in ``kernels.resampling``
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.kernels.arrays import (
+    Doubles1,
+    Floats1,
+    Floats2,
+    Floats3,
+    Floats4,
+    Integers1,
+    Integers2,
+    Masks3,
+    Masks4,
+    PictureRows,
+    Projection,
+    Samples,
+)
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
 Array = NDArray[Any]
-
-# As in ``sweep.consistency``: reweighted least squares for the albedo, after the median.
-_ALBEDO_ITERATIONS = 2
-
-# Factors multiplied before a logarithm is taken: no overflow up to residuals of 1e19 scales.
-_FACTORS = 8
 
 
 @compiled(
@@ -85,12 +93,12 @@ def _inconsistency(
     ratios: Array,
     order: Array,
 ) -> float:
-    """See :func:`~pimper_torch.sweep.consistency.inconsistency`; for one sample and height."""
+    """See :func:`~pimper_torch.sweep.costs.inconsistency`; for one sample and height."""
     for view in range(count):
         ratios[view] = radiance[step, view] * per_shading[view]
     albedo = np.float32(_lower_median(ratios, order, count))
     one = np.float32(1)
-    for _ in range(_ALBEDO_ITERATIONS):
+    for _ in range(2):
         square, product = np.float32(0), np.float32(0)
         for view in range(count):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale
@@ -99,9 +107,9 @@ def _inconsistency(
             product += lit * radiance[step, view]
         albedo = product / square if square > 0 else product
     cost = 0.0
-    for first in range(0, count, _FACTORS):
+    for first in range(0, count, 8):  # products of eight do not overflow
         factors = 1.0
-        for view in range(first, min(first + _FACTORS, count)):
+        for view in range(first, min(first + 8, count)):
             residual = (radiance[step, view] - albedo * shading[view]) * per_scale
             factors *= 1.0 + np.float64(residual) * np.float64(residual)
         cost += math.log(factors)
@@ -110,7 +118,7 @@ def _inconsistency(
 
 @compiled("int64(float32[::1], int64[::1], float32[::1])")
 def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
-    """See :func:`~pimper_torch.sweep.selection.poses_first`; views of rating 0 are not usable.
+    """See :func:`~pimper_torch.sweep.costs.poses_first`; views of rating 0 are not usable.
 
     Returns:
         How many poses have a usable view.
@@ -130,60 +138,61 @@ def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
     return distinct
 
 
-@compiled(
-    "void(float32[:,::1], float32[:,::1], int64[:,::1], int64[::1], float64[:,:,::1],"
-    "float64[:,::1], float64[::1], float64[:,::1], float64[::1], float32[:,:,::1],"
-    "float32[:,:,:,::1], float32[:,:,:,::1], float32[:,:,::1], float32[:,::1],"
-    "boolean[:,:,:,::1], boolean[:,:,::1], float32[::1], float64[::1], int64[::1], int64, int64,"
-    "float64, float32[:,:,:,::1], float32[:,:,::1])"
-)
-def costs(
-    finest: Array,
-    coarser: Array,
-    levels: Array,
-    rows: Array,
-    image_from_patch: Array,
-    centers_patch: Array,
-    focals: Array,
-    origin: Array,
-    spacing: Array,
-    depth: Array,
-    outward: Array,
-    normals: Array,
-    lights: Array,
-    gains: Array,
-    valid: Array,
-    tested: Array,
-    scale: Array,
-    ladder: Array,
-    poses: Array,
-    num_views: int,
-    min_views: int,
-    min_facing: float,
-    cost: Array,
-    swept: Array,
-) -> None:
-    """Choose the views of each sample, and evaluate its cost at all heights.
+class Shading(NamedTuple):
+    """Normals that light shades, lights of every patch and view, and factors of radiance."""
 
-    Args:
-        finest: Gray images, one in a row.
-        levels: Height, width and offset of every level.
-        image_from_patch: Three by four, for every patch and view.
-        centers_patch: Of the cameras, for every patch and view.
-        outward: Unit, along which a sample is swept; patch frame.
-        normals: That light shades, patch frame.
-        lights: First-order harmonics of every patch and view.
-        gains: Factors of radiance, of every patch and view.
-        valid: Where a view has the sample.
+    normals: Floats4
+    lights: Floats3
+    gains: Floats2
+
+
+class Trial(NamedTuple):
+    """The heights of every sample that are tried.
+
+    Attributes:
         tested: Samples that may be swept.
+        valid: Where a view has the sample.
         scale: Of the robust loss, for every patch.
-        ladder: Height hypotheses, in units of ``spacing``.
+        ladder: In units of the samples' spacing.
         poses: Number of each view's pose; empty where every view has its own.
         num_views: Maximum number of views of a sample.
         min_views: A sample with fewer views is not swept.
         min_facing: Lower bound of the cosine that shrinks footprints.
+    """
+
+    tested: Masks3
+    valid: Masks4
+    scale: Floats1
+    ladder: Doubles1
+    poses: Integers1
+    num_views: int
+    min_views: int
+    min_facing: float
+
+
+@compiled(annotated=True)
+def costs(
+    gray: PictureRows,
+    levels: Integers2,
+    projection: Projection,
+    focals: Doubles1,
+    samples: Samples,
+    shaded: Shading,
+    trial: Trial,
+    cost: Floats4,
+    swept: Floats3,
+) -> None:
+    """Choose the views of each sample, and evaluate its cost at all heights.
+
+    Args:
+        levels: Height, width and offset of every level.
         swept: Result, zero before: 1 where a sample has costs.
     """
+    rows, image_from_patch, centers_patch = projection
+    origin, spacing, depth, outward = samples
+    normals, lights, gains = shaded
+    tested, valid, scale, ladder, poses, num_views, min_views, min_facing = trial
+    finest, coarser = gray
     patches, views, height, width = valid.shape
     heights, count_levels = len(ladder), len(levels)
     limit = min(num_views, views)

@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 
-# Bytes of window weights that are read again for every hypothesis: those of a core's cache.
-_CACHED = 3 << 18
-
 _ROW = "float32[::1]"
 
 
@@ -145,26 +142,23 @@ def window_scores(
     and sources.
 
     Args:
-        field: Inverse depths, ``height width``.
-        offsets: Added to the field, the sum clamped to the smallest positive float.
-        ray: See :class:`~pimper_torch.coarse.window_matching.Pairing`, ``source 3 height width``.
-        shift: Of the same, ``source 3``.
-        tone: Of the sources, ``source height width``.
-        usable: Valid pixels of the sources.
+        field: Inverse depths; the sum with an offset is clamped to the smallest positive float.
+        ray: See :class:`~pimper_torch.coarse.window_matching.Pairing`, as for ``shift``.
+        tone: Of the sources, as ``usable``.
         weight: Of the pixels of every window, ``entry height width``; adds up to 1.
         deviation: That weight times the tone's difference to the window's mean.
         power: Variance of the tone in every window.
         valid: Of the reference view; elsewhere the score is 0.
         floor: Added to variances: regularization of windows without texture.
         best: The score is the mean of so many largest correlations.
-        scores: Result, ``offset height width``.
     """
     num_sources, height, width = tone.shape
     num_entries = weight.shape[0]
     side = int(math.sqrt(num_entries) + 0.5)
     radius = side // 2
     best = min(best, num_sources)
-    band = max(8, _CACHED // (8 * num_entries * width))
+    # Weights that are read again for every hypothesis fit a core's cache, 768 kB.
+    band = max(8, (3 << 18) // (8 * num_entries * width))
     seen = np.zeros((num_sources, band + 2 * radius, width + 2 * radius), dtype=np.float32)
     there = np.zeros((num_sources, band + 2 * radius, width), dtype=np.bool_)
     across, down = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)

@@ -26,18 +26,12 @@ from pimper_torch.progress import report
 from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
 from pimper_torch.stage import Stage
 
-# Height fields this close, in edge lengths, agree.
-_SAME_PLACE = 5e-3
-
-# A seam that fewer rays than this fraction meet is ignored.
-_MET_ENOUGH = 0.25
-
 
 def patch_status(
     facets: Int[Tensor, "seam 2"], met: Bool[Tensor, "seam ray"], count: int
 ) -> Int[Tensor, " face"]:
     """Assign every patch its :class:`~pimper_torch.records.AlignStatus`."""
-    overlapping = met.sum(dim=1) >= _MET_ENOUGH * met.shape[1]
+    overlapping = met.sum(dim=1) >= 0.25 * met.shape[1]
     status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
     status[facets[overlapping].flatten()] = int(AlignStatus.ALIGNED)
     return status
@@ -93,13 +87,6 @@ def anchor_certainty(
     """
     return noise.square() / (noise.square() + variance)
 
-
-# An arc over an edge whose centre stands out by 0.7 % of its length has this C; flatter
-# height fields are not told apart.
-_FLAT = 3e-3
-
-# Vertices that were filled in between points of the cloud are guesses.
-_FILLED_VERTEX = 0.1
 
 # Solves within the first round, so that weights that depend on the answer settle; later
 # rounds begin nearer to it and take one less.
@@ -278,9 +265,10 @@ class Align(Stage):
     ) -> Pulls:
         """Add what holds height fields to vertices, for the patches that may move."""
         vertices, coarse = problem.vertices, problem.patches.coarse
+        # Vertices that were filled in between points of the cloud are guesses.
         is_point = coarse.is_point[coarse.mesh.faces]
         certain = anchor_certainty(vertices.variance / problem.unit.square(), noise)
-        weight = torch.where(is_point, certain, _FILLED_VERTEX) * vertices.known
+        weight = torch.where(is_point, certain, 0.1) * vertices.known
         return pulls.replace(corner_weight=self.config.anchor * weight * moves[:, None])
 
     def _solve_round(
@@ -305,17 +293,18 @@ def _curvature_terms(
 ) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
     """Return k of every seam, and what its derivative adds to the right-hand sides."""
     scales = transforms[pulls.facets, 2]
-    stiffness = seam_stiffness(pulls.curvature, scales, _FLAT)
+    # The floor is C of an arc whose centre stands out by 0.7 % of its edge's length.
+    stiffness = seam_stiffness(pulls.curvature, scales, 3e-3)
     apart = (pulls.weight * distance.square()).sum(dim=1)
     return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
 
 
 def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
-    """Estimate the error of one height field from the median distance of two."""
+    """Estimate the error of one height field from the median distance of two, in edge lengths."""
     met = pulls.weight > 0
     if not bool(met.any()):
         return torch.ones_like(distance.sum())
-    return distance[met].median().clamp_min(_SAME_PLACE) / 2**0.5
+    return distance[met].median().clamp_min(5e-3) / 2**0.5
 
 
 def _with_scales_held(pulls: Pulls) -> Pulls:

@@ -177,11 +177,6 @@ def _deviation(
     return plane[:, 2].abs().to(points_cam.dtype)
 
 
-# Points that each value of the spline is computed from: one of all points costs the cube of
-# their number. A choice; beyond about 50 nearest ones the value hardly changes.
-_SPLINE_NEIGHBOURS = 50
-
-
 def fill_pixels(
     pixels: Float[Tensor, "point 2"], faces: Int[Tensor, "face 3"], edge_px: float
 ) -> Float[Tensor, "filled 2"]:
@@ -224,7 +219,7 @@ def interpolate_inverse_depth(
     spline = RBFInterpolator(
         (known - center) / unit,
         values,
-        neighbors=min(_SPLINE_NEIGHBOURS, len(known)),
+        neighbors=min(50, len(known)),  # more hardly change a value, and cost their cube
         smoothing=smoothing,
         kernel="thin_plate_spline",
     )
@@ -275,17 +270,14 @@ def with_cloud(
     )
 
 
-# Pairs of points and facets that are tested at once; bounds memory to some 100 MB.
-_TESTS_AT_ONCE = 2_000_000
-
-
 def facets_under(
     pixels: Float[Tensor, "point 2"], corners_px: Float[Tensor, "face 3 2"]
 ) -> Int[Tensor, " point"]:
     """Find the facet that contains each point of an image, -1 outside all."""
     found = []
-    for some in torch.split(pixels, max(1, _TESTS_AT_ONCE // max(1, len(corners_px)))):
-        within = (barycentric_2d(some[:, None], corners_px[None]) >= 0).all(dim=-1)
+    at_once = max(1, 2_000_000 // max(1, len(corners_px)))  # some 100 MB
+    for part in torch.split(pixels, at_once):
+        within = (barycentric_2d(part[:, None], corners_px[None]) >= 0).all(dim=-1)
         facet = within.to(torch.int8).argmax(dim=1)
         found.append(torch.where(within.any(dim=1), facet, -1))
     return torch.cat(found)

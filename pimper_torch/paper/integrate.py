@@ -17,7 +17,7 @@ from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import slopes_from_normals
 from pimper_torch.progress import track
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
-from pimper_torch.records.patches import Photometry, Templates
+from pimper_torch.records.patches import Templates
 from pimper_torch.stage import Stage
 
 
@@ -37,10 +37,10 @@ def fill_smoothly(
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
     """
     fraction = weight[:, None]
-    return _regularization(torch.where(fraction > 0, values, 0) * fraction, fraction)
+    return _blended(torch.where(fraction > 0, values, 0) * fraction, fraction)
 
 
-def _regularization(
+def _blended(
     weighted: Float[Tensor, "patch channel height width"],
     weight: Float[Tensor, "patch 1 height width"],
 ) -> Float[Tensor, "patch channel height width"]:
@@ -54,7 +54,7 @@ def _regularization(
     # evidence would fade on its way up, and the mean of the whole patch would win.
     full = (4 * coarse_weight).clamp_max(1)
     gain = full / torch.where(coarse_weight > 0, coarse_weight, 1)
-    coarse = _regularization(coarse_weighted * gain, full)
+    coarse = _blended(coarse_weighted * gain, full)
     around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
     return weight * known + (1 - weight) * around
 
@@ -126,11 +126,6 @@ def _stiffness(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"
     return 4 * (math.pi / (2 * size) * frequency).sin() ** 2
 
 
-# Normals farther from the facet's own are brought to this angle, that of the warp's limit: such a
-# sample lies on the contour or is wrong, and one alone can bend its whole patch.
-_MAX_TILT_DEG = 75.0
-
-
 class Integrate(Stage):
     """Integrate the normals of every patch on its template.
 
@@ -144,7 +139,9 @@ class Integrate(Stage):
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
         """Return the height fields, ``valid`` inside enlarged triangles that have data."""
-        steepest = math.tan(math.radians(_MAX_TILT_DEG))
+        # A normal beyond the warp's limit lies on the contour or is wrong, and one alone can bend
+        # its whole patch.
+        steepest = math.tan(math.radians(75))
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
         for templates, photometry in track(pairs):
@@ -155,7 +152,13 @@ class Integrate(Stage):
                 steepest,
             )
             depth = through_corners(height_field, templates, photometric.patches.coarse)
-            buckets.append(_depths(depth, templates, photometry))
+            has_data = photometry.valid.flatten(1).any(dim=1)
+            depths = Depths(
+                depth=depth,
+                valid=templates.inside & has_data[:, None, None],
+                transform=depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4),
+            )
+            buckets.append(depths)
         return DepthPatches(photometric=photometric, buckets=tuple(buckets))
 
 
@@ -172,23 +175,14 @@ def integrate_normals(
         spacing: Between samples, in the units of the depth.
         steepest: Limit of a slope's size.
     """
-    slopes = _slopes(normals, valid, steepest).movedim(-1, 1)
+    upright = normals.new_tensor([0, 0, -1])
+    slopes = slopes_from_normals(torch.where(valid[..., None], normals, upright), steepest)
+    slopes = slopes.movedim(-1, 1)
     slopes = fill_smoothly(slopes, valid.to(slopes)).double() * spacing[:, None, None, None]
     # Half-way between samples the mean of the two is right to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
     return integrate_steps(right, down).to(normals)
-
-
-def _slopes(
-    normals: Float[Tensor, "patch height width 3"],
-    valid: Bool[Tensor, "patch height width"],
-    steepest: float,
-) -> Float[Tensor, "patch height width 2"]:
-    """Return the slopes of valid normals, at most so steep, and 0 elsewhere."""
-    upright = torch.zeros_like(normals)
-    upright[..., 2] = -1
-    return slopes_from_normals(torch.where(valid[..., None], normals, upright), steepest)
 
 
 def through_corners(
@@ -202,15 +196,3 @@ def through_corners(
     )
     offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
     return height_field - offset[:, None, None]
-
-
-def _depths(
-    depth: Float[Tensor, "patch height width"], templates: Templates, photometry: Photometry
-) -> Depths:
-    has_data = photometry.valid.flatten(1).any(dim=1)
-    identity = depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4)
-    return Depths(
-        depth=depth,
-        valid=templates.inside & has_data[:, None, None],
-        transform=identity,
-    )

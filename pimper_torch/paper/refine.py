@@ -27,14 +27,6 @@ from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.stage import Stage
 
-# Fidelity, as a fraction of the usual, that ties what no patch supports to the flat facets: it
-# makes the system definite on an island without support, and is nothing elsewhere.
-_TIE = 1e-9
-
-# A needle's area is taken as at least this fraction of its longest edge squared: its cotangents
-# would otherwise spoil the condition of the whole system.
-_MIN_SHAPE = 1e-4
-
 
 def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     r"""Return G: where a facet is a seam and where it is its centre.
@@ -66,9 +58,10 @@ def assemble(
     weights = seam_weight(subdivision.barycentric.double())
     mesh = elements(subdivision.points.detach().double(), subdivision.faces)
     mass = lumped_mass(mesh, fidelity.double()[subdivision.face_facet])
-    mass = mass * (1 - weights) * torch.where(supported, 1, _TIE)
+    # A little mass ties what no patch supports to the flat facets: the system is definite.
+    mass = mass * (1 - weights) * torch.where(supported, 1, 1e-9)
     seams = weights[subdivision.faces].mean(dim=1)
-    rows, cols, values = cotangent_laplacian(mesh, seams, _MIN_SHAPE)
+    rows, cols, values = cotangent_laplacian(mesh, seams, 1e-4)  # needles are taken as wider
     diagonal = torch.arange(mesh.count, device=mass.device)
     rows, cols = torch.cat([rows, diagonal]), torch.cat([cols, diagonal])
     return rows, cols, torch.cat([values, mass]), mass

@@ -44,13 +44,6 @@ _MAX_VIEW_ANGLE_DEG, _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 40.0, 3, 1.5, 4
 # isolation (distance to its neighbours over theirs to their own) where it is a corner of the hull.
 _NEIGHBOURS, _MAX_SLOPE, _MAX_DEVIATION, _MAX_ISOLATION = 12, 6.0, 0.5, 3.0
 
-# Points all round that are nearer to the reference by more than this times their lateral distance
-# occlude a point.
-_OCCLUDING_SLOPE = 3.0
-
-# Of the spline, relative to the spread of the values: it passes through the points all but exactly.
-_SMOOTHING = 1e-6
-
 # A facet turned further from the reference bridges a depth discontinuity; so does one turned by
 # more than the second with an edge so many times the median facet's.
 _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
@@ -58,10 +51,6 @@ _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
 # On the border a facet is dropped with a smaller height over its longest edge in the image, or with
 # a smaller angle at a corner that it alone reaches, or with a smaller fraction of it on the object.
 _MIN_ALTITUDE, _MIN_TIP_DEG, _MIN_COVERAGE = 0.08, 45.0, 0.6
-
-# Radiance in the reference view, over the median at the mesh's vertices, at or below which a pixel
-# shows background.
-_DARK_FRACTION = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +150,7 @@ class Triangulate(Stage):
                     transform(cameras.cam_from_world[reference], scene.points_world[index]),
                     observed[index, reference],
                     neighbours=min(2 * _NEIGHBOURS, len(index) - 1),
-                    slope=_OCCLUDING_SLOPE,
+                    slope=3.0,
                 )
                 index = index[~hidden]
         if len(index) >= 4:
@@ -202,7 +191,7 @@ class Triangulate(Stage):
         pixels, _ = _project(vertices, cameras, reference)
         wanted = fill_pixels(pixels, faces, edge_px)
         known, depth = _project(points, cameras, reference)
-        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, _SMOOTHING)
+        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, 1e-6)
         possible = inverse > 0.5 / depth.amax()
         rays = rays_through(
             wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
@@ -231,7 +220,7 @@ class Triangulate(Stage):
         gray = views.images[reference].mean(dim=0)
         u, v = pixels.long().unbind(dim=1)
         at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
-        shows_object = gray > _DARK_FRACTION * at_vertices.median()
+        shows_object = gray > 0.12 * at_vertices.median()  # darker is background
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)

@@ -16,10 +16,6 @@ from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 # Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
 MIN_FACING = 0.05
 
-# Largest distance of the surface from the facet's plane, in extents of the template. A choice:
-# further off it is another part of the object.
-_REACH = 0.5
-
 
 def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     """Transfer the depth and the normals of a surface to every template.
@@ -86,7 +82,7 @@ def _transferred(
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
     positions = transform(world_from_patch, flat.reshape(num, -1, 3))
     inward = world_from_patch[:, None, :3, 2].expand_as(positions)
-    reach = _REACH * templates.spacing * max(height, width)
+    reach = 0.5 * templates.spacing * max(height, width)
     # A little further, so that rounding does not decide.
     hits, met = _nearest(caster, positions, inward, surface, 1.01 * reach[:, None])
     hits = hits.refined(surface.vertices_world, surface.faces, positions, inward)

@@ -11,16 +11,6 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Mesh
 
-# Facets that rays are cast for together, and at most in a block: a choice, they bound memory.
-_MOST_FACETS = 512
-
-# A block is divided until, in the mean, its facets are seen in this fraction of the views that
-# they could be seen in: a choice.
-_SERVED = 0.9
-
-# Of the gain of views that are as good, so that not each pose has the same light chosen: a choice.
-_TIE = 1e-3
-
 
 def view_blocks(
     mesh: Mesh, cameras: Cameras, spacing: Float[Tensor, ""], count: int
@@ -52,7 +42,8 @@ def view_blocks(
             seen = weight[some] > 0
             could = seen.sum(dim=1).clamp_max(count)
             served = seen[:, chosen].sum(dim=1)[could > 0] / could[could > 0]
-            if len(some) == 1 or not bool(served.mean() < _SERVED):
+            # In the mean facets are seen in nine of ten views that they could be seen in.
+            if len(some) == 1 or not bool(served.mean() < 0.9):
                 blocks.append((group[some], chosen))
             else:
                 waiting += [some[part] for part in halves(like[group[some]])]
@@ -61,7 +52,7 @@ def view_blocks(
     groups, waiting = [], [torch.arange(len(faces), device=faces.device)]
     while waiting:
         some = waiting.pop()
-        parts = halves(like[some]) if len(some) > _MOST_FACETS else ()
+        parts = halves(like[some]) if len(some) > 512 else ()  # bounds memory
         waiting += [some[part] for part in parts]
         groups += [] if parts else [some]
     return [block for found in side_by_side(of_group, groups, tracked=False) for block in found]
@@ -128,7 +119,8 @@ def best_views(
     chosen = torch.zeros_like(turn, dtype=torch.bool)
     for _ in range(min(count, len(chosen))):
         share = 1 / (1 + weight[:, chosen].sum(dim=1))
-        gain = (share @ weight) * (1 + _TIE * turn) / (1 + alike[:, chosen].sum(dim=1))
+        # Of views that are as good, not each pose has the same light chosen.
+        gain = (share @ weight) * (1 + 1e-3 * turn) / (1 + alike[:, chosen].sum(dim=1))
         gain = torch.where(chosen, -1, gain)
         best = gain.argmax()
         if bool(chosen.any()) and not bool(gain[best] > 0):

@@ -6,10 +6,10 @@ manifolds and solvers are in :mod:`pimper_torch.single_view.factorization`.
 
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig, Illumination
 from pimper_torch.photometry.lights import thinned
-from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 

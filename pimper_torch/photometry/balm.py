@@ -23,14 +23,16 @@ from torch import Tensor
 
 from pimper_torch.photometry.bilinear import (
     REWEIGHT_EVERY,
+    RUNNING,
     Bilinear,
     Factors,
+    State,
     equations_of_samples,
     equations_of_views,
+    iterate,
     keep_scale,
     robust_weights,
 )
-from pimper_torch.photometry.iteration import RUNNING, State, iterate
 from pimper_torch.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import StopCause

@@ -11,17 +11,21 @@ for every patch of a batch, with ``M`` the photometric manifold of some order of
 :math:`\phi` a loss. With ``c = 0``, ``P = 0``, squares and the cone this is the published
 problem; with a linear manifold it is low-rank factorization with missing data.
 
-A solver is a function of such a problem, a maximum number of iterations and a tolerance.
+A solver is a function of such a problem, a maximum number of iterations and a tolerance, and
+iterates a batch of patches until each has stopped (:func:`iterate`).
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.photometry.manifolds import Cone, Manifold
+from pimper_torch.kernels.twin_constants import MAX_STEP, MIN_DEVIATION
+from pimper_torch.photometry.cone import Cone, Manifold
 from pimper_torch.photometry.quadratics import (
     PackedCholesky,
     apply_packed,
@@ -35,17 +39,9 @@ from pimper_torch.photometry.quadratics import (
 from pimper_torch.photometry.robust import Loss, Squares, robust_deviation
 from pimper_torch.records import Convergence, Record, StopCause
 
-# Lower bound of the residuals' standard deviation, as a fraction of a patch's brightness: on
-# exact data all residuals are rounding, and none is an outlier. A choice.
-MIN_DEVIATION = 1e-4
-
 # Steps between updates of the robust weights: they change slowly, and the scale of the residuals
 # costs as much as a step.
 REWEIGHT_EVERY = 3
-
-# Longest step along a curved manifold, as a fraction of albedo (about radians of the normal): a
-# choice, for the quadratic model holds nearby only.
-MAX_STEP = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -60,7 +56,7 @@ class Bilinear(Record):
         regularization: ``c_f`` per view.
         prior: ``P``, packed: what else is known of the shading vectors, such as normals they
             should not bend away from (:meth:`Cone.bend
-            <pimper_torch.photometry.manifolds.Cone.normal_prior>`); ``None`` for none.
+            <pimper_torch.photometry.cone.Cone.normal_prior>`); ``None`` for none.
         manifold: What shading vectors can be.
         loss: What residuals cost, their deviation estimated patch by patch.
         stride: The deviation is taken over every so many samples.
@@ -155,23 +151,13 @@ def curvature_of_views(
     return whole.reshape(batch, views * rank, views * rank)
 
 
-def objective(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-) -> Float[Tensor, " patch"]:
-    """Evaluate the objective, with the robust weights fixed to ``weight``."""
-    return evaluate(problem, lights, shading, weight)[0]
-
-
 def evaluate(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
     shading: Float[Tensor, "patch rank sample"],
     weight: Float[Tensor, "patch view sample"],
 ) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
-    """Return the :func:`objective`, and minus half its gradient by the lights."""
+    """Return the objective, its robust weights given, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
     cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
@@ -260,25 +246,6 @@ def keep_scale(
     return lights * factor, shading / factor
 
 
-def to_factors(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-    iterations: Int[Tensor, " patch"],
-    cause: Int[Tensor, " patch"],
-) -> Factors:
-    """Return a solver's result, with its residuals; patches without data are marked empty."""
-    has_data = problem.weight.sum(dim=(1, 2)) > 0
-    empty = torch.full_like(cause, int(StopCause.EMPTY))
-    convergence = Convergence(
-        iterations=iterations,
-        residual=root_mean_square(problem, lights, shading),
-        cause=torch.where(has_data, cause, empty),
-    )
-    return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
-
-
 def root_mean_square(
     problem: Bilinear,
     lights: Float[Tensor, "patch view rank"],
@@ -300,3 +267,83 @@ def residual_deviation(
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
     level = problem.radiance.abs().sum(dim=(1, 2)) / count
     return robust_deviation(subset, seen).maximum(MIN_DEVIATION * level)
+
+
+# In place of a cause, for a patch that has not stopped.
+RUNNING = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class State(Record):
+    """State that every solver iterates; the first axis is the patch.
+
+    Attributes:
+        lights: ``L``.
+        shading: ``N``, columns on the manifold.
+        weight: Of each entry, robust weights included.
+    """
+
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+
+
+AnyState = TypeVar("AnyState", bound=State)
+
+
+def iterate(
+    problem: Bilinear,
+    state: AnyState,
+    advance: Callable[[Bilinear, AnyState, int], tuple[AnyState, Int[Tensor, " patch"]]],
+    max_iterations: int,
+) -> Factors:
+    """Iterate until every patch has stopped; those that have leave the batch.
+
+    Args:
+        advance: One step of the remaining patches: from problem, state and index of the step
+            to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
+
+    Returns:
+        Every patch's last lights, shading and weights, its number of steps, and its stop cause.
+    """
+    whole = problem
+    patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
+    taken = torch.full_like(patches, max_iterations)
+    causes = torch.full_like(patches, int(StopCause.LIMIT))
+    running = torch.ones_like(patches, dtype=torch.bool)
+    names = [field.name for field in dataclasses.fields(state)]
+    final = state.replace(**{name: getattr(state, name).clone() for name in names})
+    for step in range(max_iterations):
+        state, cause = advance(problem, state, step)
+        ended = running & (cause != RUNNING)
+        _store(final, state, names, patches, ended)
+        taken[patches[ended]] = step + 1
+        causes[patches[ended]] = cause[ended]
+        running = running & ~ended
+        if not bool(running.any()):
+            break
+        # Patches that have stopped leave a batch by quarters: copying the rest costs about a step.
+        if float((~running).double().mean()) >= 0.25:
+            keep = running.nonzero()[:, 0]
+            state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
+            running = running[keep]
+    _store(final, state, names, patches, running)
+    has_data = whole.weight.sum(dim=(1, 2)) > 0
+    convergence = Convergence(
+        iterations=taken,
+        residual=root_mean_square(whole, final.lights, final.shading),
+        cause=torch.where(has_data, causes, int(StopCause.EMPTY)),
+    )
+    return Factors(
+        lights=final.lights,
+        shading=final.shading,
+        weight=final.weight,
+        convergence=convergence,
+    )
+
+
+def _store(
+    final: Record, state: Record, names: list[str], patches: Int[Tensor, " patch"], rows: Tensor
+) -> None:
+    for name in names:
+        getattr(final, name)[patches[rows]] = getattr(state, name)[rows]

@@ -1,11 +1,22 @@
-r"""The photometric manifold :math:`\{\rho\,(1, n) : \rho \ge 0, \lVert n \rVert = 1\}`.
+r"""Photometric manifolds: the sets of possible shading vectors. First-order light has a cone.
 
-It is a cone of light in four dimensions: the time axis is albedo, the space axes the normal.
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
+albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, whose ambiguity is
+a scaled Lorentz transformation. It is a cone of light in four dimensions: the time axis is albedo,
+the space axes the normal. Other orders of light, and low-rank matrices, are in
+:mod:`pimper_torch.single_view.factorization.low_rank`.
+
+Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from pimper_torch.photometry.light_field import harmonics
 
 
 def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -98,3 +109,78 @@ def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor,
 def _vectors(parts: list[Tensor]) -> Float[Tensor, "..."]:
     """Stack components on the last axis, each contiguous, for products with lights."""
     return torch.stack(parts, dim=-2).mT if parts[0].ndim else torch.stack(parts)
+
+
+@runtime_checkable
+class Manifold(Protocol):
+    """A set of possible shading vectors."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is the whole space, so that normal equations give the minimum."""
+
+    def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Return the nearest vector of the manifold."""
+
+    def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Map the end of a small step along the tangents back to the manifold."""
+
+    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
+        """Span the tangent space at each column."""
+
+    def curvature(
+        self,
+        shading: Float[Tensor, "*batch rank sample"],
+        slope: Float[Tensor, "*batch rank sample"],
+    ) -> Float[Tensor, "*batch sample tangent tangent"]:
+        r"""Return :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
+
+        It is the manifold's part of the second derivatives of a function with gradient ``g``.
+        """
+
+    def split(
+        self, shading: Float[Tensor, "*batch rank"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Return albedo and unit normal of the vectors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cone:
+    r"""First-order lighting: :math:`\rho (1, n)`."""
+
+    rank: ClassVar[int] = 4
+    flat: ClassVar[bool] = False
+
+    project = retract = staticmethod(project_to_cone)
+    tangents = staticmethod(tangent_columns)
+    split = staticmethod(split_shading)
+
+    def curvature(
+        self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
+    ) -> Float[Tensor, "*batch sample 3 3"]:
+        r"""Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
+        albedo, normal = self.split(shading.mT)
+        first, second = tangents(normal)
+        along, on_first, on_second = (
+            (slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)
+        )
+        zero = torch.zeros_like(albedo)
+        rows = [[zero, on_first, on_second], [on_first, -along, zero], [on_second, zero, -along]]
+        matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+        return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
+
+    def join(
+        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 4"]:
+        """Return the vectors of albedo and normal."""
+        return albedo[..., None] * harmonics(normals)
+
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 10 sample"]:
+        r"""Return penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
+        n = normals
+        one, zero = torch.ones_like(n[..., 0, :]), torch.zeros_like(n[..., 0, :])
+        x, y, z = n.unbind(dim=-2)
+        rows = [(n * n).sum(dim=-2), -x, -y, -z, one, zero, zero, one, zero, one]
+        return torch.stack(rows, dim=-2)

@@ -34,17 +34,6 @@ from pimper_torch.photometry.quadratics import (
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Record
 
-# Ridge, as a fraction of the mean curvature, for undetermined directions such as Lorentz
-# transformations of free lights, along which the solution then does not move: a choice.
-_RIDGE = 1e-10
-
-# Newton's steps at most, and the smallest fraction of a step in the line search: choices; near the
-# solution every step doubles the correct digits.
-_NEWTON_STEPS, _MIN_STEP = 30, 1e-3
-
-# Entries of the mixed block of the Hessian that are in memory at once: a choice, 80 MB.
-_CHUNK_ENTRIES = 10_000_000
-
 
 def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     r"""Make a solution differentiable in its data.
@@ -121,7 +110,7 @@ def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
     hessian = _hessian(problem, factors.lights.double(), factors.shading.double())
     size = _gradient_size(problem, hessian)
     fraction = torch.ones_like(size)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(30):
         step = _newton_step(problem, hessian)
         L = hessian.lights + fraction[:, None, None] * step.lights
         along_tangents = combination(hessian.columns, fraction[:, None, None] * step.along_tangents)
@@ -135,7 +124,7 @@ def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
             L, N = torch.where(keep, L, hessian.lights), torch.where(keep, N, hessian.shading)
             size = torch.where(better, trial_size, size)
             hessian = _hessian(problem, L, N)
-        elif bool((fraction < _MIN_STEP).all()):
+        elif bool((fraction < 1e-3).all()):
             break
     return factors.replace(
         lights=hessian.lights.to(factors.lights), shading=hessian.shading.to(factors.shading)
@@ -252,7 +241,7 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
     regularization = problem.regularization.double()[..., None].expand(-1, -1, rank).flatten(1)
     total = total + torch.diag_embed(regularization)
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
-    size = max(1, _CHUNK_ENTRIES // (batch * views * rank * len(hessian.columns)))
+    size = max(1, 10_000_000 // (batch * views * rank * len(hessian.columns)))
     for first in range(0, N.shape[2], size):
         part = slice(first, first + size)
         mixed = torch.stack(
@@ -267,7 +256,8 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
         total = total - mixed.flatten(2) @ (
             (mixed[..., None, :] @ hessian.inverse[:, None, part])[..., 0, :].flatten(2).mT
         )
-    ridge = _RIDGE * mean.clamp_min(1e-300)
+    # Undetermined directions, as Lorentz transformations of free lights, do not move.
+    ridge = 1e-10 * mean.clamp_min(1e-300)
     return total + torch.diag_embed(ridge[:, None].expand(-1, views * rank))
 
 

@@ -9,17 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.image_samples import MIN_SPREAD
-from pimper_torch.photometry.left_out import left_out, predicts_better
+from pimper_torch.kernels.twin_constants import MIN_DEVIATION
+from pimper_torch.photometry.light_models import left_out, predicts_better
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
 # Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
 # sensor's noise is most of its residuals. Views that near to the median are of one exposure, as
 # lamps move and fall off. Choices.
 _MOST_STOPS, _SAME_STOPS = 3.0, 1.5
-
-# Solutions, with Cauchy's weights from the residuals before: a choice.
-_ITERATIONS = 8
 
 
 @torch.no_grad()
@@ -48,7 +45,7 @@ def light_colours(
     misfits = []
     for free in (False, True):
         colour, albedo = _fit(chroma, seen & ~test, free)
-        off = (chroma - albedo[:, None] - colour).norm(dim=2).clamp_min(MIN_SPREAD)
+        off = (chroma - albedo[:, None] - colour).norm(dim=2).clamp_min(MIN_DEVIATION)
         misfits.append(torch.where(test, off, torch.nan).nanmedian(dim=0).values)
     if not predicts_better(misfits[1], misfits[0]):
         return white
@@ -94,7 +91,7 @@ def _fit(
         free: Whether views have terms at all.
     """
     colour, weight = chroma.new_zeros(chroma.shape[1:]), seen.to(chroma)
-    for _ in range(_ITERATIONS):
+    for _ in range(8):
         total = weight.sum(dim=1, keepdim=True).clamp_min(1e-300)
         if free:
             matrix = torch.diag(weight.sum(dim=0)) - weight.mT @ (weight / total)
@@ -104,6 +101,6 @@ def _fit(
             colour = colour - colour.mean(dim=0)
         albedo = torch.einsum("sv,svc->sc", weight, chroma - colour) / total
         off = (chroma - albedo[:, None] - colour).norm(dim=2) * seen
-        scale = CAUCHY_TUNING * robust_deviation(off.mT, seen.mT).clamp_min(MIN_SPREAD)
+        scale = CAUCHY_TUNING * robust_deviation(off.mT, seen.mT).clamp_min(MIN_DEVIATION)
         weight = seen * cauchy_weights(off, scale)
     return colour, albedo

@@ -4,6 +4,7 @@ By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the 
 with Cauchy's loss; gradients by the implicit function theorem at the optimum.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -11,18 +12,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pimper_torch.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.linalg.implicit import implicit_solution, newton_solution
-from pimper_torch.photometry.image_samples import MIN_SPREAD, ImageSamples
-from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
+from pimper_torch.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's
 # method converges to rounding (`tests/photometry/test_factor_gradients.py`).
 _MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
-
-# Fraction of the diagonal added to the normal equations as a preconditioner, a choice: the free
-# factor of light and albedo makes them singular.
-_PRECONDITIONER_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +39,7 @@ class LightFit:
         """
         residual = samples.radiance - self.albedo[:, None] * self.model.shade(self.lights)
         relative = residual.abs() / samples.level.clamp_min(1e-300)
-        missing = torch.where(some, relative.clamp_min(MIN_SPREAD), torch.nan)
+        missing = torch.where(some, relative.clamp_min(MIN_DEVIATION), torch.nan)
         return missing.nanmedian(dim=0).values
 
 
@@ -130,7 +127,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
         residual = samples.residual(found.albedo, shading)
         weight = samples.weights(residual, samples.scale(residual))
         by_lights = found.albedo[:, None, None] * model.jacobian(found.lights)
-        normal = _normal_equations(shading, by_lights, weight, _PRECONDITIONER_DAMPING)
+        solve = _gauss_newton(shading, by_lights, weight)
         observed = (weight * shading**2).sum(dim=1) > 0
         fixed = ~torch.cat([model.inside_bounds(found.lights).flatten(), observed])
         flat = found.lights.abs().flatten()
@@ -141,7 +138,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
 
     def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
         inner = torch.where(fixed, 0, side)
-        lights, albedo = normal.solve(inner[:count].reshape(found.lights.shape), inner[count:])
+        lights, albedo = solve(inner[:count].reshape(found.lights.shape), inner[count:])
         return -torch.where(fixed, side, torch.cat([lights.flatten(), albedo]))
 
     solution = newton_solution(equations, start, precondition)
@@ -153,42 +150,21 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NormalEquations:
-    """The normal equations of lights and albedos, albedos eliminated (Schur).
-
-    Attributes:
-        cross: Block of albedos and lights' parameters.
-        inverse: Of the diagonal block of the albedos.
-        factor: Of the Schur complement, by ``torch.linalg.lu_factor``.
-    """
-
-    cross: Float[Tensor, "sample unknown"]
-    inverse: Float[Tensor, " sample"]
-    factor: tuple[Tensor, Tensor]
-
-    def solve(
-        self, on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
-    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-        """Solve for both."""
-        rhs = on_lights.flatten() - self.cross.mT @ (self.inverse * on_albedo)
-        step = torch.linalg.lu_solve(*self.factor, rhs[:, None])[:, 0]
-        return step.reshape(on_lights.shape), self.inverse * (on_albedo - self.cross @ step)
-
-
-def _normal_equations(
+def _gauss_newton(
     shading: Float[Tensor, "sample view"],
     jacobian: Float[Tensor, "sample view parameter"],
     weight: Float[Tensor, "sample view"],
-    damping: float,
-) -> _NormalEquations:
-    """Assemble Gauss-Newton's equations, and factor their Schur complement.
+) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Factor Gauss-Newton's equations of lights and albedos, these eliminated (Schur).
 
     Args:
         shading: Radiance of albedo 1, which is the derivative by the albedos.
         jacobian: The derivatives by the parameters of the lights.
-        damping: Fraction of the diagonal that is added to it.
+
+    Returns:
+        The solution by right-hand sides of lights and albedos.
     """
+    damping = 1e-6  # the free factor of light and albedo makes them singular
     _, num_views, size = jacobian.shape
     heavy = weight[..., None] * jacobian
     blocks = heavy.permute(1, 2, 0) @ jacobian.transpose(0, 1)
@@ -206,6 +182,13 @@ def _normal_equations(
     blocks_of_views[view, :, view, :] = damped
     schur = blocks_of_views.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
-    return _NormalEquations(
-        cross=cross, inverse=inverse, factor=torch.linalg.lu_factor(schur + ridge)
-    )
+    factor = torch.linalg.lu_factor(schur + ridge)
+
+    def solve(
+        on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
+    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+        rhs = on_lights.flatten() - cross.mT @ (inverse * on_albedo)
+        step = torch.linalg.lu_solve(*factor, rhs[:, None])[:, 0]
+        return step.reshape(on_lights.shape), inverse * (on_albedo - cross @ step)
+
+    return solve

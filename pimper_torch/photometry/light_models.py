@@ -1,13 +1,197 @@
-"""Parametric models of each view's light: spherical harmonics, and a near point light."""
+"""Parametric models of each view's light, and the samples that they are fitted to.
 
+Light is spherical harmonics and a near point light. Its parameters are paid for by radiance that
+was left out of the fit.
+
+Attached shadows give the fit of a point light's direction many local minima: started along the
+mean normal, it ended 30 to 70 degrees from the point light in six of nine views of a potato on a
+table, with twice the residuals. So it starts from the best of all directions.
+"""
+
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.photometry.image_samples import ImageSamples
-from pimper_torch.photometry.point_light_search import search_point_lights
+from pimper_torch.geometry.directions import even_directions
+from pimper_torch.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
+from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
+
+# Residuals have to fall by so many standard errors over the views, 99.7 % confidence, and by this
+# fraction at least, a choice: what won less on glossy scenes was no light.
+_CONFIDENCE, _LEAST = 3.0, 0.05
+
+
+def left_out(seen: Bool[Tensor, "sample view"]) -> Bool[Tensor, "sample view"]:
+    """Choose what to leave out: of each sample and each view a fifth."""
+    sample, view = (torch.arange(size, device=seen.device) for size in seen.shape)
+    return seen & ((sample[:, None] + view) % 5 == 0)
+
+
+def predicts_better(misfit: Float[Tensor, " view"], simpler: Float[Tensor, " view"]) -> bool:
+    """Decide whether a model predicts better than a simpler one, significantly.
+
+    Args:
+        misfit: Residuals of what was left out, one a view; NaN where there is none.
+        simpler: Those of the simpler model.
+    """
+    gain = (simpler / misfit).log()
+    gain = gain[gain.isfinite()]
+    if len(gain) < 2:
+        return False
+    error = float(gain.std()) / math.sqrt(len(gain))
+    return float(gain.mean()) > max(_CONFIDENCE * error, _LEAST)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSamples:
+    """Radiance of samples in all views.
+
+    Attributes:
+        radiance: Gray, linear; zero where not seen.
+        seen: False where missing.
+    """
+
+    radiance: Float[Tensor, "sample view"]
+    seen: Bool[Tensor, "sample view"]
+
+    def at(self, index: slice | tuple[slice, slice]) -> "ImageSamples":
+        """Take some samples, or some samples in some views."""
+        return ImageSamples(radiance=self.radiance[index], seen=self.seen[index])
+
+    @cached_property
+    def level(self) -> Float[Tensor, " view"]:
+        """Mean brightness of each view."""
+        return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
+
+    def residual(
+        self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Return the residuals of a model of albedo and shading; zero where not seen."""
+        return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
+
+    def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
+        """Return the scale of Cauchy's loss for each view."""
+        least = MIN_DEVIATION * self.level
+        return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
+
+    def weights(
+        self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
+    ) -> Float[Tensor, "sample view"]:
+        """Return Cauchy's weights; zero where not seen."""
+        return self.seen * cauchy_weights(residual, scale)
+
+    def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
+        """Return median radiance of each view, and of each sample relative to its views."""
+        missing = torch.where(self.seen, self.radiance, torch.nan)
+        gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
+        known = self.seen & (gain > 0)
+        ratio = torch.where(known, self.radiance / gain.clamp_min(1e-300), torch.nan)
+        albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
+        return gain, torch.where(known.any(dim=1), albedo, 0)
+
+    def albedo_under(
+        self, shading: Float[Tensor, "sample view"], weight: Float[Tensor, "sample view"]
+    ) -> Float[Tensor, " sample"]:
+        """Return the weighted least-squares albedo under a shading; NaN without weight."""
+        square = (weight * shading**2).sum(dim=1)
+        product = (weight * shading * self.radiance).sum(dim=1)
+        return torch.where(square > 0, product / torch.where(square > 0, square, 1), torch.nan)
+
+
+# Directions, 10 degrees apart; samples at most; and iterations of the weights, which samples in
+# cast shadow lose, and of albedo: no direction changed after the third.
+_DIRECTIONS, _SAMPLES, _ITERATIONS = 400, 2000, 3
+
+# Among directions whose costs differ by less than this fraction of the radiance's energy, the one
+# nearest to the mean normal is taken, as where the samples lie in a plane. A point light weaker
+# than this fraction of the ambient light counts as none: albedo alone explains the radiance. A
+# choice.
+_TIE = 1e-3
+
+
+def search_point_lights(
+    samples: ImageSamples, normals: Float[Tensor, "sample 3"]
+) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
+    r"""Search the direction of each view's point light, taken to be distant.
+
+    For albedo initialized by the samples' brightest views, ambient light :math:`a` and the point
+    light's strength :math:`s` minimize
+    :math:`\sum_i w_i (x_i - \rho_i (a + s \max(0, n_i \cdot d)))^2` in closed form for every
+    direction :math:`d`. The best direction is taken; then weights and albedo are updated.
+
+    Args:
+        normals: Unit, world.
+
+    Returns:
+        Ambient light, not negative, and the point light's irradiance vector, for each view; and
+        the samples' albedo. A constant to autograd.
+    """
+    stride = -(-len(normals) // _SAMPLES)
+    subset = samples.at(slice(None, None, stride))
+    directions = even_directions(_DIRECTIONS).to(normals)
+    facing = (normals[::stride] @ directions.mT).clamp_min(0)
+    mean = normals.mean(dim=0)
+    mean_direction = mean / mean.norm().clamp_min(1e-12)
+    off_mean = _TIE * (1 - directions @ mean_direction)
+    missing = torch.where(subset.seen, subset.radiance, torch.nan)
+    # A sample is taken to be lit in more than a fifth of the views.
+    albedo = missing.nanquantile(0.8, dim=1).nan_to_num(nan=0.0)
+    weight = subset.seen.to(normals)
+    for _ in range(_ITERATIONS):
+        ambient, strength, remaining = _fit_directions(subset, albedo, facing, weight)
+        power = (weight * subset.radiance**2).sum(dim=0)[:, None]
+        best = (remaining + power * off_mean).argmin(dim=1, keepdim=True)
+        ambient, strength = ambient.gather(1, best)[:, 0], strength.gather(1, best)[:, 0]
+        shading = ambient + strength * facing[:, best[:, 0]]
+        residual = subset.residual(albedo, shading)
+        weight = subset.weights(residual, subset.scale(residual))
+        albedo = subset.albedo_under(shading, weight).nan_to_num(nan=0.0)
+    point_light = strength[:, None] * directions[best[:, 0]]
+    absent = strength <= _TIE * ambient
+    point_light = torch.where(absent[:, None], ambient[:, None] * mean_direction, point_light)
+    ambient = torch.where(absent, 0.2 * ambient, ambient)  # the rest is the point light's
+    lights = torch.cat([ambient[:, None], point_light], dim=1)
+    shading = lights[:, 0] + (normals @ lights[:, 1:].mT).clamp_min(0)
+    all_albedo = samples.albedo_under(shading, samples.seen.to(normals))
+    return lights, all_albedo.nan_to_num(nan=0.0)
+
+
+def _fit_directions(
+    samples: ImageSamples,
+    albedo: Float[Tensor, " sample"],
+    facing: Float[Tensor, "sample direction"],
+    weight: Float[Tensor, "sample view"],
+) -> tuple[
+    Float[Tensor, "view direction"],
+    Float[Tensor, "view direction"],
+    Float[Tensor, "view direction"],
+]:
+    """Return ambient light, strength and sum of squared residuals for every direction."""
+    J = samples.radiance
+    lit = albedo[:, None] * facing
+    own = (weight * albedo[:, None] ** 2).sum(dim=0)[:, None]
+    cross = (weight * albedo[:, None]).mT @ lit
+    square = weight.mT @ lit**2
+    on_ambient = (weight * J * albedo[:, None]).sum(dim=0)[:, None]
+    on_light = (weight * J).mT @ lit
+    tiny = torch.finfo(J.dtype).tiny
+    determinant = own * square - cross**2
+    known = determinant > 1e-9 * own * square
+    ambient = (on_ambient * square - on_light * cross) / determinant.clamp_min(tiny)
+    # One of them alone where they are collinear, or where the other would be negative.
+    ambient = torch.where(known, ambient, 0).clamp_min(0)
+    strength = ((on_light - ambient * cross) / square.clamp_min(tiny)).clamp_min(0)
+    dark = (strength == 0) | (square <= tiny)
+    strength = torch.where(dark, 0, strength)
+    ambient = torch.where(dark, on_ambient / own.clamp_min(tiny), ambient)
+    explained = 2 * (ambient * on_ambient + strength * on_light)
+    used = ambient**2 * own + 2 * ambient * strength * cross + strength**2 * square
+    return ambient, strength, (weight * J**2).sum(dim=0)[:, None] - explained + used
+
 
 # Initial and minimum distance of a point light, in mean distances of the samples from their
 # centroid: choices; inside the scene its irradiance has a pole.

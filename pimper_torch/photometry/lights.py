@@ -19,33 +19,21 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.geometry.rigid import invert_rigid, transform
-from pimper_torch.photometry.harmonics import harmonics, second_harmonics
-from pimper_torch.photometry.image_samples import ImageSamples
-from pimper_torch.photometry.left_out import left_out, predicts_better
 from pimper_torch.photometry.light_colour import exposures, light_colours
-from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.light_field import LightField, harmonics, second_harmonics
 from pimper_torch.photometry.light_fit import LightFit, fit_lights, with_gradients
-from pimper_torch.photometry.light_models import LightModel
+from pimper_torch.photometry.light_models import ImageSamples, LightModel, left_out, predicts_better
 from pimper_torch.records import PatchSet, PatchViews, Templates
 
 # Models by their number of parameters.
 LightName = Literal["auto", "soft", "point_light", "room"]
 _MODELS = "soft", "point_light", "room"
 
-# Fits of the room's harmonics and of all else take turns, so many times: a choice.
-_ROOM_ITERATIONS = 8
-
-# Models are tried on about this many samples: a choice.
-_TRIED = 2500
-
-# Maximum number of samples that the light is fitted to: a choice, 2,000 per parameter.
-LIGHT_SAMPLES = 10_000
-
 # Maximum number of views whose lights are fitted together, as time grows with its cube: a choice.
 _TOGETHER = 80
 
-# Thinned templates keep this multiple of LIGHT_SAMPLES on their facets: some are in no view.
-_SPARE = 2
+# Maximum number of samples that the light is fitted to: a choice, 2,000 per parameter.
+LIGHT_SAMPLES = 10_000
 
 
 def thinned(patches: PatchSet) -> PatchSet:
@@ -59,7 +47,7 @@ def thinned(patches: PatchSet) -> PatchSet:
         Templates with fewer rows and columns; the samples have the same positions.
     """
     own = sum(int((each.barycentric >= 0).all(dim=-1).sum()) for each in patches.buckets)
-    step = max(1, math.isqrt(own // (_SPARE * LIGHT_SAMPLES)))
+    step = max(1, math.isqrt(own // (2 * LIGHT_SAMPLES)))  # some samples are in no view
     return patches.replace(buckets=tuple(_subsampled(each, step) for each in patches.buckets))
 
 
@@ -168,7 +156,7 @@ def fit_light_field(
     size = _mean_distance(positions - origin)
     geometry = own_normals, (positions - origin) / size
     step = -(-views // _TOGETHER)
-    groups = [_every(samples, step, first) for first in range(step)]
+    groups = [samples.at((slice(None), slice(first, None, step))) for first in range(step)]
     name = _selected(groups[0], *geometry, iterations) if model == "auto" else model
     fits = [_lights(name, group, *geometry, iterations) for group in groups]
     scales = [1.0, *(_ratio(each[2], fits[0][2]) for each in fits[1:])]
@@ -186,12 +174,6 @@ def fit_light_field(
         point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
-
-
-def _every(samples: ImageSamples, step: int, first: int) -> ImageSamples:
-    """Take every so many-th view."""
-    some = slice(first, None, step)
-    return ImageSamples(radiance=samples.radiance[:, some], seen=samples.seen[:, some])
 
 
 def _ratio(
@@ -246,7 +228,7 @@ def _fit(
     if name == "point_light":
         return found, each[:1]
     room = each[:1]
-    for _ in range(_ROOM_ITERATIONS):
+    for _ in range(8):
         room = _fit_room(found, samples, basis, room)
         model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
         found = fit_lights(model, samples, iterations, (found.lights, found.albedo))
@@ -284,9 +266,9 @@ def _selected(
     iterations: int,
 ) -> str:
     """Select the model by its residuals where radiance is left out of the fit."""
-    few = slice(None, None, -(-len(normals) // _TRIED))
+    few = slice(None, None, -(-len(normals) // 2500))
     normals, points = normals[few], points[few]
-    every = ImageSamples(radiance=samples.radiance[few], seen=samples.seen[few])
+    every = samples.at(few)
     test = left_out(every.seen)
     seen = every.seen & ~test
     rest = ImageSamples(radiance=torch.where(seen, every.radiance, 0), seen=seen)

@@ -8,19 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
+from pimper_torch.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
+from pimper_torch.kernels.twin_constants import (
+    GAUSSIAN_SCALE,
+    LONGEST_NEWTON_STEP,
+    NEWTON_STEPS,
+)
 from pimper_torch.linalg.sums import along_last
-
-# Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
-# (Holland & Welsch, 1977).
-CAUCHY_TUNING = 2.385
-
-# The M-estimate of scale of unit Gaussian noise: the root of its equation's expectation, checked in
-# `test_robust.py`.
-_GAUSSIAN_SCALE = 0.6472404
-
-# Newton's steps at most, and their longest, in logarithms of the squared scale: a choice; started
-# at the mean square, few outliers need more than ten.
-_NEWTON_STEPS, _MAX_STEP = 40, 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +124,7 @@ def robust_variance(
     correction = (along_last(fraction) - half) / torch.where(slope > 0, slope, 1)
     # One more Newton step, of length about zero: its derivative is the implicit function's.
     variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
-    return torch.where(determined, variance / _GAUSSIAN_SCALE**2, 0)
+    return torch.where(determined, variance / GAUSSIAN_SCALE**2, 0)
 
 
 @torch.no_grad()
@@ -141,11 +135,11 @@ def _scale_of_squares(
     scale = along_last(square) / square.shape[-1]
     scale = torch.where(scale > 0, scale, 1)
     close = torch.finfo(square.dtype).eps ** 0.75
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         fraction = _fractions(square, scale[..., None])
         slope = 2 * (along_last(fraction) - along_last(fraction.square()))
         step = (along_last(fraction) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
-        scale = scale * step.clamp(-_MAX_STEP, _MAX_STEP).exp()
+        scale = scale * step.clamp(-LONGEST_NEWTON_STEP, LONGEST_NEWTON_STEP).exp()
         if bool((step.abs() < close).all()):
             break
     return scale

@@ -12,12 +12,6 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.records import Record
 
-# Rays around a sample that detect a shadow edge near it: a choice.
-_RING = 6
-
-# Rays that are cast together: a choice, about 100 MB of memory.
-_RAYS_AT_ONCE = 1_000_000
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shadows(Record):
@@ -45,8 +39,7 @@ def cast_shadows(
     """Cast a ray from every sample to the point light of every view.
 
     Args:
-        caster: The surface that casts the shadows.
-        points: World; on that surface or near it.
+        points: World; on the surface that casts the shadows, or near it.
         normals: Unit, outward.
         tolerance: Maximum distance of the points from the surface, scene units: rays start so far
             along the normal, and as far again towards the point light. An object thinner than
@@ -72,8 +65,7 @@ def cast_shadows(
     sure = torch.ones_like(lit)
     shines = field.point_light.norm(dim=1) > 0
     needed = lit & shines if mask is None else mask.reshape(-1, views) & shines
-    at_once = max(1, _RAYS_AT_ONCE // (1 if ring is None else 1 + _RING))
-    for batch in torch.split(needed.mT.nonzero(), at_once):
+    for batch in torch.split(needed.mT.nonzero(), 150_000):  # a million rays, 100 MB
         view, sample = batch.unbind(dim=1)
         towards, _ = _direction_to_light(field, view, flat[sample])
         facing = (towards * up[sample]).sum(dim=-1) > 0
@@ -95,64 +87,47 @@ def cast_shadows_on_rasters(
     points: Float[Tensor, "patch height width 3"],
     normals: Float[Tensor, "patch height width 3"],
     spacing: Float[Tensor, " patch"],
+    seen: Bool[Tensor, "patch view height width"],
     *,
     tolerance: float | Float[Tensor, " patch"],
-    guard: float = 0.0,
+    guard: float,
     stride: int = 4,
-    mask: Bool[Tensor, "patch height width"] | None = None,
-    seen: Bool[Tensor, "patch view height width"] | None = None,
 ) -> Shadows:
     """Predict shadows on templates from a sparse raster of rays.
 
     See :func:`cast_shadows`. A sample without a ray takes the result of the nearest ray; the
-    guard, if any, grows by the distance between the two.
+    guard grows by the distance between the two.
 
     Args:
-        caster: The surface that casts the shadows.
-        points: World, of every sample.
+        points: World.
         normals: World, unit, outward.
-        spacing: Of the samples, scene units.
-        tolerance: Scene units.
-        guard: Scene units.
-        mask: Where rays are cast; elsewhere everything is lit and sure.
-        seen: In which views rays are cast, sample by sample.
+        spacing: Of the samples, scene units, as tolerance and guard.
+        seen: In which views rays are cast; elsewhere everything is lit and sure.
 
     Returns:
         Of shape ``patch height width view``.
     """
     height, width = points.shape[1:3]
-    rows, columns = _ray_indices(height, stride, points), _ray_indices(width, stride, points)
-    needed = points.new_ones(points.shape[:3], dtype=torch.bool) if mask is None else mask
-    chosen = _any_in_blocks(needed[:, None], stride)[:, 0]
-    views = None if seen is None else _any_in_blocks(seen, stride).movedim(1, -1)[chosen]
-    patch, row, column = chosen.nonzero(as_tuple=True)
+    rows, columns = (
+        (torch.arange(0, size, stride, device=points.device) + stride // 2).clamp_max(size - 1)
+        for size in (height, width)
+    )
+    needed = max_pool2d(seen.float(), stride, ceil_mode=True).movedim(1, -1) > 0
+    blocks = needed.any(dim=-1)
+    patch, row, column = blocks.nonzero(as_tuple=True)
     index = patch, rows[row], columns[column]
     offset = torch.as_tensor(tolerance).to(points).expand(len(points))
-    margin = guard + 2**0.5 * (stride // 2) * spacing if guard > 0 else torch.zeros_like(spacing)
+    margin = guard + 2**0.5 * (stride // 2) * spacing
     cast = cast_shadows(
-        field, caster, points[index], normals[index], offset[patch], margin[patch], views
+        field, caster, points[index], normals[index], offset[patch], margin[patch], needed[blocks]
     )
 
     def spread_out(sparse: Bool[Tensor, "ray view"]) -> Bool[Tensor, "patch height width view"]:
-        blocks = torch.ones(*chosen.shape, sparse.shape[1], dtype=torch.bool, device=sparse.device)
-        blocks[chosen] = sparse
-        dense = blocks.repeat_interleave(stride, dim=1).repeat_interleave(stride, dim=2)
+        dense = torch.ones_like(needed).index_put((blocks,), sparse)
+        dense = dense.repeat_interleave(stride, dim=1).repeat_interleave(stride, dim=2)
         return dense[:, :height, :width]
 
     return Shadows(lit=spread_out(cast.lit), sure=spread_out(cast.sure))
-
-
-def _any_in_blocks(
-    valid: Bool[Tensor, "patch view height width"], stride: int
-) -> Bool[Tensor, "patch view rows columns"]:
-    """Find which blocks of ``stride`` by ``stride`` samples have any true sample."""
-    return max_pool2d(valid.float(), stride, ceil_mode=True) > 0
-
-
-def _ray_indices(size: int, stride: int, like: Float[Tensor, "..."]) -> Int[Tensor, " ray"]:
-    """Return the index, in each block of ``stride`` samples, that a ray is cast from."""
-    first = torch.arange(0, size, stride, device=like.device)
-    return (first + stride // 2).clamp_max(size - 1)
 
 
 def _direction_to_light(
@@ -188,8 +163,8 @@ def _hexagon(
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first_axis = normalize(torch.linalg.cross(axis, normals), dim=1)
     second_axis = torch.linalg.cross(normals, first_axis)
-    angle = 2 * math.pi * torch.arange(_RING).to(normals) / _RING
-    reach = radius[:, None, None] / math.cos(math.pi / _RING)
+    angle = 2 * math.pi * torch.arange(6).to(normals) / 6
+    reach = radius[:, None, None] / math.cos(math.pi / 6)
     return reach * (
         angle.cos()[:, None] * first_axis[:, None] + angle.sin()[:, None] * second_axis[:, None]
     )

@@ -23,36 +23,30 @@ from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.kernels.twin_constants import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    INITIAL_DAMPING,
+    SHADING_STEPS,
+    ZERO_ROUNDINGS,
+)
 from pimper_torch.photometry.bilinear import (
+    RUNNING,
     Bilinear,
     Factors,
+    State,
     curvature_of_views,
     equations_of_samples,
     evaluate,
+    iterate,
     keep_scale,
     robust_weights,
     update_shading,
 )
-from pimper_torch.photometry.iteration import RUNNING, State, iterate
-from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, StopCause
-
-# Initial damping, as a fraction of the mean curvature, and the factors by which it falls and
-# rises. Of initial values from 1e-4 to 1e-2 and factors from 3 to 10 these led most random starts
-# to the best minimum known (9 of 10 on dino_trimmed; 10 and 1e-3 led 5 there).
-_INITIAL_DAMPING = 1e-2
-_DAMPING_DECREASE, _DAMPING_INCREASE = 0.2, 5.0
-
-# Gauss-Newton steps of the shading vectors after each step of the lights: a choice.
-_SHADING_STEPS = 2
-
-# Residuals below this many roundings of the data count as zero: a choice.
-_ZERO_ROUNDINGS = 30.0
-
-# Products of pairs of views, over all samples, that are in memory at once: a choice.
-_GROUP_ENTRIES = 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -146,15 +140,15 @@ def _step(
     else:
         moved, shading = keep_scale(problem, state.lights, moved, shading)
     equations = equations_of_samples(problem, moved, state.weight)
-    shading = update_shading(problem, *equations, shading, _SHADING_STEPS)
+    shading = update_shading(problem, *equations, shading, SHADING_STEPS)
     after, slope = evaluate(problem, moved, shading, state.weight)
     better = after < state.cost
     gain = (state.cost - after) / state.cost.clamp_min(torch.finfo(after.dtype).tiny)
     small = torch.where(gain < tolerance, state.small + 1, 0)
     small = torch.where(better, small, state.small)
     limit = torch.finfo(after.dtype).eps
-    damping = state.damping * torch.where(better, _DAMPING_DECREASE, _DAMPING_INCREASE).to(after)
-    exact = state.cost <= (_ZERO_ROUNDINGS * limit) ** 2 * state.energy
+    damping = state.damping * torch.where(better, DAMPING_DECREASE, DAMPING_INCREASE).to(after)
+    exact = state.cost <= (ZERO_ROUNDINGS * limit) ** 2 * state.energy
     stalled = (damping > 1 / limit) & ~exact
     state = state.replace(small=small, damping=damping.clamp_min(limit))
     if bool(better.any()):
@@ -175,7 +169,7 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
     lights = torch.linalg.qr(problem.lights).Q if _is_free(problem) else problem.lights
     weight = robust_weights(problem, lights, problem.shading)
     equations = equations_of_samples(problem, lights, weight)
-    shading = update_shading(problem, *equations, problem.shading, _SHADING_STEPS)
+    shading = update_shading(problem, *equations, problem.shading, SHADING_STEPS)
     cost, slope = evaluate(problem, lights, shading, weight)
     seen = (weight * problem.radiance).flatten(1)
     state = _State(
@@ -186,7 +180,7 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
         cost=cost,
         slope=slope,
         curvature=lights.new_zeros(len(lights), 0, 0),
-        damping=torch.full_like(cost, _INITIAL_DAMPING),
+        damping=torch.full_like(cost, INITIAL_DAMPING),
         small=torch.zeros_like(cost).long(),
     )
     return state.replace(curvature=_curvature(problem, state, curvature_samples))
@@ -238,7 +232,7 @@ def _eliminated(
     rank = shading.shape[1]
     pairs = outer(shading)
     blocks = shading.new_zeros(batch, views, views, pairs.shape[1])
-    group = max(1, _GROUP_ENTRIES // (views * samples))
+    group = max(1, 100_000 // (views * samples))
     for view in range(0, views, group):
         some = slice(view, view + group)
         factors = [(rows[:, some, None], rows[:, None, view:]) for rows in white]
@@ -284,7 +278,7 @@ def _solve_by_kernel(
     small_steps: int,
     curvature_samples: int | None,
 ) -> Factors:
-    from pimper_torch.kernels.factorization import solve_on_cone
+    from pimper_torch.kernels import factorization
 
     J, prior = problem.radiance, problem.prior
     if prior is None:
@@ -296,24 +290,14 @@ def _solve_by_kernel(
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
-    solve_on_cone(
-        as_array(J),
-        as_array(problem.weight),
-        as_array(problem.anchor),
-        as_array(problem.regularization),
-        as_array(prior),
+    data = J, problem.weight, problem.anchor, problem.regularization, prior
+    results = lights, shading, weight, taken, residual, cause
+    factorization.solve_on_cone(
+        factorization.ConeProblem(*map(as_array, data)),
         0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
         problem.stride,
-        max_iterations,
-        tolerance,
-        small_steps,
-        curvature_samples or 0,
-        lights.numpy(),
-        shading.numpy(),
-        weight.numpy(),
-        taken.numpy(),
-        residual.numpy(),
-        cause.numpy(),
+        factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
+        factorization.ConeSolution(*(each.numpy() for each in results)),
     )
     convergence = Convergence(iterations=taken, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)

@@ -22,9 +22,6 @@ _ADDED = re.compile(
     re.IGNORECASE,
 )
 _OF_VARIANCE = re.compile(rf"[ _.-]{VARIANCE}$", re.IGNORECASE)
-# Networks round sides to multiples of up to 32 pixels: of the shortest usual side, 518, a
-# sixteenth, up or down, of which half is off on either side.
-_OTHER_SHAPE = 0.07
 
 
 def read_maps(
@@ -117,9 +114,12 @@ def _matched(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 def _require_shape(path: Path, values: np.ndarray, name: str, width: int, height: int) -> None:
     high, wide = values.shape[:2]
-    if abs(wide * height / (high * width) - 1) <= _OTHER_SHAPE:
+    # Networks round sides to multiples of up to 32 pixels: of the shortest usual side, 518, a
+    # sixteenth, up or down, of which half is off on either side.
+    most = 0.07
+    if abs(wide * height / (high * width) - 1) <= most:
         return
-    turned = abs(wide * width / (high * height) - 1) <= _OTHER_SHAPE
+    turned = abs(wide * width / (high * height) - 1) <= most
     why = (
         "it seems made of the pixels that the file stores; turn them as EXIF says before"
         if turned

@@ -15,7 +15,6 @@ FORMATS = (".npz", ".npy", ".exr", *PICTURES)
 """Of several files of one photograph, the first of these is read: least is lost in it."""
 
 VARIANCE = "variance"
-_MOGE_LEVELS = 65533  # of 65535: 0 is unknown, the last is infinitely far
 
 
 def read_layers(
@@ -102,7 +101,7 @@ def _picture(path: Path, cut_out: bool) -> np.ndarray:
         near, far = (image.info.get(name) for name in ("near", "far"))
     if near is not None and far is not None and decoded.bits == 16:
         levels = np.rint(values * decoded.full)
-        part = (levels - 1) / _MOGE_LEVELS
+        part = (levels - 1) / 65533  # 0 is unknown, 65535 infinitely far
         values = np.float32(near) ** (1 - part) * np.float32(far) ** part
         unknown = (levels == 0) | (levels == decoded.full)
         values = np.where(unknown, np.float32(np.nan), values)

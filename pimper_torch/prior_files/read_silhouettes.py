@@ -12,11 +12,7 @@ from pimper_torch.priors.from_maps import silhouettes_from, stacked
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.size.given import Mark, number_of, require_inside
 
-_BYTE = 255
-_MOST_LABELS = 32  # files of 8 bits whose levels are all below hold labels: all but 0 is object
 _KINDS = ("mask", "silhouette", "alpha", "inside")  # how names of arrays begin
-_UNKNOWN = 0.5
-_RASTER, _REACH = 512, 1  # longer side of a click's map, and its pixels to each side
 
 
 def read_silhouettes(
@@ -48,8 +44,9 @@ def _chance(path: Path, values: np.ndarray) -> np.ndarray:
             f"{path}: holds values from {low:g} to {high:g}; needed: the probability of the "
             "object, from 0 to 1. A network's logits go through a sigmoid first."
         )
-    levels = _BYTE * known
-    if 0 < high < _MOST_LABELS / _BYTE and np.allclose(levels, np.rint(levels), atol=1e-3):
+    levels = 255 * known
+    # Files of 8 bits whose levels are all below 32 hold labels: all but 0 is the object.
+    if 0 < high < 32 / 255 and np.allclose(levels, np.rint(levels), atol=1e-3):
         return (values > 0).astype(np.float32)
     return values
 
@@ -69,11 +66,10 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
         size = views.sizes_px[view].tolist()
         full = pointer.size_px or size
         require_inside(pointer, *full)
-        scale = min(1.0, _RASTER / max(size))
+        scale = min(1.0, 512 / max(size))
         width, height = (max(1, round(scale * side)) for side in size)
-        inside = maps.setdefault(view, torch.full((height, width, 1), _UNKNOWN))
+        inside = maps.setdefault(view, torch.full((height, width, 1), 0.5))
         column = min(int(pointer.x * width / full[0]), width - 1)
         row = min(int(pointer.y * height / full[1]), height - 1)
-        around = slice(max(0, row - _REACH), row + _REACH + 1)
-        inside[around, max(0, column - _REACH) : column + _REACH + 1] = 1
+        inside[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = 1
     return silhouettes_from(stacked({views.names[view]: (one, None) for view, one in maps.items()}))

@@ -35,7 +35,6 @@ _OURS = (False, "axis", "scene")
 # median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
 # are too coarse for; relative depth that clouds are good to at best.
 _FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
-_TO_DEVIATION = 1.4826  # of the median absolute value of Gaussian noise
 
 
 def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
@@ -109,7 +108,7 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
     off = lines.new_zeros(len(prior.names))
     for one in torch.unique(seen.place[:, 0]).tolist():
-        off[one] = _TO_DEVIATION * errors[best, gauge, seen.place[:, 0] == one].median()
+        off[one] = 1.4826 * errors[best, gauge, seen.place[:, 0] == one].median()  # of Gaussians
     return _in_scene(prior, scene, along, inverse, lines[best, gauge], off)
 
 

@@ -22,8 +22,6 @@ NORMALS_ERROR_DEG, DEPTH_ERROR = 25.0, 0.08
 # Lengths of vectors that are normals, blended where maps were resized. Grey, and the colour 0 that
 # marks nothing, are none.
 _SHORTEST, _LONGEST = 0.5, 1.5
-_UNKNOWN = 0.5  # probability of a silhouette where nothing is said
-_RANGE = (0.02, 0.98)  # of the values of a map: its ends may be strays
 
 NormalAxes = Literal["auto", "opencv", "opengl", "lub", "dsine", "world"]
 _AXES: dict[NormalAxes, Axes | None] = {"auto": None, "dsine": "lub", "world": "opencv"}
@@ -103,8 +101,11 @@ def depth_from(
     values = torch.where(known, values, 0)
     deviation = error * values.detach().abs()
     if inverse is None or gauge == "affine":
+        # The ends of a map's range may be strays.
         spans = [
-            float(np.diff(np.quantile(one[mask].cpu().numpy(), _RANGE))[0]) if mask.any() else 0.0
+            float(np.diff(np.quantile(one[mask].cpu().numpy(), (0.02, 0.98)))[0])
+            if mask.any()
+            else 0.0
             for one, mask in zip(values.detach(), known, strict=True)
         ]
         deviation = (error * values.new_tensor(spans)[:, None, None]).expand_as(values)
@@ -126,7 +127,7 @@ def silhouettes_from(maps: Maps, *, undistorted: bool = False) -> SilhouettePrio
         names=maps.names,
         sizes_px=maps.sizes_px,
         undistorted=undistorted,
-        inside=maps.values[..., 0].nan_to_num(_UNKNOWN),
+        inside=maps.values[..., 0].nan_to_num(0.5),
     )
 
 

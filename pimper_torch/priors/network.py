@@ -57,8 +57,8 @@ def priors_of(
         std: That pictures are divided by then.
         meaning: What else the prior has to state: of normals ``axes`` and ``error_deg``, of depth
             ``inverse``, ``along``, ``gauge`` and ``error``, as
-            :func:`~pimper_torch.prior_files.read_normals.read_normals` and
-            :func:`~pimper_torch.prior_files.read_depth.read_depth` take them; of albedo ``error``,
+            :func:`~pimper_torch.prior_files.read_maps.read_normals` and
+            :func:`~pimper_torch.prior_files.read_maps.read_depth` take them; of albedo ``error``,
             in its own units.
 
     Raises:

@@ -43,7 +43,6 @@ _POINTS, _NEIGHBOURS, _RIM, _INSIDE = 600, 8, 64, 2.0
 # of 160x120) have 0.66 to 0.83, with 30 degrees of noise 0.31 to 0.70; world normals of another
 # world 0.10 at most.
 _LEAST = 0.2
-_AGREEING = 0.9  # length of the mean of a point's normals: they are within 25 degrees of it
 
 
 def settled_normals(
@@ -136,7 +135,8 @@ def _worth(
     worth = means_by(torch.where((found * rays).sum(dim=-1) < 0, flat, -1), seen.point)
     agree = means_by(found.movedim(-1, 1), seen.point).norm(dim=1).mean(dim=-1)
     world, second = agree[_WORLD], agree.sort().values[-2]
-    of_other_world = bool(world > max(float(second), _AGREEING))
+    # A mean of length 0.9: normals are within 25 degrees of it.
+    of_other_world = bool(world > max(float(second), 0.9))
     if silhouettes is not None:  # where these are everything, they have no outlines
         worth = torch.cat([worth, _at_outlines(prior, known, scene, silhouettes)], dim=1)
     return worth, of_other_world

@@ -1,9 +1,17 @@
 """Radiance and the encoded values that files hold: responses, saturation, sRGB."""
 
 from pimper_torch.radiometry.encoding import FROM_FILES, LINEAR, SRGB, Encoding
-from pimper_torch.radiometry.response import Curve, Gamma, Linear, Response, Srgb
+from pimper_torch.radiometry.response import (
+    Curve,
+    Gamma,
+    Linear,
+    Response,
+    Srgb,
+    linear_from_srgb,
+    srgb_from_linear,
+    to_bytes,
+)
 from pimper_torch.radiometry.saturation import SATURATED, find_saturation
-from pimper_torch.radiometry.srgb import linear_from_srgb, srgb_from_linear, to_bytes
 
 __all__ = [
     "FROM_FILES",

@@ -8,11 +8,7 @@ from torch import Tensor
 
 from pimper_torch.radiometry.response import Curve, Gamma, Linear, Response, Srgb
 
-# Half a level of 255: what no file of 8 bits tells from the curve itself.
-_SAME = 0.5 / 255
-_STEPS = 1025
-# Responses that differ by so much of full scale disagree: gamma 2.2 and sRGB do not, by 0.008.
-_DISAGREE = 0.02
+_LEVELS = torch.linspace(0, 1, 1025, dtype=torch.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,19 +34,18 @@ SILENT = Colour()
 
 def plain(response: Response) -> Response:
     """Return the standard response that a file's own cannot be told from, or the file's own."""
-    levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
     known: tuple[Response, ...] = (Linear(), Srgb())
     for standard in known:
-        again = standard.encoded_from_linear(_through(response, levels))
-        if float((again - levels).abs().max()) <= _SAME:
+        again = standard.encoded_from_linear(_through(response))
+        # Half a level of 255 is what no file of 8 bits tells from the curve itself.
+        if float((again - _LEVELS).abs().max()) <= 0.5 / 255:
             return standard
     return response
 
 
 def disagree(one: Response, other: Response) -> bool:
-    """Return whether two responses give radiance that differs by more than 0.02 of full scale."""
-    levels = torch.linspace(0, 1, _STEPS, dtype=torch.float64)
-    return float((_through(one, levels) - _through(other, levels)).abs().max()) > _DISAGREE
+    """Return whether radiance differs by 0.02 of full scale; of gamma 2.2 and sRGB it does not."""
+    return float((_through(one) - _through(other)).abs().max()) > 0.02
 
 
 def told(response: Response) -> str:
@@ -62,7 +57,7 @@ def told(response: Response) -> str:
     return f"{response.exponent:.4g}" if isinstance(response, Gamma) else "a curve"
 
 
-def _through(response: Response, levels: Float[Tensor, " level"]) -> Float[Tensor, "channel level"]:
+def _through(response: Response) -> Float[Tensor, "channel level"]:
     rows = len(response.radiance) if isinstance(response, Curve) else 1
-    spread = levels.expand(rows, 1, -1)
+    spread = _LEVELS.expand(rows, 1, -1)
     return response.linear_from_encoded(spread)[:, 0]

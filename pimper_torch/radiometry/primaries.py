@@ -23,8 +23,6 @@ _BRADFORD = torch.tensor(
     dtype=torch.float64,
 )
 _D50 = torch.tensor([0.9642, 1.0, 0.8249], dtype=torch.float64)
-# Profiles of sRGB differ by so much, as their white was rounded or adapted in other ways.
-_SAME = 0.02
 # Choices: rows of a matrix from primaries to sRGB sum to 1, up to the profile's white; what mixes
 # a colour with less than this of another is not saturated with it.
 _MAX_OFF_WHITE, _MIXED = 0.1, 0.01
@@ -56,7 +54,8 @@ def srgb_from_primaries(
     if float((white - 1).abs().max()) > _MAX_OFF_WHITE:
         return None
     matrix, same = matrix / white, torch.eye(3, dtype=torch.float64)
-    return same if float((matrix - same).abs().max()) < _SAME else matrix
+    # Profiles of sRGB differ, as their white was rounded or adapted in other ways.
+    return same if float((matrix - same).abs().max()) < 0.02 else matrix
 
 
 def primaries_of(chromaticities: Chromaticities) -> Float[Tensor, "3 3"] | None:

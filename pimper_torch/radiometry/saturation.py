@@ -10,16 +10,6 @@ from torch import Tensor
 # 255 down by two levels, which in sRGB are 0.018 of radiance.
 SATURATED = 0.98
 
-# Levels that belong together, as a fraction of the top: noise after saturation, such as a dark
-# frame's that was subtracted, spreads a sensor's by less.
-_BAND = 0.004
-# So many bands below the top show how the values fall off; half of them must be occupied.
-_TAIL_BANDS = 8
-# The top holds so many times what each of these holds. A tail that falls off holds less at its
-# end, one that ends abruptly as much.
-_PILED = 4.0
-# Pixels above the top that do not count: hot ones.
-_STRAY = 2e-6
 # A pile-up is a level that so many photographs share, with so many pixels each. A face of one
 # brightness, in a rendering without noise, has another in each.
 _PHOTOGRAPHS, PIXELS = 2, 8
@@ -44,19 +34,21 @@ def find_saturation(
     """
     total = int(counts.sum())
     above = counts.flip(0).cumsum(0).flip(0)
-    reached = (above > _STRAY * total).nonzero()
+    reached = (above > 2e-6 * total).nonzero()  # but hot pixels
     if len(reached) == 0:
         return None
     top = int(reached[-1])
-    width = max(1, round(_BAND * top))
-    edges = [top + 1 - width * band for band in range(_TAIL_BANDS + 2)]
+    # Noise after saturation, such as a dark frame's that was subtracted, spreads a level by less.
+    width = max(1, round(0.004 * top))
+    edges = [top + 1 - width * band for band in range(10)]
     if edges[-1] < 0:
         return None
     bands = [int(counts[low:high].sum()) for high, low in pairwise(edges)]
     pile, tail = bands[0], torch.tensor(bands[1:])
     shared = int(photographs[edges[1] : edges[0]].max()) >= _PHOTOGRAPHS
-    falls_off = int((tail > 0).sum()) >= _TAIL_BANDS // 2
-    if not (shared and falls_off and pile > _PILED * int(tail.max())):
+    # A tail that falls off holds less at its end, one that ends abruptly as much as the top.
+    falls_off = int((tail > 0).sum()) >= 4
+    if not (shared and falls_off and pile > 4 * int(tail.max())):
         return None
     held = counts[edges[1] : edges[0]].cumsum(0)
     return edges[1] + int((2 * held >= pile).nonzero()[0])

@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.mapped import stacked, zeros
 from pimper_torch.parallel import side_by_side
-from pimper_torch.radiometry.srgb import srgb_from_linear
+from pimper_torch.radiometry.response import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.silhouettes.opencv import shrunk
 

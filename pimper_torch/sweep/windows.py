@@ -50,7 +50,7 @@ def level_weight(
     depth: Float[Tensor, "patch height width"],
     swept: Float[Tensor, "patch height width"],
     spacing: Float[Tensor, " patch"],
-    max_slope: float,
+    max_slope: float = 4.0,
 ) -> Float[Tensor, "patch height width"]:
     """Return the weight of every sample in windows: none on a cliff.
 

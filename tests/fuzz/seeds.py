@@ -49,8 +49,7 @@ from pimper_torch.io.decode import decode, write_deep_png
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.responses import read_curve
-from pimper_torch.prior_files.read_depth import read_depth
-from pimper_torch.prior_files.read_normals import read_normals
+from pimper_torch.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.sfm.colmap import pinhole_lenses, read_model, reconstruction_of, write_binary

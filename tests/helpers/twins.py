@@ -5,7 +5,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Literal
 from unittest.mock import patch
 
-_MODULES = (*("patches.warp", "photometry.variable_projection", "sweep.sweep", "fusion.estimate"),)
+_MODULES = (*("patches.warp", "photometry.variable_projection", "sweep.costs", "fusion.estimate"),)
 
 
 @contextmanager

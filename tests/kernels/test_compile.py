@@ -57,7 +57,9 @@ def test_every_kernel_of_a_run_is_compiled():
     listed = {*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE}
     sources = Path(pimper_torch.kernels.__path__[0]).glob("*.py")
     with_types = {
-        path.stem for path in sources if re.search(r'@compiled\(\s*(f?"|\*)', path.read_text())
+        path.stem
+        for path in sources
+        if re.search(r'@compiled\(\s*(f?"|\*|annotated)', path.read_text())
     }
     assert with_types == {*listed, "lookup"}  # which other kernels import
 

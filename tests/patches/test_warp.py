@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.pyramid import look_up, pyramid_level
+from pimper_torch.patches.sources import look_up, pyramid_level
 from pimper_torch.patches.warp import Warp, WarpConfig, missing_fraction
 from pimper_torch.records import CoarseMesh, Mesh
 

@@ -7,8 +7,8 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.photometry.bilinear import Bilinear
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
-from pimper_torch.photometry.manifolds import Cone
 from pimper_torch.photometry.quadratics import outer
 from pimper_torch.photometry.robust import Cauchy, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection

@@ -11,10 +11,7 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.photometry.factor_priors import (
     FactorPrior,
     FieldLights,
-    GuessedAlbedo,
-    GuessedInliers,
-    GuessedLights,
-    GuessedNormals,
+    Guesses,
     Known,
     SurfaceNormals,
     views_worth,
@@ -69,7 +66,7 @@ def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
 
 def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
     true = scene(bumps=0.2)
-    priors = [FieldLights(), SurfaceNormals(0.0), GuessedAlbedo()]
+    priors = [FieldLights(), SurfaceNormals(0.0), Guesses()]
     found = []
     for unit in (1.0, 7.0):
         albedo = [unit * each.mean(dim=-1) for each in true.albedo]
@@ -108,7 +105,7 @@ def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
     for variance, pulled in ((1e-6, True), (1e6, False)):
         variances = [torch.full_like(each[..., 0], variance) for each in lights]
         seen = carried(true.seen, lights_patch=wrong, light_variance=variances)
-        found = Factorize(priors=[FieldLights(1.0), GuessedLights()])(seen)
+        found = Factorize(priors=[FieldLights(1.0), Guesses()])(seen)
         for one, given in zip(found.buckets, wrong, strict=True):
             cosine = torch.cosine_similarity(one.lights_patch, given, dim=2)
             assert bool((cosine > 0.9999).all()) == pulled
@@ -158,5 +155,3 @@ def test_gradients_reach_a_prior_from_elsewhere(scene):
 def test_variances_are_worth_views():
     information = torch.tensor([math.radians(5.44) ** -2, 0.0, 1e9])
     assert_close(views_worth(information), torch.tensor([0.1, 0.0, 1.0]), rtol=0.01, atol=0)
-    assert isinstance(GuessedNormals(), FactorPrior)
-    assert isinstance(GuessedInliers(), FactorPrior)

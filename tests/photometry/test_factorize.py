@@ -11,8 +11,7 @@ from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.harmonics import harmonics
-from pimper_torch.photometry.light_field import LightField
+from pimper_torch.photometry.light_field import LightField, harmonics
 from pimper_torch.records import PatchStatus, PatchViews
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
@@ -294,17 +293,6 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
     for bucket in found.buckets:
         assert bucket.normals_patch.isfinite().all()
         assert (bucket.albedo == 0).all()
-
-
-def test_parts_make_no_difference(scene, monkeypatch):
-    true = scene()
-    whole = Factorize()(true.seen)
-    monkeypatch.setattr("pimper_torch.photometry.factorize.PART_ENTRIES", 1)
-    single = Factorize()(true.seen)
-    for one, other in zip(whole.buckets, single.buckets, strict=True):
-        assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-8)
-        assert_close(one.albedo, other.albedo, rtol=0, atol=1e-8)
-        assert_close(one.convergence.iterations, other.convergence.iterations)
 
 
 def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):

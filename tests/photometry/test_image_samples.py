@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.image_samples import ImageSamples
+from pimper_torch.photometry.light_models import ImageSamples
 from pimper_torch.photometry.robust import CAUCHY_TUNING
 
 

@@ -10,10 +10,9 @@ from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.io.estimates import estimate_of
-from pimper_torch.photometry.factor_priors import PatchSamples
+from pimper_torch.photometry.factor_priors import WEIGHTS, LearnedPrior, PatchSamples
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
-from pimper_torch.photometry.learned import WEIGHTS, LearnedPrior
+from pimper_torch.photometry.light_field import harmonics, rotate_lights
 
 
 @pytest.fixture

@@ -3,8 +3,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.harmonics import harmonics, linearized, second_harmonics
-from pimper_torch.photometry.light_field import LightField, faces_light
+from pimper_torch.photometry.light_field import (
+    LightField,
+    faces_light,
+    harmonics,
+    linearized,
+    second_harmonics,
+)
 from pimper_torch.photometry.lights import fit_light_field
 
 

@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.geometry.rigid import rigid, rotate
-from pimper_torch.photometry.harmonics import harmonics, rotate_lights
+from pimper_torch.photometry.light_field import harmonics, rotate_lights
 from pimper_torch.photometry.lights import fit_light_field
 
 

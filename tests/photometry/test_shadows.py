@@ -126,9 +126,10 @@ def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_pla
     field = point_lights([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
     raster = points[None, :, :150], normals[None, :, :150]  # no multiple of the stride
     spacing = torch.tensor([0.02]).double()
+    seen = torch.ones(1, 2, *raster[0].shape[1:3], dtype=torch.bool)
     dense = cast_shadows(field, ball_over_plane, *raster, 1e-4)
     found = cast_shadows_on_rasters(
-        field, ball_over_plane, *raster, spacing, tolerance=1e-4, guard=0.02, stride=stride
+        field, ball_over_plane, *raster, spacing, seen, tolerance=1e-4, guard=0.02, stride=stride
     )
     assert found.lit.shape == dense.lit.shape
     assert (found.lit == dense.lit)[found.sure].all()
@@ -146,8 +147,10 @@ def test_rays_are_cast_only_in_views_that_show_the_sample(ball_over_plane, plane
     seen[:, 1, :, 100:] = True
     settings = {"tolerance": 1e-4, "stride": 4, "guard": 0.01}
     raster = points[None], normals[None], spacing
-    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings, seen=seen)
-    whole = cast_shadows_on_rasters(field, ball_over_plane, *raster, **settings)
+    found = cast_shadows_on_rasters(field, ball_over_plane, *raster, seen, **settings)
+    whole = cast_shadows_on_rasters(
+        field, ball_over_plane, *raster, torch.ones_like(seen), **settings
+    )
     there = seen.movedim(1, -1)
     assert (found.lit == whole.lit)[there].all()
     assert (found.sure == whole.sure)[there].all()

@@ -11,7 +11,7 @@ a distant point light  3     :math:`\rho n`: any vector     an invertible 3 x 3
 first order            4     :math:`\rho (1, n)`            scaled Lorentz
 =====================  ====  =============================  =====================
 
-First order is :class:`pimper_torch.photometry.manifolds.Cone`.
+First order is :class:`pimper_torch.photometry.cone.Cone`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """

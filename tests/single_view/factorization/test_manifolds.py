@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear
-from pimper_torch.photometry.manifolds import Cone
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.quadratics import apply_packed
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
