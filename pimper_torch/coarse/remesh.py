@@ -7,8 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
-from pimper_torch.coarse.splitting import mark_edges, split_edges
+from pimper_torch.coarse.splitting import (
+    fitted_normals,
+    mark_edges,
+    normal_weights,
+    split_edges,
+    with_points,
+)
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
@@ -136,7 +141,7 @@ def remesh(
 
     Returns:
         The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
-        cloud follow :func:`~pimper_torch.coarse.inherit.with_points`. Unused vertices are
+        cloud follow :func:`~pimper_torch.coarse.splitting.with_points`. Unused vertices are
         dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
     Raises:

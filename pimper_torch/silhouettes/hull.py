@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.projection import rays_through, triangulate_rays
 from pimper_torch.mapped import parts
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, Silhouettes
@@ -158,6 +158,34 @@ class HalfSpace(Everywhere):
         """Find points above the planes; the tolerance is of silhouettes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
+
+
+def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+    """Return the corners of a box that holds what the silhouettes show.
+
+    Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
+    there it reaches as far as the largest of them, seen from its camera, and half as far again:
+    a silhouette may be cut by the photograph's border.
+
+    Returns:
+        ``None`` where fewer than two reliable views show anything.
+    """
+    masks = silhouettes.masks
+    views = (silhouettes.reliable & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
+    if len(views) < 2:
+        return None
+    chosen, boxes = cameras.take(views), []
+    for view in views:
+        rows, columns = (masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
+        low = torch.stack([columns.amin(), rows.amin()])
+        boxes.append(torch.stack([low, torch.stack([columns.amax(), rows.amax()]) + 1]))
+    low, high = torch.stack(boxes).to(chosen.intrinsics).unbind(dim=1)
+    seen = torch.ones(1, len(views), dtype=torch.bool, device=low.device)
+    centre = triangulate_rays(chosen, (low + high)[None] / 2, seen)[0]
+    distance = (centre - chosen.centers_world).norm(dim=1)
+    half = (high - low).norm(dim=1) / 2 / chosen.intrinsics[:, 0, 0]
+    reach = 1.5 * (distance * half).amax()
+    return torch.stack([centre - reach, centre + reach])
 
 
 def visual_hull(
