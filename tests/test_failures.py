@@ -25,7 +25,7 @@ from pimper_torch.failures import (
 from pimper_torch.failures import collecting as collecting_entries
 from pimper_torch.fusion import estimate
 from pimper_torch.io.reports import summary_report
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp

@@ -32,10 +32,6 @@ from pimper_torch.records import Record, SparseScene
 # Views that a view is matched with. A choice.
 _NUM_SOURCES = 5
 
-# Fraction by which the whole range searched exceeds the points' inverse depths, on either side. A
-# choice: the surface reaches beyond its sparse points.
-_RANGE_MARGIN = 0.15
-
 # Of a valid depth: correlation of its windows; other views that agree, and their reprojection
 # error. Choices: two views seldom agree by chance; a pixel is what the finest step resolves.
 _MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
@@ -182,7 +178,8 @@ def _whole_range(
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Search planes parallel to the image, then offsets of a smooth surface through the points."""
     low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
-    low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
+    # The surface reaches beyond its sparse points.
+    low, high = low - 0.15 * (high - low), high + 0.15 * (high - low)
     low = max(low, 0.1 * high)
     count = min(max_hypotheses, max(3, round((high - low) / (_WHOLE_STEP * step))))
     found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
@@ -387,13 +384,6 @@ def nearest_pixels(
     return grid_sample(maps[:, None], grid[:, None], mode="nearest", align_corners=False)[:, 0, 0]
 
 
-# Angles between rays that match well: below about 5 degrees depth is poorly determined, above
-# about 25 windows look different. Centre and standard deviations of a bell curve; a choice.
-_BEST_ANGLE_DEG = 12.0
-_BELOW_DEG = 4.0
-_ABOVE_DEG = 12.0
-
-
 def choose_sources(
     scene: SparseScene, points: Int[Tensor, " chosen"], view: int, count: int
 ) -> Int[Tensor, " source"]:
@@ -407,8 +397,9 @@ def choose_sources(
     points_world, shared = scene.points_world[points[here]], observed[here]
     rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
     angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
-    width = torch.where(angle < _BEST_ANGLE_DEG, _BELOW_DEG, _ABOVE_DEG)
-    value = torch.exp(-((angle - _BEST_ANGLE_DEG) / width).square() / 2)
+    # Below about 5 degrees depth is poorly determined, above about 25 windows look different.
+    away = angle - 12.0
+    value = torch.exp(-(away / torch.where(away < 0, 4.0, 12.0)).square() / 2)
     score = (value * shared).sum(dim=0)
     score[view] = 0
     order = score.argsort(descending=True)[:count]

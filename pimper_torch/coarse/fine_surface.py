@@ -37,20 +37,8 @@ from pimper_torch.silhouettes.contours import Contours
 # near a face is to the points or contour points that support it.
 POINT_PX, TOLERANCE_PX, REACH_PX = 1.0, 4.0, 4.0
 
-# Of the octree, whatever the cell: 1024 cells along a side bound its memory.
-MAX_DEPTH = 10
-
-# How often contour points are found, each time on the surface before; the first time on the points.
-_ITERATIONS = 3
-
 # Barycentric coordinates, times 6, of the points of a facet that vote for its support.
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
-
-# Cosine between a surface's normal and the ray to a camera, above which it faces that. A choice.
-_FACING = 0.1
-
-# Points and contour points that a surface can be put through, at least. A choice.
-_MIN_POINTS = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -100,7 +88,7 @@ def fine_surface(
     part = cropped(scene, contours.silhouettes)
     centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = no_points(centre), None
-    if len(reliable) >= _MIN_POINTS or not contours.confine:
+    if len(reliable) >= 16 or not contours.confine:
         found, maps, pixel = matched_cloud(part, reliable, densify, POINT_PX)
         near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
         leave_out("coarse.matched", ~near, at=found.points_world)
@@ -149,14 +137,15 @@ def closed_surface(
         ReconstructionError: Too few of both.
     """
     points, normals = cloud.points_world, cloud.normals_world
-    for _ in range(_ITERATIONS):
+    # The first time on the points, then each time on the surface before.
+    for _ in range(3):
         touched = contours.touching(points, normals)
         contour = OrientedPoints(
             points_world=touched.points_world.to(cloud.points_world),
             normals_world=touched.normals_world.to(cloud.points_world),
             noise=touched.variance.sqrt().to(cloud.noise),
         )
-        if len(cloud.points_world) + len(touched.ray) < _MIN_POINTS:
+        if len(cloud.points_world) + len(touched.ray) < 16:
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched inside the "
                 f"silhouettes, and {len(touched.ray)} rays touch the surface there; some hundreds "
@@ -189,7 +178,7 @@ def visible_vertices(
     caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
     for center in cameras.centers_world.to(vertices):
         towards = normalize(center - vertices, dim=1)
-        facing = ((towards * normals).sum(dim=1) > _FACING) & ~found
+        facing = ((towards * normals).sum(dim=1) > 0.1) & ~found
         found[facing] = ~caster.occluded(vertices[facing], center, tolerance)
     return found
 
@@ -206,15 +195,12 @@ def poisson(
     # COLMAP works in single precision: a cloud far from the origin is brought there.
     centre = points.median(dim=0).values
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-    depth = min(MAX_DEPTH, round(math.log2(extent / cell)))
+    # 1024 cells along a side bound the octree's memory.
+    depth = min(10, round(math.log2(extent / cell)))
     vertices, faces = poisson_surface(
         points - centre, cloud.normals_world, depth=depth, point_weight=1.0
     )
     return vertices.to(points) + centre, faces.to(points.device)
-
-
-# Pixels kept round the silhouettes, for windows that reach beyond what they match. A choice.
-_MARGIN = 8
 
 
 def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
@@ -261,8 +247,8 @@ def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Ten
     for axis in range(2):  # columns, then rows
         along = by_view(lambda mask, axis=axis: mask.any(dim=axis), masks)
         index = torch.arange(along.shape[1], device=along.device)
-        first = torch.where(along, index, along.shape[1]).amin(dim=1) - _MARGIN
-        last = torch.where(along, index, -1).amax(dim=1) + 1 + _MARGIN
+        first = torch.where(along, index, along.shape[1]).amin(dim=1) - 8
+        last = torch.where(along, index, -1).amax(dim=1) + 9
         ends.append(torch.stack([first, last], dim=1))
     boxes = torch.stack(ends, dim=2)
     empty = ~along.any(dim=1)

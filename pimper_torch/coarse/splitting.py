@@ -157,10 +157,6 @@ def _cases(
 # surface's normals that follow from their neighbours alone, over that of the best: choices.
 _MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
 
-# Weight of the facets' own normals in the fit, in fractions of a typical vertex's data: negligible
-# except where there is none. A choice.
-_DAMPING = 0.01
-
 
 def normal_weights(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
     """Return inverse variances of normals about those that facets blend, relative to the best.
@@ -198,7 +194,8 @@ def fitted_normals(
         0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten()
     )
     rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), sums.flatten(0, 1))
-    damping = (_DAMPING * average(diagonal)).clamp_min(1e-12).expand(len(vertices))
+    # Negligible except where there is no data.
+    damping = (0.01 * average(diagonal)).clamp_min(1e-12).expand(len(vertices))
     own = vertex_normals(vertices, faces)
     every = torch.arange(len(vertices), device=faces.device)
     fitted = SparseCholesky(

@@ -214,15 +214,6 @@ def _facets(
     return few.vertices_world, few.faces
 
 
-# Degrees of freedom that the median over all points counts for beside a point's own
-# residuals, of which a track of three views leaves three. A choice.
-_COMMON_FREEDOM = 6.0
-
-# Fraction of its mean information that a point has at least in every direction: the standard
-# deviation of its depth is at most 1,000 times that across, as where only one view sees it.
-_MIN_INFORMATION = 1e-6
-
-
 def point_covariances(
     scene: SparseScene, index: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
@@ -253,7 +244,8 @@ def point_covariances(
     inward = intrinsics.new_tensor([0, 0, 1])
     rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
     information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]
-    least = _MIN_INFORMATION * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    # A depth has a standard deviation of at most 1,000 times that across, as in one view.
+    least = 1e-6 * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
     covariance = torch.linalg.inv(information + least[:, None, None] * eye)
 
@@ -262,5 +254,6 @@ def point_covariances(
     error = scene.reprojection_errors_px.double()
     noise = 2 / torch.pi * error.square() * 2 * views / freedom
     common = noise.median()
-    blended = (_COMMON_FREEDOM * common + freedom * noise) / (_COMMON_FREEDOM + freedom)
+    # The median counts as the residuals of two tracks of three views.
+    blended = (6 * common + freedom * noise) / (6 + freedom)
     return (blended[index, None, None] * covariance).to(scene.points_world)

@@ -38,17 +38,8 @@ from pimper_torch.silhouettes.contours import Contours
 # Of the surface's octree, pixels of the finest depth maps at the cloud's median depth. A choice.
 CELL_PX = 4.0
 
-# Cosine between a face's normal and the ray to a camera, above which a view counts. A choice: at
-# 84 degrees a face is a tenth as wide as it is long.
-_FACING = 0.1
-
-# Steps of inverse depth (see DepthMaps) by which a depth map lies behind a face that it
-# contradicts. A choice: depths that agree differ by a step at most, faces lie off points by some.
-_BEHIND_STEPS = 4.0
-
-# Tone (root of radiance over the bright level) of an illuminated pixel, at least. A choice: a
-# twentieth of the bright level's radiance, above the pedestal of a hundredth.
-_LIT_TONE = 0.06**0.5
+# Views that see something behind a face which is dropped: one may be wrong.
+_MIN_BEHIND = 2
 
 # Fraction of a region that views see through, from which all of it is in the air: by two views,
 # 0.56 of the lid over a mug's mouth, and at most 0.1 of regions without points that are there (mug,
@@ -123,14 +114,16 @@ def view_counts(
         seen, lit, behind = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
         center = cameras.centers_world[view]
         pixels, depth = project(centre, cameras.cam_from_world[view], cameras.intrinsics[view])
-        facing = (normalize(center - centre, dim=-1) * normals).sum(dim=-1) > _FACING
+        # At 84 degrees a face is a tenth as wide as it is long.
+        facing = (normalize(center - centre, dim=-1) * normals).sum(dim=-1) > 0.1
         within = ((pixels >= 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
         (chosen,) = torch.nonzero(within & facing, as_tuple=True)
         column, row = pixels[chosen].floor().long().unbind(dim=-1)
         column = column.clamp_max(level.tone.shape[-1] - 1)
         row = row.clamp_max(level.tone.shape[-2] - 1)
         if maps is not None:
-            nearest = maps.inverse_depth[view, row, column] + _BEHIND_STEPS * maps.step[view]
+            # Depths that agree differ by a step at most, faces lie off points by some.
+            nearest = maps.inverse_depth[view, row, column] + 4.0 * maps.step[view]
             through = maps.valid[view, row, column] & (1 / depth[chosen] > nearest)
             frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
             rays = rays_through(pixels[chosen][through], frame, intrinsics)
@@ -140,7 +133,8 @@ def view_counts(
         free = ~caster.occluded(centre[chosen], center, 0.5 * side[chosen])
         free &= level.usable[view, row, column]
         seen[chosen] = free.long()
-        lit[chosen] = (free & (level.tone[view, row, column] > _LIT_TONE)).long()
+        # A twentieth of the bright level's radiance, above the pedestal of a hundredth.
+        lit[chosen] = (free & (level.tone[view, row, column] > 0.06**0.5)).long()
         return torch.stack([seen, lit, behind])
 
     counts = side_by_side(of_view, range(cameras.num_views), tracked=False)
@@ -275,7 +269,7 @@ def near_points(
     """
     supported = support == Support.POINTS
     distance = point_distances(centre, cloud.points_world)
-    between = (counts.lit >= 2) & (counts.behind < 2) & ~supported
+    between = (counts.lit >= 2) & (counts.behind < _MIN_BEHIND) & ~supported
     beyond = between & (distance > _MARGIN_PX * pixel)
     far = connected_to(faces, beyond, distance > _GAP_PX * pixel)
     return (supported & (counts.seen >= 2)) | (between & ~far)
@@ -305,7 +299,7 @@ def seen_surface(
     known = support >= Support.CONTOUR
     small = (config.hole_px * pixel) ** 2
     bare = inside & (support != Support.POINTS)
-    through = bare & (counts.behind >= 2)
+    through = bare & (counts.behind >= _MIN_BEHIND)
     through |= regions_seen_through(faces, bare & (counts.seen > 0), through)
     possible = without_small_holes(vertices, faces, inside & ~through, small)
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))

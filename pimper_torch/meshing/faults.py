@@ -19,9 +19,6 @@ from pimper_torch.geometry.topology import corners_of, face_pairs, graph_compone
 # edges of a box or of thin bones it is a right angle, give or take the noise of small faces.
 _FOLD = math.radians(110.0)
 
-# Of a cosine in float32: what it may add to the bound is looked at in vain, and changes nothing.
-_ROUNDING = 1e-3
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
@@ -90,7 +87,8 @@ class Faults:
         axis = vertex_normals(vertices, self.faces)
         near = corners_of(self.faces, overturned, len(vertices))
         for corner in self.faces.unbind(dim=1):
-            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + _ROUNDING
+            # Rounding of a cosine in float32: faces that it adds change nothing.
+            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + 1e-3
             near[corner[bent]] = True
         return near[self.faces].any(dim=1)
 

@@ -207,30 +207,12 @@ def _read(values: Array, points: Array) -> Array:
 # is below the surface: beside the border of what is known, none is.
 _ALONG_NORMAL = 0.9
 
+# How far outside the visual hull a ray may touch the surface.
+_TOLERANCE_PX = 1.5
+
 # Points, itself included, to the last of which a point's disc reaches: those round it in a
 # triangle mesh.
 _NEIGHBOURS = 7
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TangencyConfig:
-    """Settings of the choice of positions on contour rays.
-
-    Attributes:
-        steps: Places that are looked at on each ray, over the object's depth.
-        refined_steps: Between those beside the best one.
-        tolerance_px: How far outside the visual hull the place may lie.
-        ambiguous_px: Two positions on a ray, one behind the other, both so near to the surface
-            that they differ by less than this: nothing tells which of them it touches.
-    """
-
-    steps: Annotated[int, Range(least=4, most=100_000)] = 128
-    refined_steps: Annotated[int, Range(least=2, most=100_000)] = 12
-    tolerance_px: Annotated[float, Range(least=0, most=65_535)] = 1.5
-    ambiguous_px: Annotated[float, Range(least=0, most=65_535)] = 2.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "touch")
 
 
 @torch.no_grad()
@@ -240,7 +222,6 @@ def contour_points(
     hull: Hull,
     points_world: Float[Tensor, "point 3"],
     normals_world: Float[Tensor, "point 3"],
-    config: TangencyConfig | None = None,
 ) -> ContourPoints:
     """Find where each contour ray touches a surface, of which points with normals are given.
 
@@ -257,20 +238,21 @@ def contour_points(
         two surfaces, one behind the other, are as near to it: parts that hide each other.
         A constant to autograd.
     """
-    config = config or TangencyConfig()
     centers = cameras.centers_world[rays.view]
     focal = cameras.intrinsics[rays.view, 0, 0]
     low, high = _depths_in_box(hull, centers, rays.rays_world)
-    depth = low + torch.linspace(0, 1, config.steps).to(low) * (high - low)
+    steps = 128
+    depth = low + torch.linspace(0, 1, steps).to(low) * (high - low)
     pixel = depth.mean(dim=1) / focal
     surface = _SignedDistance(points_world, normals_world) if len(points_world) else None
-    cost = _costs(rays, centers, depth, hull, config.tolerance_px * pixel, surface)
-    clear = ~ambiguous(cost, config.ambiguous_px * pixel)
+    cost = _costs(rays, centers, depth, hull, _TOLERANCE_PX * pixel, surface)
+    # Places nearer to each other than that tell nothing of which surface a ray touches.
+    clear = ~ambiguous(cost, 2.0 * pixel)
     (met,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
     best = depth[met].gather(1, cost[met].argmin(dim=1, keepdim=True))
-    offset = torch.linspace(-1, 1, 2 * config.refined_steps + 1).to(low)
-    fine = best + offset * (high - low)[met] / (config.steps - 1)
-    tolerance = config.tolerance_px * pixel[met]
+    offset = torch.linspace(-1, 1, 25).to(low)
+    fine = best + offset * (high - low)[met] / (steps - 1)
+    tolerance = _TOLERANCE_PX * pixel[met]
     cost = _costs(rays.take(met), centers[met], fine, hull, tolerance, surface)
     found = fine.gather(1, cost.argmin(dim=1, keepdim=True))
     sigma = rays.sigma_px[met] * found[:, 0] / focal[met]
@@ -391,18 +373,8 @@ class Contours(Record):
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
         """Return contours without rays; the hull holds everything, or what is above planes."""
-        like = cameras.cam_from_world
-        rays = ContourRays(
-            view=torch.zeros(0, dtype=torch.long, device=like.device),
-            pixels=like.new_zeros(0, 2),
-            rays_world=like.new_zeros(0, 3),
-            normals_world=like.new_zeros(0, 3),
-            sigma_px=like.new_zeros(0),
-        )
-        hull = Everywhere.of(cameras)
-        for plane in silhouettes.planes_world:
-            hull = hull.above(plane[:3], -plane[3])
-        return cls(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)
+        hull = Everywhere.of(cameras, silhouettes.planes_world)
+        return cls(silhouettes=silhouettes, rays=_nothing(cameras), cameras=cameras, hull=hull)
 
     @property
     def confine(self) -> bool:

@@ -34,7 +34,6 @@ from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, Silhoue
 
 FEW = 3  # soft masks: fewer have no majority
 _SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
-_SURE = 1e-3  # probabilities nearer to 0 or 1 than this count no more: 8 bits hold no finer ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -87,7 +86,8 @@ def soft_masks_of(views: Views, pictures: WorkingPictures) -> SoftMasks | None:
             if float(inside.min()) > 0.5 - _SAYS_NOTHING:
                 seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _SAYS_NOTHING
             else:
-                odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(_SURE, 1 - _SURE))
+                # 8 bits hold no finer probabilities.
+                odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(1e-3, 1 - 1e-3))
                 given[view] = True
     if not priors:
         return None
@@ -126,7 +126,6 @@ def pointed_at(hull: Hull, cameras: Cameras, seeds_px: Sequence[Float[Tensor, "_
 
 
 MIN_POINTS = 12  # of the object that a view must observe for them to tell anything
-_PROBES = 5  # places along each side of a region that photographs are asked for
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 
 
@@ -268,7 +267,7 @@ def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 
     offset = low.new_tensor(scene.offset_world)
     box, points = torch.stack([low, high]) - offset, scene.points_world
     inside = ((points > box[0]) & (points < box[1])).all(dim=1)
-    steps = torch.cartesian_prod(*[torch.linspace(0, 1, _PROBES, dtype=torch.float64)] * 3)
+    steps = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=torch.float64)] * 3)
     cameras = scene.cameras
     places = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
     pixels, depth = project(places, cameras.cam_from_world, cameras.intrinsics)

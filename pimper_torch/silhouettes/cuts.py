@@ -30,9 +30,6 @@ from pimper_torch.silhouettes.opencv import (
 from pimper_torch.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 
-_WELL = 2.0  # times as deep as is_deep asks for
-_CUTS = 2  # rounds of mixtures and cut inside GrabCut
-_SPECK = 2e-4  # fraction of the picture
 # Fractions of the views that may lack what the others have in common, tried in turn until that
 # takes so much of a median mask; a mask that shows less than this of it is of something else.
 _DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
@@ -177,7 +174,7 @@ def _again(
         if cues.soft is not None and cues.soft.given[view]:
             labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
         cut = _cut(grab_cut, cues, view, labels, seen[view])
-        return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
+        return without_specks(cut, seen[view] > 0, round(2e-4 * cut.numel()))
 
     return of_views(again, cues.num_views)
 
@@ -195,12 +192,12 @@ def _cut(
     object's unless the plane is seen there.
     """
     if cues.agreement is None:
-        return how(cues.pictures.opponent[view], labels, _CUTS)
+        return how(cues.pictures.opponent[view], labels, 2)
     agreement = cues.agreement[view]
     surrounded = not_seen_through(cues.object_px[view], agreement)
     surrounded &= ~(agreement >= DISPUTED)
-    labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
-    return how(cues.pictures.opponent[view], labels, _CUTS)
+    labels = torch.where(is_deep(margin / 2.0) & surrounded, OBJECT, labels)
+    return how(cues.pictures.opponent[view], labels, 2)
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
@@ -280,15 +277,10 @@ def _voted(
 
 # Lengths are fractions of the pictures' longer side.
 _DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
-_STRIP = 1 / 64  # along the border of a photograph, where nothing else is known
 _CLOSING = 1 / 90
-_BEYOND = 1 / 25  # what is further outside the hull's projection is background
 _DEEP = 1 / 50  # parallax this far inside the projection tells object
 _THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
 _MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
-_GRAIN = 1 / 200  # what is smaller in parallax is noise
-_GAPS = 1 / 50  # in what does not show the plane, as beyond its far border
-_BAND = 1 / 160  # about the border of a soft mask
 _FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
 # Half a window of agreement: next to the object a window that holds some of it agrees no more. On
 # rendered scenes of 24 views (armadillo, mug, balls, potatoes) twice as much is no better.
@@ -318,7 +310,7 @@ def labels_from_points(
         labels[surely_on_plane(agreement)] = BACKGROUND
         region &= ~_shows_plane(agreement)
     else:
-        strip = max(1, round(_STRIP * longer))
+        strip = max(1, round(1 / 64 * longer))
         border = torch.ones_like(labels, dtype=torch.bool)
         border[strip:-strip, strip:-strip] = False
         labels[border] = BACKGROUND
@@ -349,7 +341,7 @@ def labels_from_hull(
     if agreement is not None:
         labels[surely_on_plane(agreement)] = BACKGROUND
         labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
-    beyond = margin < -_BEYOND * longer
+    beyond = margin < -1 / 25 * longer
     labels[beyond if unknown is None else beyond & ~unknown] = BACKGROUND
     discs = discs_at(object_px, _DISC * longer, (width, height))
     labels[discs & (margin > 0)] = OBJECT
@@ -362,7 +354,7 @@ def labels_from_soft(
     margin: Float[Tensor, "height width"],
 ) -> UInt8[Tensor, "height width"]:
     """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
-    border, reach = signed_distance(mask), _BAND * max(mask.shape)
+    border, reach = signed_distance(mask), 1 / 160 * max(mask.shape)
     labels = torch.where((border > reach) & (margin > 0), OBJECT, labels)
     outside = (border < -reach) & ~is_deep(margin) | (margin < -2 * reach)
     return torch.where(outside, BACKGROUND, labels)
@@ -371,7 +363,7 @@ def labels_from_soft(
 def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
     found = _grainless(agreement < _NOT_PLANE)
-    return filled(closed(found, round(_GAPS * max(agreement.shape))), agreement)
+    return filled(closed(found, round(1 / 50 * max(agreement.shape))), agreement)
 
 
 def in_front(
@@ -383,7 +375,7 @@ def in_front(
     these is left out.
     """
     longer = max(cut.shape)
-    other = closed(agreement < _OFF_PLANE, round(_GRAIN * longer)) & ~cut
+    other = closed(agreement < _OFF_PLANE, round(1 / 200 * longer)) & ~cut
     return opened(other, round(_DEEP * longer))
 
 
@@ -452,4 +444,4 @@ def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "heig
 
 
 def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    return opened(mask, max(1, round(_GRAIN * max(mask.shape))))
+    return opened(mask, max(1, round(1 / 200 * max(mask.shape))))

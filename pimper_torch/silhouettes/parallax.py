@@ -23,10 +23,8 @@ from pimper_torch.radiometry.srgb import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.silhouettes.opencv import shrunk, warped, window_means
 
-_BRIGHT = 0.99  # this quantile of each photograph's radiance is shown white
 _FAINT = 0.03  # of white; ratios of darker colours tell noise
 _RATIO = 100.0  # grey levels for a ratio of e
-_DARK = 0.005  # of white; logarithms of what is darker tell noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -56,10 +54,11 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
 
     def shown(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
         small = shrunk(image, wide, high)
-        level = torch.quantile(small.mean(dim=0).flatten()[::7], _BRIGHT).clamp_min(1e-6)
+        level = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
         radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
-        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + _DARK)
+        # Logarithms of what is darker tell noise.
+        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + 0.005)
 
     images = views.images.detach().cpu().unbind()
     colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
@@ -104,8 +103,6 @@ _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
 _ROOM = 1.0  # of the picture's size beyond it: a room that shifts by more is not looked at
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
-_MIN_VIEWS = 3  # of which two agree
-_SAMPLES = 2**20  # of the plane, over all views, at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -210,7 +207,7 @@ def _common(
         return warped(seen, maps[view], raster.size_px)
 
     seen = of_views(rectified, len(values))
-    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px[0])), dim=1)
+    rows = torch.split(seen, max(1, 2**20 // (len(seen) * raster.size_px[0])), dim=1)
     common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
@@ -227,7 +224,7 @@ def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row colu
     """Return the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
-    few = seen.isfinite().sum(dim=0) < _MIN_VIEWS
+    few = seen.isfinite().sum(dim=0) < 3
     return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 

@@ -21,12 +21,7 @@ from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 
 # On rendered scenes, 99 in 100 pixels of a median view's cut lie less than 0.4 pixels of 640
 # outside; one of 16 to 30 views holds a shadow of 2 to 9 % of its cut.
-_FAR = 1 / 200  # of the pictures' longer side, outside the projection
 _LEAST, _MOST = 0.005, 0.2  # of a cut, so far outside
-_MANY = 0.5  # of the views
-_SHIFTED = 0.5  # of what is outside is missing elsewhere
-_WELL = 2.0  # times as deep as is_deep asks for: beside a skull's cheek bone views see through
-_SHALLOW = 0.2  # of a hole: more lies near the projection's border where it is seen through
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -86,7 +81,8 @@ def _without_holes(cuts: Cuts) -> Cuts:
     """Fill holes deep inside the projection, as a highlight makes them in a single view."""
 
     def filled(mask: Tensor, margin: Tensor) -> Tensor:
-        return mask | blind_holes(mask, ~is_deep(margin / _WELL), _SHALLOW)
+        # Beside a skull's cheek bone views see through what is half as deep.
+        return mask | blind_holes(mask, ~is_deep(margin / 2.0), 0.2)
 
     return cuts.replace(masks=by_view(filled, cuts.masks, cuts.margins_px))
 
@@ -100,15 +96,15 @@ def _without_shadows(cuts: Cuts) -> Cuts:
     something on the other, as a misplaced camera makes it; where a cut has little to do with the
     projection.
     """
-    far = _FAR * max(cuts.masks.shape[1:])
+    far = 1 / 200 * max(cuts.masks.shape[1:])
     excess = cuts.masks & (cuts.margins_px < -far)
     missing = ~cuts.masks & (cuts.margins_px > far)
     own, over, lost = (layer.sum(dim=(1, 2)) for layer in (cuts.masks, excess, missing))
     exceeds = over > _LEAST * own
-    if float(exceeds.double().mean()) > _MANY:
+    if float(exceeds.double().mean()) > 0.5:
         return cuts
     masks = cuts.masks.clone()
-    for view in (exceeds & (over < _MOST * own) & (lost <= _SHIFTED * over)).nonzero()[:, 0]:
+    for view in (exceeds & (over < _MOST * own) & (lost <= 0.5 * over)).nonzero()[:, 0]:
         outside = masks[view] & (cuts.margins_px[view] < -far / 2)
         masks[view] &= ~components_of(outside, excess[view])
     leave_out("silhouettes.shadows", cuts.masks & ~masks)
@@ -117,7 +113,6 @@ def _without_shadows(cuts: Cuts) -> Cuts:
 
 # Probabilities where a view's cut and the hull contradict each other by more than two pixels.
 _UNSURE_INSIDE, _UNSURE_OUTSIDE = 0.6, 0.3
-_SOFT = 0.5  # working pixels: the width of a border
 
 
 def silhouettes_of(cuts: Cuts, views: Views, details: SilhouetteDetails) -> Silhouettes:
@@ -145,7 +140,7 @@ def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"
         border, hull = interpolate(
             layers[None], (height, width), mode="bilinear", align_corners=False
         )[0]
-        inside = torch.sigmoid(border / _SOFT)
+        inside = torch.sigmoid(border / 0.5)
         inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
         return torch.where((border < -2) & (hull > 2), _UNSURE_OUTSIDE, inside)
 
@@ -158,10 +153,6 @@ def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"
 # Pixels of each silhouette that are looked at and places on their rays; longer side of the pictures
 # in which that is done: choices.
 _PIXELS, _PLACES, _SIZE_PX = 100, 64, 320
-# Of the longer side, up to which a place may lie outside of a silhouette: masks are drawn by hand.
-_SLACK = 0.01
-# Fraction of the others that must see a place.
-_SEEN = 0.5
 # Fraction of a silhouette's pixels in conflict, or of the median other's in conflict with it: 0.00
 # of true masks (potatoes and mug along an arc, jar and spot on a turntable, balls by hand, 8 to 12
 # views of 240x180 and 320x240). Where those of one or two views are wrong, theirs is 0.30 and more
@@ -194,7 +185,7 @@ class _Conflicts:
 
         def of_view(denied: Tensor, seen: Tensor) -> Tensor:
             denied, seen = (one & chosen[:, None, None] for one in (denied, seen))
-            count = torch.where(seen.sum(dim=0) >= _SEEN * most, denied.sum(dim=0), len(chosen))
+            count = torch.where(seen.sum(dim=0) >= 0.5 * most, denied.sum(dim=0), len(chosen))
             fewest = count.amin(dim=-1)
             valid = fewest < len(chosen)
             best = (count == fewest[:, None]) & valid[:, None]
@@ -265,7 +256,8 @@ def _conflicts(
             borders[:, None], grid_from_pixels(pixels, width, height), align_corners=False
         )[:, 0]
         reach = step[:, None] * cameras.intrinsics[:, 0, 0, None, None] / depth
-        return seen & (value < -reach - _SLACK * max(height, width)), seen
+        # Masks are drawn by hand.
+        return seen & (value < -reach - 0.01 * max(height, width)), seen
 
     shape = len(small), len(small), _PIXELS, _PLACES
     conflicts = _Conflicts(denied=zeros(shape, torch.bool), seen=zeros(shape, torch.bool))
