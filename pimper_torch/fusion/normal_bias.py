@@ -6,8 +6,8 @@ same light: their common error is not taken out, but its variance is given. Deta
 with independent errors, the coarse shape with common errors, and both are put together.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
-precise 3D geometry, SIGGRAPH 2005, for the idea; facets and functions linear on them in place of a smoothing kernel are
-ours.
+precise 3D geometry, SIGGRAPH 2005, for the idea; facets, and functions linear on them,
+in place of a smoothing kernel are ours.
 """
 
 import math

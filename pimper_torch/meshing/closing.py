@@ -11,7 +11,7 @@ from pimper_torch.errors import InputError
 from pimper_torch.fusion.continuation import continued
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
-from pimper_torch.meshing.groups import diagonal
+from pimper_torch.meshing.faults import diagonal
 from pimper_torch.records import Mesh, Record
 
 

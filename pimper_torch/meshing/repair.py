@@ -22,8 +22,7 @@ from pimper_torch.geometry.topology import (
 )
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.systems import solutions
-from pimper_torch.meshing.faults import faults
-from pimper_torch.meshing.groups import diagonal, small_groups
+from pimper_torch.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.records import Surface
 from pimper_torch.stage import Stage
 

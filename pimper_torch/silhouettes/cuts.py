@@ -1,4 +1,7 @@
-"""Alternate cuts of every view with a vote of all views on their visual hull."""
+"""Alternate cuts of every view with a vote of all views on their visual hull.
+
+Cuts start from labels that are certain: of points, of parallax and, after a vote, of the hull.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -33,6 +36,19 @@ from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 # Fractions of the views that may lack what the others have in common, tried in turn until that
 # takes so much of a median mask; a mask that shows less than this of it is of something else.
 _DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
+
+# Lengths are fractions of the pictures' longer side.
+_DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
+_CLOSING = 1 / 90
+_DEEP = 1 / 50  # parallax this far inside the projection tells object
+_THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
+_MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
+
+# Agreement with neighbours moved by the plane: below is not the plane, above is.
+_OFF_PLANE = 0.4
+_NOT_PLANE = 0.6
+_ON_PLANE = 0.75
+_THROUGH = 0.2  # of a hole: its border agrees with nothing
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
@@ -136,9 +152,7 @@ def _in_front(
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Cut from points and parallax; by parallax alone where backgrounds are all round.
-
-    So they do where hardly any points are the object's.
+    """Cut from points and parallax; by parallax alone before a room, or with hardly a point.
 
     Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
     """
@@ -273,24 +287,6 @@ def _voted(
         return margins(hull, cameras.intrinsics[view], frame, (width, height))
 
     return of_views(margin, len(masks))
-
-
-# Lengths are fractions of the pictures' longer side.
-_DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
-_CLOSING = 1 / 90
-_DEEP = 1 / 50  # parallax this far inside the projection tells object
-_THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
-_MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
-_FOOT = 1 / 200  # parallax says nothing of an object's foot that is so high
-# Half a window of agreement: next to the object a window that holds some of it agrees no more. On
-# rendered scenes of 24 views (armadillo, mug, balls, potatoes) twice as much is no better.
-_HALF_WINDOW = 1 / 160
-
-# Agreement with neighbours moved by the plane: below is not the plane, above is.
-_OFF_PLANE = 0.4
-_NOT_PLANE = 0.6
-_ON_PLANE = 0.75
-_THROUGH = 0.2  # of a hole: its border agrees with nothing
 
 
 def labels_from_points(
@@ -435,12 +431,12 @@ def held_fraction(
 def surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Find the plane, but not what is next to something else: the object's foot agrees, too."""
     sure = _grainless(agreement > _ON_PLANE)
-    return signed_distance(sure) > _FOOT * max(agreement.shape)
+    return signed_distance(sure) > 1 / 200 * max(agreement.shape)
 
 
 def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Find what some window that agrees with the plane holds."""
-    return signed_distance(_grainless(agreement > _ON_PLANE)) > -_HALF_WINDOW * max(agreement.shape)
+    return signed_distance(_grainless(agreement > _ON_PLANE)) > -1 / 160 * max(agreement.shape)
 
 
 def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
