@@ -46,11 +46,7 @@ class Split(Record):
     def relocate(
         self, parent: Int[Tensor, " point"], barycentric: Float[Tensor, "point 3"]
     ) -> tuple[Int[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Return the child that each point of a face lies in or nearest to, and its coordinates.
-
-        Args:
-            barycentric: Coordinates in that; may be outside.
-        """
+        """Return the child that each point of a face lies in or nearest to, and its coordinates."""
         inverse = torch.linalg.inv(self.corners).to(barycentric)
         first = torch.searchsorted(self.parent, parent)
         last = torch.searchsorted(self.parent, parent, right=True) - 1

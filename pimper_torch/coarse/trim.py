@@ -202,7 +202,6 @@ def fringes(
 
     Args:
         kept: True for faces that are not dropped.
-        supported: True for faces with support.
         smallest: Area from which a supported component is not marked.
         rings: Half the width of the widest narrow strip, in faces.
     """

@@ -29,7 +29,6 @@ class MatchingLevel(Record):
         tone: Root of gray radiance, so that noise is about the same everywhere; about 1 at
             the photographs' bright level.
         usable: False outside photographs and masks.
-        cameras: At this resolution.
     """
 
     tone: Float[Tensor, "view height width"]

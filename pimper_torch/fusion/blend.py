@@ -62,9 +62,7 @@ class Blend(Record):
             0 where not swept.
         offset_information: Inverse variance of the offsets; 0 where not swept.
         prior_normals_world: That were guessed, unit; zero where none was.
-        prior_normal_information: Inverse variance of these.
         prior_offsets: Like ``offsets``, that were guessed.
-        prior_offset_information: Inverse variance of these.
     """
 
     heights: Float[Tensor, " vertex"]

@@ -39,7 +39,6 @@ class Coarse(Record):
         shape: The same, with the errors that facets have in common.
         exposed: 1 where normals are not known, nor enclosed by known ones, else 0.
         noise: Factors of the variances of all kinds of terms.
-        typical: What else blocks have in common.
     """
 
     subdivision: Subdivision

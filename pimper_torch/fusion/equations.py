@@ -128,8 +128,6 @@ def kept_slopes(
 
     Args:
         edges: Those without normals at both ends.
-        flat: ``q``.
-        directions: ``d``, unit.
         variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
     """
     found = slopes(edges, flat, directions, shape, variance)
@@ -148,7 +146,6 @@ def kept_steps(
     """State that heights go on differing as they do, where edges are not upright.
 
     Args:
-        flat: ``q``.
         transferred: Heights of the surface that there is.
         variance: Of its slopes, squared radians.
     """
@@ -209,7 +206,6 @@ class Contacts(Record):
     """Points that the surface passes through.
 
     Attributes:
-        points: World.
         lines: Along which they are known, unit.
         variance: Of where they are along these; scene units squared.
     """
@@ -226,8 +222,6 @@ class BaseSurface(Record):
 
     Attributes:
         points: Of the subdivided mesh's vertices now.
-        facet: Each vertex lies in.
-        directions: ``d``, unit.
         reach: Points further off are not of this surface.
         finest: Least standard error of a point, as the surface is flat between its vertices.
     """

@@ -42,7 +42,6 @@ class Fused(Record):
     """The heights, the noise factor of each kind of terms, and the last system.
 
     Attributes:
-        heights: Of all vertices, float64.
         factors: What the variances that each kind claims were multiplied by.
         weights: Of every equation of each kind; outliers have less than 1.
         damping: Information of the heights that vertices start at.
@@ -201,11 +200,7 @@ def _evaluated(
     probe: Float[Tensor, " vertex"],
     answer: Float[Tensor, " vertex"],
 ) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
-    """Return squared residuals over the claimed variance, and the number of equations used up.
-
-    Args:
-        probe: Random signs.
-    """
+    """Return squared residuals over the claimed variance, and the number of equations used up."""
     parts = kind.coefficients, kind.targets, kind.information, kind.correlated
     if compiled_for(*parts, weight, heights, answer):
         from pimper_torch.kernels import normal_equations as kernels

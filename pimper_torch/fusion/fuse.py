@@ -143,7 +143,6 @@ class Fuse(Stage):
 
         Args:
             swept: Photometry and swept heights of all patches.
-            contours: What silhouettes say about the surface.
             expected: Whether the expected error of every vertex is found.
             most: Vertices of the subdivided mesh that are solved for at once, about. A surface of
                 more is solved for by overlapping blocks (:mod:`~pimper_torch.fusion.blocks`).

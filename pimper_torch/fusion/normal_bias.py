@@ -32,7 +32,6 @@ class NormalBias(Record):
 
     Attributes:
         tilt: To be added to the normals; world.
-        count: Vertices with normals.
     """
 
     tilt: Float[Tensor, "facet 3"]
@@ -70,7 +69,6 @@ def normal_bias(
     Args:
         normals: Photometric, unit.
         shape: Of the surface, unit.
-        known: Where there are photometric ones.
         most: Larger differences, as across a cliff, are cut to so many radians.
 
     Differentiable.

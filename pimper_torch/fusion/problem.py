@@ -126,7 +126,6 @@ def pose(
 
     Args:
         swept: Photometry and swept heights of all patches.
-        samples_per_vertex: Template samples between neighbouring vertices.
         block: Of a mesh that is laid already; without, one is laid over all facets.
     """
     patches = swept.patches

@@ -102,7 +102,6 @@ class Term(nn.Module):
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
         Args:
-            heights: Of the surface, found without it.
             firm: Vertices whose positions other terms tell.
         """
         del problem, heights, firm

@@ -97,11 +97,7 @@ def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
 
 
 def coarser(matrix: csr_array, prolong: csr_array, restrict: csr_array) -> csr_array:
-    """Return the Galerkin matrix of the coarse unknowns.
-
-    Args:
-        prolong: From :func:`prolongation`.
-    """
+    """Return the Galerkin matrix of the coarse unknowns."""
     from pimper_torch.kernels import multigrid_levels as kernels
 
     parts = [part for each in (matrix, prolong, restrict) for part in parts_of(each)]

@@ -39,7 +39,6 @@ def solve_with_hierarchy(
     """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
 
     Args:
-        hierarchy: Approximates the inverse of A.
         diagonal: Of A; only to measure the residual.
         rhs: ``b``, one column a right-hand side if there are several.
         tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
@@ -93,11 +92,7 @@ def _checked(
     tolerance: float,
     what: str,
 ) -> Iterate:
-    """Return the result of conjugate gradients, or refuse it.
-
-    Args:
-        reached: Values, steps and whether they converged.
-    """
+    """Return the result of conjugate gradients, or refuse it."""
     found, cycles, converged = reached
     scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
     left, side = (scale * residual).norm(dim=0), (scale * rhs).norm(dim=0)

@@ -68,9 +68,6 @@ def solutions(
     Slivers among the faces of a mesh, and weights that differ by a factor of a million between
     neighbours, may slow multigrid down.
 
-    Args:
-        rows: As in :func:`prepare`.
-
     Differentiable in ``values`` and in the sides.
     """
     size = len(sides[0])

@@ -138,7 +138,6 @@ def small_groups(
     """Find the vertices ``among`` whose connected component is small.
 
     Args:
-        among: Vertices to connect along edges.
         max_extent: Diagonal of a component's bounding box.
     """
     label = vertex_components(faces, among)

@@ -135,7 +135,6 @@ class Cues(Record):
 
     Attributes:
         object_px: Pixels of the object's points, one tensor a view.
-        plane: That the object stands on.
         background_from_view: Maps to a room at rest before which the object turns; empty without.
         agreement: With the texture of plane and room, the better of both.
         soft: Masks that the photographs come with as priors.
