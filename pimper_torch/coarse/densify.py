@@ -32,6 +32,14 @@ from pimper_torch.records import Record, SparseScene
 # Views that a view is matched with. A choice.
 _NUM_SOURCES = 5
 
+# Fraction by which the whole range searched exceeds the points' inverse depths, on either side, as
+# the surface reaches beyond its sparse points.
+_RANGE_MARGIN = 0.15
+
+# Angle between rays that match best, the top of a bell curve: below about 5 degrees depth is poorly
+# determined, above about 25 windows look different.
+_BEST_ANGLE_DEG = 12.0
+
 # Of a valid depth: correlation of its windows; other views that agree, and their reprojection
 # error. Choices: two views seldom agree by chance; a pixel is what the finest step resolves.
 _MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
@@ -178,8 +186,7 @@ def _whole_range(
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Search planes parallel to the image, then offsets of a smooth surface through the points."""
     low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
-    # The surface reaches beyond its sparse points.
-    low, high = low - 0.15 * (high - low), high + 0.15 * (high - low)
+    low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
     low = max(low, 0.1 * high)
     count = min(max_hypotheses, max(3, round((high - low) / (_WHOLE_STEP * step))))
     found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
@@ -397,8 +404,7 @@ def choose_sources(
     points_world, shared = scene.points_world[points[here]], observed[here]
     rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
     angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
-    # Below about 5 degrees depth is poorly determined, above about 25 windows look different.
-    away = angle - 12.0
+    away = angle - _BEST_ANGLE_DEG
     value = torch.exp(-(away / torch.where(away < 0, 4.0, 12.0)).square() / 2)
     score = (value * shared).sum(dim=0)
     score[view] = 0

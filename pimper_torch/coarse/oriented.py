@@ -19,6 +19,10 @@ from pimper_torch.mapped import zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, SparseScene
 
+# Length of the mean of unit normals round a point, at least: that of normals which scatter by
+# 60 degrees.
+_MIN_AGREEMENT = 0.5
+
 # Radius of the windows that planes are fitted in, pixels: that of the windows that were matched.
 _RADIUS = 2
 
@@ -291,8 +295,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
 
     parts = torch.split(points, _AT_ONCE)
     found, agreement = zip(*side_by_side(common, parts, tracked=False), strict=True)
-    # That of normals which scatter by 60 degrees.
-    reliable = torch.cat(agreement).to(cloud.normals_world) > 0.5
+    reliable = torch.cat(agreement).to(cloud.normals_world) > _MIN_AGREEMENT
     return cloud.replace(normals_world=torch.cat(found).to(cloud.normals_world)).take(reliable)
 
 

@@ -38,6 +38,10 @@ from pimper_torch.silhouettes.contours import Contours
 # Of the surface's octree, pixels of the finest depth maps at the cloud's median depth. A choice.
 CELL_PX = 4.0
 
+# Cosine between a face's normal and the ray to a camera, above which a view counts: at 84 degrees a
+# face is a tenth as wide as it is long.
+_FACING = 0.1
+
 # Views that see something behind a face which is dropped: one may be wrong.
 _MIN_BEHIND = 2
 
@@ -114,8 +118,7 @@ def view_counts(
         seen, lit, behind = torch.zeros_like(faces[:, 0]).expand(3, -1).clone()
         center = cameras.centers_world[view]
         pixels, depth = project(centre, cameras.cam_from_world[view], cameras.intrinsics[view])
-        # At 84 degrees a face is a tenth as wide as it is long.
-        facing = (normalize(center - centre, dim=-1) * normals).sum(dim=-1) > 0.1
+        facing = (normalize(center - centre, dim=-1) * normals).sum(dim=-1) > _FACING
         within = ((pixels >= 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
         (chosen,) = torch.nonzero(within & facing, as_tuple=True)
         column, row = pixels[chosen].floor().long().unbind(dim=-1)
