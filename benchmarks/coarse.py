@@ -22,21 +22,17 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.coarse.fine_surface import (
-    CELL_PX,
     POINT_PX,
     REACH_PX,
     TOLERANCE_PX,
     closed_surface,
     cropped,
     poisson,
-    seen_surface,
-    supports,
 )
-from pimper_torch.coarse.matched import matched_cloud
-from pimper_torch.coarse.oriented import OrientedPoints
+from pimper_torch.coarse.oriented import OrientedPoints, matched_cloud
 from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import CoarseSurface, reliable_points
-from pimper_torch.coarse.trim import point_distances, view_counts
+from pimper_torch.coarse.trim import CELL_PX, point_distances, seen_surface, supports, view_counts
 from pimper_torch.errors import PimperWarning
 from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras, transfer

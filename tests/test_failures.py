@@ -24,7 +24,7 @@ from pimper_torch.failures import (
 from pimper_torch.failures import collecting as collecting_entries
 from pimper_torch.fusion import estimate
 from pimper_torch.io.reports import summary_report
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
@@ -408,8 +408,6 @@ def test_heights_that_are_not_finite_are_none(given, expected, monkeypatch):
         assert not one.offset[0].any()
         assert not one.information[0].any()
         assert torch.equal(one.offset[1:], other.offset[1:])
-
-
 
 
 # --- whole runs --------------------------------------------------------------------------------

@@ -32,9 +32,13 @@ from pimper_torch.records import Record, SparseScene
 # Views that a view is matched with. A choice.
 _NUM_SOURCES = 5
 
-# Fraction by which the whole range searched exceeds the points' inverse depths, on either side. A
-# choice: the surface reaches beyond its sparse points.
+# Fraction by which the whole range searched exceeds the points' inverse depths, on either side, as
+# the surface reaches beyond its sparse points.
 _RANGE_MARGIN = 0.15
+
+# Angle between rays that match best, the top of a bell curve: below about 5 degrees depth is poorly
+# determined, above about 25 windows look different.
+_BEST_ANGLE_DEG = 12.0
 
 # Of a valid depth: correlation of its windows; other views that agree, and their reprojection
 # error. Choices: two views seldom agree by chance; a pixel is what the finest step resolves.
@@ -387,13 +391,6 @@ def nearest_pixels(
     return grid_sample(maps[:, None], grid[:, None], mode="nearest", align_corners=False)[:, 0, 0]
 
 
-# Angles between rays that match well: below about 5 degrees depth is poorly determined, above
-# about 25 windows look different. Centre and standard deviations of a bell curve; a choice.
-_BEST_ANGLE_DEG = 12.0
-_BELOW_DEG = 4.0
-_ABOVE_DEG = 12.0
-
-
 def choose_sources(
     scene: SparseScene, points: Int[Tensor, " chosen"], view: int, count: int
 ) -> Int[Tensor, " source"]:
@@ -407,8 +404,8 @@ def choose_sources(
     points_world, shared = scene.points_world[points[here]], observed[here]
     rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
     angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
-    width = torch.where(angle < _BEST_ANGLE_DEG, _BELOW_DEG, _ABOVE_DEG)
-    value = torch.exp(-((angle - _BEST_ANGLE_DEG) / width).square() / 2)
+    away = angle - _BEST_ANGLE_DEG
+    value = torch.exp(-(away / torch.where(away < 0, 4.0, 12.0)).square() / 2)
     score = (value * shared).sum(dim=0)
     score[view] = 0
     order = score.argsort(descending=True)[:count]

@@ -33,8 +33,6 @@ from pimper_torch.sfm.sparse_scene import photographed
 _ROOM, _STEPS = 100_000, 48
 # Depths that are searched, in distances to where the cameras look. A choice.
 _NEAREST, _FARTHEST = 0.3, 3.0
-# Fraction of the views with a place in their frames whose masks may lack it: masks err, too.
-_MAX_LACKING = 0.2
 # Points a view that are kept, spread evenly. A choice: with 400 borders of what several views see
 # are lost (Chamfer distance of 8 potatoes of 240x180 0.177 in place of 0.152 % of the diagonal).
 _MOST = 1500
@@ -46,9 +44,6 @@ _AGREEING_PX, _MAX_ERROR_PX = 1.0, 1.5
 # Fraction of the pixels with one agreeing view that must have two: 0.83 and 0.55 with the cameras
 # of rendered potatoes and of a jar with hardly any texture, 0.29 to 0.47 with other views'.
 _MIN_CONFIRMED = 0.5
-# Correlation of windows from which on a view shows a point: that of the maps.
-_ALIKE = 0.5
-_TINY = 1e-9  # inverse depth, so that none is divided by
 # Sizes at which depth is searched: 100, 200, 400 and 800 pixels.
 _MAPS = DensifyConfig(levels=4)
 
@@ -109,7 +104,8 @@ def _room(scene: SparseScene) -> SparseScene:
     framed, shown = _framed(points, cameras, views)
     count = framed.sum(dim=1)
     lacking = (framed & ~shown).sum(dim=1)
-    kept = (count >= _FEWEST_VIEWS) & (lacking <= _MAX_LACKING * count)
+    # Masks err, too.
+    kept = (count >= _FEWEST_VIEWS) & (lacking <= 0.2 * count)
     point, view = (framed & shown)[kept].nonzero(as_tuple=True)
     inside = points[kept]
     return scene.replace(
@@ -188,11 +184,11 @@ def _in_source(
     pairing = pair(maps.level, view, one)
     field, there = maps.inverse_depth[view], maps.agreed > 0
     agrees = agreeing(maps.level, maps.inverse_depth, there, view, one, _AGREEING_PX)[chosen] > 0
-    alike = Matcher(maps.level, pairing, Windows()).scores(field, [0.0])[0, chosen] >= _ALIKE
+    alike = Matcher(maps.level, pairing, Windows()).scores(field, [0.0])[0, chosen] >= 0.5
     rays = pairing.replace(ray=pairing.ray[:, :, chosen])
     height, width = chosen.shape
     grid = grid_from_pixels(rays.look(field[chosen])[0].movedim(1, -1), width, height)
-    depth = 1 / nearest_pixels(maps.inverse_depth[one], grid).clamp_min(_TINY)
+    depth = 1 / nearest_pixels(maps.inverse_depth[one], grid).clamp_min(1e-9)
     # Where the ray is as deep in the source as the source's own map says.
     by_source = (rays.ray[:, 2] / (depth - rays.shift[:, 2:]))[0]
     agrees = agrees & (by_source > 0)

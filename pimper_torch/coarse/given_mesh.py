@@ -15,13 +15,6 @@ from pimper_torch.geometry.welding import welded
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.conventions.mesh_frame import compare_with_scene
 
-# Rays cast along each photograph's longer side. A choice: some 20,000 rays a photograph see every
-# component that is not smaller than a hundredth of it, in milliseconds.
-_RAYS = 160
-
-# Of a face's longest side: a height below which single precision does not tell its normal.
-_MIN_HEIGHT = 1e-6
-
 
 def prepared(
     mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
@@ -60,7 +53,8 @@ def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
         )
     longest = side_lengths(vertices[faces]).amax(dim=1)
     area = face_normals(vertices, faces).norm(dim=-1)
-    flat = ~(area > _MIN_HEIGHT * longest.square())
+    # Single precision does not tell the normal of a lower face.
+    flat = ~(area > 1e-6 * longest.square())
     if bool(flat.all()):
         raise InputError(
             f"coarse mesh: none of the given mesh's {len(faces)} faces has an area; needed: a "
@@ -110,7 +104,8 @@ def _fronts_outward(
     balance, num_hits = torch.zeros_like(normals[:, 0]), 0
     for view in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[view])
-        stride = max(1, max(width, height) // _RAYS)
+        # Some 20,000 rays see every component that is not smaller than a hundredth.
+        stride = max(1, max(width, height) // 160)
         pixels = pixel_centers(width, height, like=vertices)[::stride, ::stride].reshape(-1, 2)
         intrinsics, frame = cameras.intrinsics[view], cameras.cam_from_world[view]
         rays = rays_through(pixels, frame.to(pixels), intrinsics.to(pixels))

@@ -10,25 +10,21 @@ from torch import Tensor
 from torch.linalg import cross
 from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
-from pimper_torch.coarse.densify import DepthMaps
+from pimper_torch.coarse.densify import DensifyConfig, DepthMaps, depth_maps
 from pimper_torch.coarse.window_matching import shifted
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import zeros
 from pimper_torch.parallel import side_by_side
-from pimper_torch.records import Record, SparseScene
+from pimper_torch.records import Cameras, Record, SparseScene
+
+# Length of the mean of unit normals round a point, at least: that of normals which scatter by
+# 60 degrees.
+_MIN_AGREEMENT = 0.5
 
 # Radius of the windows that planes are fitted in, pixels: that of the windows that were matched.
 _RADIUS = 2
-
-# Steps of inverse depth from the centre of a window at which a pixel's weight has fallen to
-# 0.6: more is another surface, or one so steep that views hardly show it. A choice.
-_REACH_STEPS = 3.0
-
-# Fraction of a window that has to lie on the plane: where it is less, the pixel is beside an
-# occluding contour, which windows that match make too large. A choice.
-_MIN_FRACTION = 0.7
 
 # Robust iterations of the plane's fit, and what is added to the diagonal of its normal equations,
 # which are of the order of 10. Choices.
@@ -38,31 +34,9 @@ _ITERATIONS, _RIDGE = 3, 1e-3
 # across a plane over the smaller one along it; least cosine of a normal to the mean ray. Choices.
 _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
 
-# Noisy points share cells of a grid up to 2 to this power times as wide. A choice.
-_MAX_DOUBLINGS = 3
-
-# Steps of inverse depth that a window's pixels may scatter round their plane: more is a match
-# without texture, and a coarser window is more accurate. A choice: a step is a pixel.
-_MAX_NOISE_STEPS = 1.0
-
 # Neighbours of a dense point that its normal is fitted to, a choice, and how many normals are
 # fitted at once, which bounds memory to tens of MB a thread.
 _COMMON, _AT_ONCE = 24, 10_000
-
-# Points, about, whose cells are averaged at once; they take some 150 bytes each. A choice.
-_SLAB = 2_000_000
-
-# Length of the mean of unit normals round a point, at least: that of normals which scatter by
-# 60 degrees. A choice.
-_MIN_AGREEMENT = 0.5
-
-# Steps of inverse depth by which a view's depth map has to lie behind a point to contradict it. A
-# choice: depths that agree differ by a step at most.
-_DENIED_STEPS = 3.0
-
-# Views, spread evenly over all, that may contradict a point: time would grow with the square of
-# their number. The largest real set that the coarse surface was measured on has 66.
-_MAX_DENYING = 66
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -131,7 +105,8 @@ def _of_view(
     inverse_depth, slope, spread, fitted = fitted_planes(
         maps.inverse_depth[view], maps.valid[view], float(maps.step[view])
     )
-    fitted &= wanted & (spread <= _MAX_NOISE_STEPS * maps.step[view])
+    # More noise is a match without texture, and a coarser window is more accurate.
+    fitted &= wanted & (spread <= maps.step[view])
     height, width = fitted.shape
     pixels = pixel_centers(width, height, like=intrinsics)[fitted]
     q, slope, spread = inverse_depth[fitted], slope[fitted], spread[fitted]
@@ -169,7 +144,8 @@ def fitted_planes(
         depth, and True where enough neighbours lie on the plane.
     """
     offset, across, down, variance, fraction = _fits(inverse_depth, valid, max(step, 1e-30))
-    fitted = valid & (fraction >= _MIN_FRACTION) & (offset.abs() < 1)
+    # Where less of a window lies on the plane, the pixel is beside an occluding contour.
+    fitted = valid & (fraction >= 0.7) & (offset.abs() < 1)
     # Neighbouring windows overlap, so that their errors are correlated: averaging gains nothing.
     spread = step * variance.sqrt().clamp_min(0.05)
     return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fitted
@@ -190,7 +166,8 @@ def _fits(
 
     differences = (around(inverse_depth) - inverse_depth[valid]) * (1 / step)
     counted = around(valid.to(inverse_depth))
-    weight = counted * torch.exp(-(differences / _REACH_STEPS).square() / 2)
+    # More steps are another surface, or one so steep that views hardly show it.
+    weight = counted * torch.exp(-(differences / 3.0).square() / 2)
     for _ in range(_ITERATIONS):
         a, b, c = (squares @ weight).double().reshape(3, 3, -1) + ridge
         right = (basis @ (weight * differences))[:, None]
@@ -211,7 +188,8 @@ def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[
     cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
     pixels_from_world = cameras.intrinsics @ cameras.cam_from_world[:, :3]
     height, width = maps.valid.shape[-2:]
-    last, most = cameras.num_views - 1, min(cameras.num_views, _MAX_DENYING)
+    # Time would grow with the square of their number.
+    last, most = cameras.num_views - 1, min(cameras.num_views, 66)
     for other in torch.linspace(0, last, most).round().long().tolist():
         if other == view:
             continue
@@ -224,7 +202,7 @@ def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[
         # Half the time of indexing by rows and columns.
         behind = maps.inverse_depth[other].flatten().index_select(0, pixel)
         known = maps.valid[other].flatten().index_select(0, pixel)
-        count += inside & known & (1 / depth > behind + _DENIED_STEPS * maps.step[other])
+        count += inside & known & (1 / depth > behind + 3.0 * maps.step[other])
     return count
 
 
@@ -240,11 +218,8 @@ def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     """
     if len(cloud.points_world) == 0:
         return cloud
-    doublings = (cloud.noise / (cell / 3)).clamp(1e-6).log2().ceil().clamp(0, _MAX_DOUBLINGS)
-    parts = [
-        _averaged(cloud.take(doublings == rank), cell * 2**rank)
-        for rank in range(_MAX_DOUBLINGS + 1)
-    ]
+    doublings = (cloud.noise / (cell / 3)).clamp(1e-6).log2().ceil().clamp(0, 3)
+    parts = [_averaged(cloud.take(doublings == rank), cell * 2**rank) for rank in range(4)]
     return OrientedPoints.cat(parts)
 
 
@@ -256,7 +231,8 @@ def _averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     low, high = points.amin(dim=0), points.amax(dim=0)
     side = ((high - low) / cell).floor().long() + 1
     column = ((points[:, 0] - low[0]) / cell).floor().long()
-    slab = torch.bincount(column).cumsum(dim=0).sub(1).div(_SLAB, rounding_mode="floor")[column]
+    # They take some 150 bytes a point.
+    slab = torch.bincount(column).cumsum(dim=0).sub(1).div(2_000_000, rounding_mode="floor")[column]
     numbers = torch.unique(slab).tolist()
     slabs = [_of_slab(cloud.take(slab == number), cell, low, side) for number in numbers]
     return OrientedPoints.cat(slabs)
@@ -364,3 +340,40 @@ def sparse_oriented(
         noise=width[:, 0].sqrt().to(points),
     )
     return cloud.take(flat & ~by_dense.to(points.device) & (facing.abs() > _FACING))
+
+
+def matched_cloud(
+    scene: SparseScene,
+    reliable: Int[Tensor, " reliable"],
+    config: DensifyConfig,
+    cell_px: float,
+) -> tuple[OrientedPoints, DepthMaps, float]:
+    """Match the photographs densely, and merge the depth maps and the sparse points.
+
+    Args:
+        cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
+
+    Returns:
+        The cloud, the finest depth maps, and the size of their pixels there, scene units.
+    """
+    maps = depth_maps(scene, reliable, config)
+    pixel = pixel_size(scene, reliable) * maps[-1].factor
+    # The coarsest windows of three reach past contours: they only initialize the finer ones.
+    dense = with_common_normals(thinned(oriented_points(maps[-2:]), cell_px * pixel))
+    cloud = OrientedPoints.cat([dense, sparse_oriented(scene, reliable, dense, 3 * pixel)])
+    return cloud, maps[-1], pixel
+
+
+def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
+    """Return the size of a photograph's pixel at reliable points; the median over observations."""
+    chosen = torch.isin(scene.observation_point, reliable)
+    view, point = scene.observation_view[chosen], scene.observation_point[chosen]
+    frames = scene.cameras.cam_from_world[view]
+    depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]
+    return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())
+
+
+def pixel_size_at(point: Float[Tensor, " 3"], cameras: Cameras) -> float:
+    """Return the size of a photograph's pixel at a point; the median over views."""
+    distance = (cameras.centers_world - point).norm(dim=1)
+    return float((distance / cameras.intrinsics[:, 0, 0]).median())

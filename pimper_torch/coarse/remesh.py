@@ -7,8 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.coarse.inherit import fitted_normals, normal_weights, with_points
-from pimper_torch.coarse.splitting import mark_edges, split_edges
+from pimper_torch.coarse.splitting import (
+    fitted_normals,
+    mark_edges,
+    normal_weights,
+    split_edges,
+    with_points,
+)
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
@@ -25,19 +30,9 @@ from pimper_torch.stage import Stage
 # have far fewer than a million parts.
 _ON_EDGE = 1e-6
 
-# Fraction of a facet's subdivided mesh vertices within its departure.
-_DEPARTURE_QUANTILE = 0.9
-
-# Views that have to see a facet without data, where silhouettes constrain nothing. A choice: one
-# may be wrong.
-_MIN_VIEWS = 2
-
 # A facet whose corners would move stays where its area falls below this fraction, or its longest
 # side grows so many times: it collapses, or has an outlier for a corner. Choices.
 _MIN_AREA, _MAX_STRETCH = 0.05, 4.0
-
-# Photometric residual over the median facet's, above which a facet is split. A choice.
-_MAX_RESIDUAL = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +89,7 @@ class Remesh(Stage):
         ):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual[templates.facet] = known.detach().to(residual)
-            seen[templates.facet] |= heights.num_views >= _MIN_VIEWS
+            seen[templates.facet] |= heights.num_views >= 2
         inside = within(contours.hull, surface, patches.num_patches)
         leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
         return remesh(
@@ -136,7 +131,7 @@ def remesh(
 
     Returns:
         The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
-        cloud follow :func:`~pimper_torch.coarse.inherit.with_points`. Unused vertices are
+        cloud follow :func:`~pimper_torch.coarse.splitting.with_points`. Unused vertices are
         dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
     Raises:
@@ -267,7 +262,7 @@ def _severity(
     worst = torch.maximum(worst, spread.to(worst))
     if residual is not None:
         typical = residual.nanmedian()
-        relative = residual / torch.where(typical > 0, typical, torch.inf) / _MAX_RESIDUAL
+        relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
         worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
     return worst
 
@@ -283,7 +278,7 @@ def departures(
     order = distance.argsort()
     order = order[surface.facet[order].argsort(stable=True)]
     count = torch.bincount(surface.facet, minlength=len(faces))
-    rank = (_DEPARTURE_QUANTILE * (count - 1).clamp_min(0)).ceil().long()
+    rank = (0.9 * (count - 1).clamp_min(0)).ceil().long()
     last = (count.cumsum(dim=0) - count + rank).clamp_max(len(order) - 1)
     return torch.where(count > 0, distance[order[last]], 0)
 

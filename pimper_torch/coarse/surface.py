@@ -8,17 +8,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.coarse.covariances import point_covariances
 from pimper_torch.coarse.densify import DensifyConfig
-from pimper_torch.coarse.fine_surface import FineSurfaceConfig, fine_surface, min_fraction
+from pimper_torch.coarse.fine_surface import fine_surface
 from pimper_torch.coarse.given_mesh import oriented_outward, prepared
-from pimper_torch.coarse.matched import pixel_size
+from pimper_torch.coarse.oriented import pixel_size
 from pimper_torch.coarse.reference import reference_view
-from pimper_torch.coarse.trim import supported_components
+from pimper_torch.coarse.trim import FineSurfaceConfig, min_fraction, supported_components
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import triangulation_angles
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
@@ -212,3 +212,48 @@ def _facets(
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
     few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
     return few.vertices_world, few.faces
+
+
+def point_covariances(
+    scene: SparseScene, index: Int[Tensor, " chosen"]
+) -> Float[Tensor, "chosen 3 3"]:
+    r"""Return the covariance of triangulated points.
+
+    .. math:: C = \sigma^2 \Big( \sum_{views} J^T J \Big)^{-1}
+
+    with J the derivative of the pixel by the point: a point is uncertain along its rays, the
+    more so the farther it is and the narrower the angle between them. The pixel's noise
+    :math:`\sigma` is estimated from the point's mean reprojection error :math:`e` over n
+    views, :math:`\sigma^2 = (2 e^2 / \pi) \, 2n / (2n - 3)` for Gaussian noise, blended with
+    the median of the cloud, as a short track says little about its own noise. Cameras are
+    taken as exact.
+
+    Returns:
+        Scene units squared.
+
+    Source: Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 5.2, for the
+    back-propagation of pixel noise.
+    """
+    cameras, point = scene.cameras, scene.observation_point
+    view, count = scene.observation_view, len(scene.points_world)
+    frames = cameras.cam_from_world[view].double()
+    intrinsics = cameras.intrinsics[view].double()
+    points = transform(frames, scene.points_world[point, None].double())
+    depth = points[:, 0, 2, None, None]
+    pixel = (points @ intrinsics.mT)[:, 0, :2, None] / depth
+    inward = intrinsics.new_tensor([0, 0, 1])
+    rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
+    information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]
+    # A depth has a standard deviation of at most 1,000 times that across, as in one view.
+    least = 1e-6 * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
+    covariance = torch.linalg.inv(information + least[:, None, None] * eye)
+
+    views = torch.bincount(point, minlength=count).double()
+    freedom = (2 * views - 3).clamp_min(1)
+    error = scene.reprojection_errors_px.double()
+    noise = 2 / torch.pi * error.square() * 2 * views / freedom
+    common = noise.median()
+    # The median counts as the residuals of two tracks of three views.
+    blended = (6 * common + freedom * noise) / (6 + freedom)
+    return (blended[index, None, None] * covariance).to(scene.points_world)

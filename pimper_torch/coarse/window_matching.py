@@ -20,13 +20,6 @@ from pimper_torch.kernels.arrays import as_array
 from pimper_torch.mapped import by_view, each
 from pimper_torch.records import Cameras, Record, SparseScene
 
-# Added to radiance over its bright level before the root, so that the noise of black pixels is not
-# stretched without limit. A choice.
-_PEDESTAL = 0.01
-
-# Quantile of radiance that is the bright level: above it lie highlights. A choice.
-_BRIGHT = 0.98
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MatchingLevel(Record):
@@ -36,7 +29,6 @@ class MatchingLevel(Record):
         tone: Root of gray radiance, so that noise is about the same everywhere; about 1 at
             the photographs' bright level.
         usable: False outside photographs and masks.
-        cameras: At this resolution.
     """
 
     tone: Float[Tensor, "view height width"]
@@ -60,11 +52,13 @@ def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
     usable = by_view(lambda one: avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4, usable)
     shown = torch.cat([one[lit] for one, lit in each(gray, usable)])
     shown = shown if len(shown) else gray.reshape(-1)
-    rank = min(len(shown), int(_BRIGHT * len(shown)) + 1)
+    # Above it lie highlights.
+    rank = min(len(shown), int(0.98 * len(shown)) + 1)
     level = np.partition(shown.cpu().numpy(), rank - 1)[rank - 1]
     bright = max(float(level), torch.finfo(gray.dtype).tiny)
     return MatchingLevel(
-        tone=by_view(lambda one: (one / bright + _PEDESTAL).sqrt(), gray),
+        # The noise of black pixels is not stretched without limit.
+        tone=by_view(lambda one: (one / bright + 0.01).sqrt(), gray),
         usable=usable,
         cameras=Cameras(
             intrinsics=scale_intrinsics(cameras.intrinsics, 1 / factor, 1 / factor),

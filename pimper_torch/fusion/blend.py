@@ -34,17 +34,6 @@ from pimper_torch.records import (
     Templates,
 )
 
-# Rays at a flatter angle to the patch (cosine) are not intersected with it: 78 degrees from its
-# normal, a choice.
-_FACING = 0.2
-
-# How far outside the band a ray may cross the facet's plane and still meet its height field inside:
-# a choice.
-_SLACK_BANDS = 2.0
-
-# Samples at the border of a template whose cells are not whole, so that no ray meets them.
-_RAGGED_SAMPLES = 1.5
-
 # An outlier twice as far away as allowed counts an eleventh: a choice.
 _DISTRUST = 10.0
 
@@ -73,9 +62,7 @@ class Blend(Record):
             0 where not swept.
         offset_information: Inverse variance of the offsets; 0 where not swept.
         prior_normals_world: That were guessed, unit; zero where none was.
-        prior_normal_information: Inverse variance of these.
         prior_offsets: Like ``offsets``, that were guessed.
-        prior_offset_information: Inverse variance of these.
     """
 
     heights: Float[Tensor, " vertex"]
@@ -271,7 +258,8 @@ def _bands(
     step = templates.spacing[:, None] * opposite / twice_area  # barycentric, for one sample
     inside = templates.inside[..., None]
     reach = torch.where(inside, -templates.barycentric, 0).amax(dim=(1, 2))
-    return corners, torch.maximum(reach - _RAGGED_SAMPLES * step, step / 2)
+    # At a template's border cells are not whole, so that no ray meets them.
+    return corners, torch.maximum(reach - 1.5 * step, step / 2)
 
 
 def _rays_near(
@@ -294,11 +282,13 @@ def _rays_near(
     frame, from_patch = templates.patch_from_world, _barycentric_map(corners)
     start = transform(frame[patch], subdivision.points[vertex, None])[:, 0]
     along = rotate(frame[patch], directions[vertex, None])[:, 0]
-    facing = along[:, 2] < -_FACING
+    # At 78 degrees from its normal and more.
+    facing = along[:, 2] < -0.2
     distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
     crossing = start[:, :2] + distance[:, None] * along[:, :2]
     barycentric = (from_patch[patch, :, :2] @ crossing[..., None])[..., 0] + from_patch[patch, :, 2]
-    close = (barycentric > -(1 + _SLACK_BANDS) * bands[patch]).all(dim=-1)
+    # A ray may cross the facet's plane further outside and still meet its height field.
+    close = (barycentric > -3 * bands[patch]).all(dim=-1)
     near = facing & close
     counts = torch.bincount(patch[near], minlength=len(templates.facet))
     listed = pad_sequence(list(torch.split(vertex[near], counts.tolist())), batch_first=True)

@@ -23,12 +23,6 @@ from pimper_torch.records import Mesh, Record
 # Rings of facets round those of a block: the first is blended with its neighbours.
 _RINGS = 2
 
-# Blocks that the noise is estimated from.
-_SAMPLED = 2
-
-# Equations that a block needs to tell the noise of their kind to a tenth of a standard deviation.
-_ENOUGH = 200
-
 # Values that all blocks have in common, by name: the factor of a kind of terms by the number of
 # the term and that of the kind among the term's.
 Key = str | tuple[int, int]
@@ -45,7 +39,6 @@ class Coarse(Record):
         shape: The same, with the errors that facets have in common.
         exposed: 1 where normals are not known, nor enclosed by known ones, else 0.
         noise: Factors of the variances of all kinds of terms.
-        typical: What else blocks have in common.
     """
 
     subdivision: Subdivision
@@ -154,7 +147,8 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Float[Tensor, ""]]]]) -> Ty
     total: dict[Key, Tensor] = {}
     for sample in samples:
         for key, (number, value) in sample.items():
-            if number >= _ENOUGH:
+            # So many tell the noise of their kind to a tenth of a standard deviation.
+            if number >= 200:
                 count[key] += number
                 total[key] = total.get(key, torch.zeros_like(value)) + number * value
     return {key: value / count[key] for key, value in total.items()}
@@ -162,7 +156,7 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Float[Tensor, ""]]]]) -> Ty
 
 def sampled(parts: Sequence[Bool[Tensor, " facet"]]) -> Sequence[Bool[Tensor, " facet"]]:
     """Return the parts that noise is estimated from."""
-    return parts[:: math.ceil(len(parts) / _SAMPLED)]
+    return parts[:: math.ceil(len(parts) / 2)]
 
 
 def parts_of(whole: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:

@@ -17,10 +17,6 @@ from pimper_torch.geometry.topology import boundary_vertices, vertex_components
 from pimper_torch.linalg.sums import average, total
 from pimper_torch.linalg.systems import solutions
 
-# The mean counts as much as this fraction of a neighbour at least, so that the system is not
-# singular: a choice.
-_MIN_DAMPING = 1e-6
-
 
 def continued(
     values: Float[Tensor, "vertex channel"],
@@ -35,7 +31,8 @@ def continued(
         values: Of the vertices; anything where they are not known.
         edges: Between neighbours, each once.
         otherwise: What the others are taken for, far from what is known.
-        damping: How many neighbours that counts as, above 0.
+        damping: How many neighbours that counts as; above 0 unless all have a known one, or one
+            that has.
 
     Differentiable in the values that are known, and in the others' ``otherwise`` and ``damping``.
 
@@ -85,7 +82,7 @@ def about_mean(
     one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
     step = total((one - other).square()) / max(len(one), 1)
     damping = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
-    damping = damping.clamp_min(_MIN_DAMPING).expand(len(values))
+    damping = damping.clamp_min(1e-6).expand(len(values))
     return continued(values, known, edges, mean.expand_as(values), damping)
 
 

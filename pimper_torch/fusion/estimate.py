@@ -22,7 +22,7 @@ from pimper_torch.fusion.equations import Equations
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.least_squares import compressed_equations, normal_equations
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.linalg.sums import total
 from pimper_torch.linalg.systems import solutions, solve_compressed
 from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
@@ -32,17 +32,9 @@ from pimper_torch.records import Failure, Record
 # spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
 _ACCURATE, _ESTIMATING, _EXACT = 1e-6, 1e-4, 1e-8
 
-# Equations of a kind that its noise is estimated from at least, where there are so many: the
-# factor's standard error is then below 0.2 %.
-_SUBSET = 500_000
-
 # No source claims more than twice its true standard error: residuals of a kind that outweighs all
 # others vanish, which would raise its weight without bound.
 _MIN_FACTOR = 0.25
-
-# Least redundancy of a kind, as a fraction of its equations: its estimate by random signs may be
-# negative.
-_MIN_REDUNDANCY = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -50,7 +42,6 @@ class Fused(Record):
     """The heights, the noise factor of each kind of terms, and the last system.
 
     Attributes:
-        heights: Of all vertices, float64.
         factors: What the variances that each kind claims were multiplied by.
         weights: Of every equation of each kind; outliers have less than 1.
         damping: Information of the heights that vertices start at.
@@ -108,9 +99,11 @@ def fuse_terms(
                     continue
                 square, used = _evaluated(kind, weights[index], heights, probe, answer)
                 redundancy = 1 - used / found[index] / total(weights[index])
-                square = square / redundancy.clamp_min(_MIN_REDUNDANCY)
+                # Its estimate by random signs may be negative.
+                square = square / redundancy.clamp_min(0.05)
                 if factors is None:
-                    found[index] = noise_factor(square[:: max(1, len(square) // _SUBSET)])
+                    # The factor's standard error is then below 0.2 %.
+                    found[index] = noise_factor(square[:: max(1, len(square) // 500_000)])
                 weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
         (heights,) = _solved(
             kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
@@ -207,11 +200,7 @@ def _evaluated(
     probe: Float[Tensor, " vertex"],
     answer: Float[Tensor, " vertex"],
 ) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
-    """Return squared residuals over the claimed variance, and the number of equations used up.
-
-    Args:
-        probe: Random signs.
-    """
+    """Return squared residuals over the claimed variance, and the number of equations used up."""
     parts = kind.coefficients, kind.targets, kind.information, kind.correlated
     if compiled_for(*parts, weight, heights, answer):
         from pimper_torch.kernels import normal_equations as kernels

@@ -22,9 +22,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused
+from pimper_torch.fusion.normal_bias import CoarsePart
 from pimper_torch.fusion.terms import UNMEASURED
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
@@ -34,9 +34,6 @@ from pimper_torch.linalg.systems import prepare
 # surface of rendered mug, potatoes and jar (16 photographs of 640x480) are correlated by 0.5 to
 # 0.8 over 1.5 to 3 % of the diagonal and by 0.3 to 0.5 over 3 to 6 %; their facets are 2 to 3 %.
 _REGION = 2.5
-
-# Of the answers, relative, in the energy norm: far below the sampling error of a dozen draws.
-_ACCURACY = 1e-2
 
 
 @torch.no_grad()
@@ -79,7 +76,7 @@ def _answers(fused: Fused, sides: list[Float[Tensor, " vertex"]]) -> Float[Tenso
     """Return the heights' answers to errors of the targets, all draws at once."""
     rows, cols, values = fused.matrix()
     what = "the expected error"
-    system = prepare(rows, cols, values, len(fused.heights), what, tolerance=_ACCURACY)
+    system = prepare(rows, cols, values, len(fused.heights), what, tolerance=1e-2)
     del rows, cols, values
     return system.solve(torch.stack(sides, dim=1))
 

@@ -18,14 +18,13 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import solved_or
-from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.blend import Blend, ray_directions, vertex_spacing
 from pimper_torch.fusion.blocks import Coarse, Key, Typical, block_of, parts_of, pooled, sampled
 from pimper_torch.fusion.continuation import about_mean, enclosed
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
-from pimper_torch.fusion.normal_bias import NormalBias, normal_bias
+from pimper_torch.fusion.normal_bias import CoarsePart, NormalBias, normal_bias
 from pimper_torch.fusion.problem import FINEST, Problem, laid, pose
 from pimper_torch.fusion.terms import (
     ROTATION,
@@ -118,7 +117,7 @@ class Fuse(Stage):
     and taken out. So have swept heights: the variance of their common error is estimated from the
     other kinds, and limits their weight (:mod:`~pimper_torch.fusion.normal_bias`). Detail comes
     from a solve with independent errors, the coarse shape from one with common errors
-    (:mod:`~pimper_torch.fusion.bands`).
+    (:mod:`~pimper_torch.fusion.normal_bias`).
 
     The surface's normals are its own; its albedo is continued where it is not known, with
     information 0. Differentiable in templates, normals, albedo, information, swept heights and the
@@ -144,7 +143,6 @@ class Fuse(Stage):
 
         Args:
             swept: Photometry and swept heights of all patches.
-            contours: What silhouettes say about the surface.
             expected: Whether the expected error of every vertex is found.
             most: Vertices of the subdivided mesh that are solved for at once, about. A surface of
                 more is solved for by overlapping blocks (:mod:`~pimper_torch.fusion.blocks`).

@@ -2,10 +2,12 @@
 
 Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
 every facet, blended between facets, is taken out of the normals. Swept heights are found in the
-same light: their common error is not taken out, but its variance is given.
+same light: their common error is not taken out, but its variance is given. Detail is solved for
+with independent errors, the coarse shape with common errors, and both are put together.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
-precise 3D geometry, SIGGRAPH 2005, for the idea; facets in place of a smoothing kernel are ours.
+precise 3D geometry, SIGGRAPH 2005, for the idea; facets, and functions linear on them,
+in place of a smoothing kernel are ours.
 """
 
 import math
@@ -17,10 +19,8 @@ from torch import Tensor
 
 from pimper_torch.fusion.equations import Common, Equations
 from pimper_torch.geometry.subdivision import Subdivision
+from pimper_torch.linalg.systems import prepare
 from pimper_torch.records import Record
-
-# Median of the square of unit Gaussian noise.
-_MEDIAN_SQUARE = 0.4549
 
 # Median of the squared length of a vector of two components of unit Gaussian noise.
 MEDIAN_OF_TILT = 2 * math.log(2)
@@ -32,7 +32,6 @@ class NormalBias(Record):
 
     Attributes:
         tilt: To be added to the normals; world.
-        count: Vertices with normals.
     """
 
     tilt: Float[Tensor, "facet 3"]
@@ -70,7 +69,6 @@ def normal_bias(
     Args:
         normals: Photometric, unit.
         shape: Of the surface, unit.
-        known: Where there are photometric ones.
         most: Larger differences, as across a cliff, are cut to so many radians.
 
     Differentiable.
@@ -108,7 +106,8 @@ def common_variance(
     mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
     used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)
     square = (mean[used] / total[used]).square()
-    return square.median() / _MEDIAN_SQUARE if len(square) > 0 else off.new_zeros(())
+    # The median of the square of unit Gaussian noise.
+    return square.median() / 0.4549 if len(square) > 0 else off.new_zeros(())
 
 
 def common(
@@ -117,3 +116,42 @@ def common(
     """Return the error that the known vertices of each facet have in common."""
     count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
     return Common(variance=variance, count=count[facet].to(variance))
+
+
+class CoarsePart:
+    """Gives the continuous function linear on every facet that is nearest to values."""
+
+    def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:
+        self._subdivision, self._facets = subdivision, facets
+        self._size = int(facets.max()) + 1
+        fraction = subdivision.barycentric.double()
+        rows, cols, entries = [], [], []
+        for one in range(3):
+            for other in range(3):
+                rows.append(facets[:, one])
+                cols.append(facets[:, other])
+                product = fraction[:, one] * fraction[:, other]
+                sums = product.new_zeros(len(facets)).index_add(0, subdivision.facet, product)
+                entries.append(sums)
+        each = torch.arange(self._size, device=facets.device)
+        # It only keeps corners without a vertex from being singular.
+        damping = torch.full_like(each, 1e-3, dtype=fraction.dtype)
+        self._normal = prepare(
+            torch.cat([each, *rows]),
+            torch.cat([each, *cols]),
+            torch.cat([damping, *entries]),
+            self._size,
+            "the fusion's coarse shape",
+        )
+
+    def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
+        """Return it at the subdivided mesh's vertices, in one column or several. Differentiable."""
+        columns = values.double().reshape(len(values), -1)
+        side = columns.new_zeros(self._size, columns.shape[1])
+        for corner in range(3):
+            fraction = self._subdivision.barycentric[:, corner, None].double()
+            side = side.index_add(
+                0, self._facets[self._subdivision.facet, corner], fraction * columns
+            )
+        at = self._normal.solve(side)
+        return self._subdivision.interpolate(at, self._facets).to(values).reshape(values.shape)

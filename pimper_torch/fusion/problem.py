@@ -8,8 +8,7 @@ from torch import Tensor
 
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.fusion.blocks import Block, Typical
-from pimper_torch.fusion.contacts import BaseSurface
-from pimper_torch.fusion.equations import upright
+from pimper_torch.fusion.equations import BaseSurface, upright
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, face_edges
@@ -17,23 +16,9 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.memory import release_memory
 from pimper_torch.records import DepthPatches, Depths, FacetPoints, Record, SweptPatches
 
-# Information of every vertex about its present height, in units of one over its spacing squared:
-# as if it were known to 100 spacings. It decides where nothing else does.
-_DAMPING = 1e-4
-
-# The same of a vertex that is held on the border of a block: a hundred times the information of
-# slopes that are known to 0.25 degrees.
-_HELD = 1e7
-
-# Points of the cloud further off the surface than this, in its spacings, are not of it: a choice.
-_REACH = 20.0
-
 # Between its vertices the surface is flat: points know no more than this fraction of a spacing. A
 # choice.
 FINEST = 0.03
-
-# How far, in samples, a patch may lie from the others before they outvote it: a choice.
-_OUTLIER_SAMPLES = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -102,7 +87,7 @@ class Problem(Record):
             facet=self.facet,
             heights=self.blend.heights,
             directions=self.directions,
-            reach=float(_REACH * self.spacing.detach()),
+            reach=float(20.0 * self.spacing.detach()),
             finest=FINEST * self.spacing,
         )
 
@@ -110,7 +95,7 @@ class Problem(Record):
     def damping(self) -> Float[Tensor, " vertex"]:
         """Information of every vertex's present height, and of one that is held."""
         square = self.spacing**2
-        return torch.where(self.block.held, _HELD / square, _DAMPING / square)
+        return torch.where(self.block.held, 1e7 / square, 1e-4 / square)
 
     @property
     def start(self) -> Float[Tensor, " vertex"]:
@@ -141,7 +126,6 @@ def pose(
 
     Args:
         swept: Photometry and swept heights of all patches.
-        samples_per_vertex: Template samples between neighbouring vertices.
         block: Of a mesh that is laid already; without, one is laid over all facets.
     """
     patches = swept.patches
@@ -152,7 +136,7 @@ def pose(
     directions = ray_directions(subdivision, patches.coarse)
     some = swept.of_facets(block.facets)
     height_fields = transferred_height_fields(some)
-    blend = blend_patches(height_fields, subdivision, directions, _OUTLIER_SAMPLES, some.buckets)
+    blend = blend_patches(height_fields, subdivision, directions, 4.0, some.buckets)
     del some, height_fields
     # A vertex stands for so many samples, each of which has its own information.
     density = samples_per_vertex**2

@@ -12,12 +12,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from pimper_torch.fusion.contacts import Contacts, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.continuation import continued, enclosed
 from pimper_torch.fusion.equations import (
+    Contacts,
     Equations,
+    cloud_points,
+    contour_tangents,
     kept_slopes,
     kept_steps,
+    passing,
     slopes,
     swept_heights,
     upright,
@@ -34,9 +37,6 @@ from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.linalg.sums import total
 from pimper_torch.silhouettes.contours import Contours
-
-# An angle from vertex to vertex that is larger, in radians, is a fold's: a choice.
-_FOLD = 0.25
 
 # Least squared angle from vertex to vertex, radians, and least variance of the slopes that a
 # surface has already: they keep weights finite on flat facets and exact surfaces.
@@ -102,7 +102,6 @@ class Term(nn.Module):
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
         Args:
-            heights: Of the surface, found without it.
             firm: Vertices whose positions other terms tell.
         """
         del problem, heights, firm
@@ -401,5 +400,5 @@ def rotation(problem: Problem) -> Float[Tensor, ""]:
         return problem.typical[ROTATION]
     edges = problem.edges[problem.lit]
     one, other = problem.normals[edges].unbind(dim=1)
-    square = (one - other).square().sum(dim=1).clamp_max(_FOLD**2)
+    square = (one - other).square().sum(dim=1).clamp_max(0.25**2)
     return (total(square) / max(len(edges), 1)).clamp_min(_MIN_ROTATION)

@@ -17,9 +17,6 @@ from torch.nn.functional import pad
 # a row of samples must not miss because rounding put it a hair beside the row.
 _NEGLIGIBLE_WEIGHT = 1e-4
 
-# A ray has met the height field when it passes this close, in sample spacings.
-_TOUCHING = 0.02
-
 
 def sample_raster(
     values: Float[Tensor, "patch channel height width"],
@@ -111,7 +108,7 @@ def intersect_height_field(
         hit = (
             (supported >= 1 - _NEGLIGIBLE_WEIGHT)
             & _within(points[..., :2], origin, spacing, depth.shape[-2:])
-            & (gap.abs() <= _TOUCHING * spacing[:, None])
+            & (gap.abs() <= 0.02 * spacing[:, None])
             & (rate.abs() > normal_enough)
         )
     return points, hit

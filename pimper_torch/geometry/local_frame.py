@@ -16,11 +16,6 @@ Offset = tuple[float, float, float]
 
 NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 
-# Distance of a scene from the origin, in its own radii, from which it is shifted: from there on
-# single precision moves points by a thousandth of what a pixel of a 2000 pixels wide photograph
-# shows, ``10 * 2**-24`` against ``1 / 2000`` of a radius.
-_FAR = 10.0
-
 
 def local_origin(
     cam_from_world: Float[Tensor, "view 4 4"], points_world: Float[Tensor, "point 3"]
@@ -49,7 +44,8 @@ def local_origin(
     radius = float((centers - middle).norm(dim=1).median())
     if radius == 0:  # cameras that all stand there
         radius = float((centers - middle).norm(dim=1).max())
-    if radius == 0 or float(middle.norm()) <= _FAR * radius:
+    # From here on single precision moves points by a thousandth of a pixel of 2000.
+    if radius == 0 or float(middle.norm()) <= 10.0 * radius:
         return NO_OFFSET
     digits = -math.floor(math.log10(radius))
     x, y, z = (round(value, digits) + 0.0 for value in middle.tolist())  # no -0.0

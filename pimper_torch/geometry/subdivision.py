@@ -20,11 +20,6 @@ from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Record
 
-# An edge has at most so many times the pieces that it would have if its facet were equilateral,
-# of the same area: those of a half square's diagonal, and at most 2 points a spacing squared,
-# where the equilateral subdivided mesh has 1.2.
-_MAX_PIECES = 1.32
-
 # Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
 # which one counts alone.
 _BLENDED, _TOGETHER = 3, 1e-12
@@ -192,7 +187,8 @@ def _pieces(
         unset = torch.full_like(length, torch.inf)
         return unset.scatter_reduce(0, facet_edges.flatten(), spread, "amin")
 
-    length = torch.minimum(length, _MAX_PIECES * least(equilateral))
+    # The pieces of a half square's diagonal: at most 2 points a spacing squared.
+    length = torch.minimum(length, 1.32 * least(equilateral))
     return (length / least(spacing)).round().long().clamp_min(1)
 
 

@@ -10,9 +10,6 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Record, SparseScene
 
-_TRIALS = 2000  # three good points of fifteen in a hundred are missed with probability 0.001
-_MIN_POINTS = 20
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaneSearch:
@@ -102,10 +99,11 @@ def supporting_plane(
         do, the one with most points, refitted to them.
     """
     count = len(points_world)
-    if count < _MIN_POINTS:
+    if count < 20:
         return None
     tolerance, generator = search.tolerance * distance, torch.Generator()
-    drawn = torch.randint(count, (_TRIALS, 3), generator=generator.manual_seed(search.seed))
+    # Three good points of fifteen in a hundred are missed with probability 0.001.
+    drawn = torch.randint(count, (2000, 3), generator=generator.manual_seed(search.seed))
     a, b, c = points_world[drawn.to(points_world.device)].unbind(dim=1)
     normals = normalize(torch.linalg.cross(b - a, c - a), dim=1)
     offsets = (normals * a).sum(dim=1)

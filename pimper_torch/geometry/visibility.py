@@ -18,10 +18,6 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Mesh, Record
 
-# Distance of a mesh from the origin, in its own diagonals, from which single precision moves it by
-# more than a millionth of its diagonal.
-_FAR = 16.0
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Hits(Record):
@@ -184,7 +180,8 @@ def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:
         return None
     low, high = vertices.amin(dim=0), vertices.amax(dim=0)
     middle = (low + high) / 2
-    return middle if bool(middle.norm() > _FAR * (high - low).norm()) else None
+    # Single precision moves such a mesh by more than a millionth of its diagonal.
+    return middle if bool(middle.norm() > 16.0 * (high - low).norm()) else None
 
 
 def _reaches(

@@ -29,13 +29,7 @@ SFM = ("line_matches", "patch_alignment")
 COARSE = ("window_scores",)
 PHOTOMETRY = ("resampling", "lights_and_albedo", "factorization")
 SWEEP = ("sweep_costs",)
-SURFACE = (
-    "normal_equations",
-    "sparse_products",
-    "vector_updates",
-    "multigrid_levels",
-    "decimation",
-)
+SURFACE = ("normal_equations", "sparse_products", "vector_updates", "multigrid_levels")
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.

@@ -30,9 +30,6 @@ Product = Callable[[Tensor], Tensor]
 # Up to so many unknowns, the coarsest level is solved by a dense inverse: a choice.
 _DENSE = 400
 
-# Coarsening stops where it leaves more than this fraction of the unknowns: a choice.
-_MAX_COARSE_FRACTION = 0.8
-
 # Chebyshev's polynomial smooths the part of the spectrum, [0, 2], above 2 / _SPAN: a choice; the
 # part below is left to the coarse unknowns.
 _SPAN = 4
@@ -198,7 +195,7 @@ class Hierarchy:
             prolong_matrix = prolongation(matrix) if matrix.shape[0] > _DENSE else None
             if (
                 prolong_matrix is not None
-                and not 0 < prolong_matrix.shape[1] < _MAX_COARSE_FRACTION * matrix.shape[0]
+                and not 0 < prolong_matrix.shape[1] < 0.8 * matrix.shape[0]
             ):
                 prolong_matrix = None
             restrict_matrix = None if prolong_matrix is None else prolong_matrix.T.tocsr()

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.linalg.prepared import PreparedMatrix
-from pimper_torch.linalg.singular import WORST_RESIDUAL, SingularSystemError
+from pimper_torch.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
 
 # Above this the solution has fewer than three digits in float64; an exactly singular
 # matrix that survives elimination by rounding lands at 1e15 and more.

@@ -9,8 +9,7 @@ from torch import Tensor
 from pimper_torch.failures import reason_of, skipped
 from pimper_torch.linalg.aggregation import parts_of
 from pimper_torch.linalg.multigrid import Multigrid, solve_by_cycles
-from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
-from pimper_torch.linalg.singular import SingularSystemError, refuse_hopeless
+from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE, SingularSystemError, refuse_hopeless
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.sums import total
 from pimper_torch.parallel import over_rows
@@ -68,9 +67,6 @@ def solutions(
 
     Slivers among the faces of a mesh, and weights that differ by a factor of a million between
     neighbours, may slow multigrid down.
-
-    Args:
-        rows: As in :func:`prepare`.
 
     Differentiable in ``values`` and in the sides.
     """

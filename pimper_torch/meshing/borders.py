@@ -23,19 +23,13 @@ from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
 
 # Lengths round faces that may go: with 5, the rounding of a right angle creeps along the border.
 _REACH = 8.0
-_SIDES = 100_000  # faces that the median side is taken of: it is certain to a few thousandths
 # Of the smoothed distance on a straight border, below which the surface sticks out. A choice: a
 # right angle is rounded (0.59 at its tip), and arcs of a few lengths stay; with 0.9 a skull lost
 # the edge of its teeth, with 0.55 flaps stay.
 _STRAIGHT = 0.75
-# Lengths from the border: in a plane whatever is further from it has more than that, 0.76.
-_DEEPEST = 2.0
-_CHANGED = 4.0  # lengths round what was cut: the kernel is 0.02 there
-_ITERATIONS = 12  # a skull's base that ends in flaps of four facets changes in 9
 # Of conjugate gradients, relative, and steps at most. Of a skull with 1.1 million faces 33,023 are
 # marked, in 14 CPU s; by sparse factors 33,427, of which 412 differ, in 33.
 _TOLERANCE, _MOST_STEPS = 3e-4, 1000
-_MIN_SHAPE = 0.01  # of a needle's longest edge squared is taken for its area at least
 
 
 def protruding(
@@ -55,7 +49,7 @@ def protruding(
     """
     points, corners, unsure = vertices.detach().double().cpu(), faces.cpu(), unsure.cpu()
     marked = torch.zeros(len(faces), dtype=torch.bool)
-    sides = side_lengths(points[corners[:: max(1, len(corners) // _SIDES)]])
+    sides = side_lengths(points[corners[:: max(1, len(corners) // 100_000)]])
     if float(sides.median()) >= length or not bool(unsure.any()):
         return marked.to(faces.device)
     border = _long_borders(points, corners, length)
@@ -83,12 +77,14 @@ def _repeatedly(
     """
     out, active = torch.zeros(len(faces), dtype=torch.bool), torch.ones_like(inner)
     smooth = torch.full_like(vertices[:, 0], length)
-    for _ in range(_ITERATIONS):
+    # A skull's base that ends in flaps of four facets changes in 9.
+    for _ in range(12):
         left = (~out).nonzero()[:, 0]
         border = _long_borders(vertices, faces[left], length)
         border = border[~inner[border]]
         active &= corners_of(faces, unsure & ~out, len(vertices))
-        active[active.clone()] = _near(vertices[active], vertices[border], _DEEPEST * length)
+        # In a plane what is further from the border has more than 0.76 of that.
+        active[active.clone()] = _near(vertices[active], vertices[border], 2.0 * length)
         if not bool(active.any()):
             break
         near = _near(vertices, vertices[active], _REACH * length)
@@ -101,7 +97,8 @@ def _repeatedly(
             break
         out[left[some]] = True
         gone = vertices[torch.unique(faces[left[some]])]
-        active = _near(vertices, gone, _CHANGED * length)
+        # The kernel is 0.02 there.
+        active = _near(vertices, gone, 4.0 * length)
     return out
 
 
@@ -147,7 +144,7 @@ def _smoothed(
     """
     mesh = elements(vertices, faces)
     one = torch.ones_like(mesh.area)
-    rows, columns, entries = cotangent_laplacian(mesh, length**2 * one, _MIN_SHAPE)
+    rows, columns, entries = cotangent_laplacian(mesh, length**2 * one, 0.01)
     mass, index = lumped_mass(mesh, one), torch.arange(mesh.count)
     mass = torch.where(mass > 0, mass, mass.max())
     cells = torch.cat([rows, index]).numpy(), torch.cat([columns, index]).numpy()

@@ -8,14 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.fusion.continuation import continued
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
-from pimper_torch.linalg.systems import solutions
-from pimper_torch.meshing.groups import diagonal
+from pimper_torch.meshing.faults import diagonal
 from pimper_torch.records import Mesh, Record
-
-# A ring so small gets a centre.
-_SMALLEST_RING = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -60,7 +57,7 @@ def closed(mesh: Mesh) -> Closed:
 
     extent = float(diagonal(mesh.vertices_world.detach()))
 
-    def continued(values: Tensor | None, filler: float) -> Tensor | None:
+    def extended(values: Tensor | None, filler: float) -> Tensor | None:
         if values is None:
             return None
         return torch.cat([values[source], values.new_full((fresh, *values.shape[1:]), filler)])
@@ -68,7 +65,9 @@ def closed(mesh: Mesh) -> Closed:
     film = mesh.vertices_world[source]
     if mesh.albedo is not None:
         film = torch.cat([film, _known(mesh.albedo)[source].to(film)], dim=1)
-    film = _stretched(film, added, count) if fresh else film
+    film = torch.cat([film, film.new_zeros(fresh, film.shape[1])])
+    there = torch.arange(count, device=film.device) < len(source)
+    film = continued(film, there, face_edges(added)[0], film, film.new_zeros(count))
     vertices, everything = film[:, :3], torch.cat([faces, added])
     normals = mesh.normals_world
     if normals is not None:
@@ -80,8 +79,8 @@ def closed(mesh: Mesh) -> Closed:
         albedo=None
         if mesh.albedo is None
         else torch.cat([mesh.albedo[source], film[len(source) :, 3:].to(mesh.albedo)]),
-        confidence=continued(mesh.confidence, 0.0),
-        expected_error=continued(mesh.expected_error, extent),
+        confidence=extended(mesh.confidence, 0.0),
+        expected_error=extended(mesh.expected_error, extent),
     )
     measured = torch.arange(len(everything), device=faces.device) < len(faces)
     return Closed(mesh=whole, measured=measured, borders=len(cycles))
@@ -128,7 +127,7 @@ def _disk(cycle: list[int], first: int) -> Int[Tensor, "face 3"]:
     if len(cycle) == 3:
         return torch.tensor([cycle])
     outer, triangles = torch.tensor(cycle), []
-    while len(outer) > _SMALLEST_RING:
+    while len(outer) > 6:
         inner = torch.arange(first, first + math.ceil(len(outer) / 2))
         first += len(inner)
         start, after = outer, outer.roll(-1)
@@ -140,22 +139,3 @@ def _disk(cycle: list[int], first: int) -> Int[Tensor, "face 3"]:
     centre = torch.full_like(outer, first)
     triangles.append(torch.stack([outer, outer.roll(-1), centre], dim=1))
     return torch.cat(triangles)
-
-
-def _stretched(
-    values: Float[Tensor, "known channel"], faces: Int[Tensor, "face 3"], count: int
-) -> Float[Tensor, "vertex channel"]:
-    """Add vertices that have the mean of their neighbours' values each."""
-    edges, _ = face_edges(faces)
-    links = torch.cat([edges, edges.flip(1)])
-    here, there = links[links[:, 0] >= len(values)].unbind(dim=1)
-    here, known, size = here - len(values), there < len(values), count - len(values)
-    side = values.new_zeros(size, values.shape[1]).double()
-    side = side.index_add(0, here[known], values.double()[there[known]])
-    degree = torch.bincount(here, minlength=size).to(side)
-    every = torch.arange(size, device=here.device)
-    rows = torch.cat([every, here[~known]])
-    columns = torch.cat([every, there[~known] - len(values)])
-    entries = torch.cat([degree, -torch.ones_like(degree[here[~known]])])
-    (found,) = solutions(rows, columns, entries, side, what="the closing")
-    return torch.cat([values, found.to(values)])

@@ -14,8 +14,7 @@ from pimper_torch.geometry.surfaces import component_areas
 from pimper_torch.geometry.topology import face_components, vertex_fans
 from pimper_torch.ledger import leave_out
 from pimper_torch.meshing.borders import protruding
-from pimper_torch.meshing.faults import faults
-from pimper_torch.meshing.groups import diagonal, small_groups
+from pimper_torch.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.stage import Stage
 

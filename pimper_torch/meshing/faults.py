@@ -1,4 +1,4 @@
-"""Defective faces: stretched, overturned, folded."""
+"""Defective faces: stretched, overturned, folded; and connected components of vertices."""
 
 import math
 from dataclasses import dataclass
@@ -13,14 +13,16 @@ from pimper_torch.geometry.surfaces import (
     unit_face_normals,
     vertex_normals,
 )
-from pimper_torch.geometry.topology import corners_of, face_pairs, graph_components
+from pimper_torch.geometry.topology import (
+    corners_of,
+    face_pairs,
+    graph_components,
+    vertex_components,
+)
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
 # edges of a box or of thin bones it is a right angle, give or take the noise of small faces.
 _FOLD = math.radians(110.0)
-
-# Of a cosine in float32: what it may add to the bound is looked at in vain, and changes nothing.
-_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +92,8 @@ class Faults:
         axis = vertex_normals(vertices, self.faces)
         near = corners_of(self.faces, overturned, len(vertices))
         for corner in self.faces.unbind(dim=1):
-            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + _ROUNDING
+            # Rounding of a cosine in float32: faces that it adds change nothing.
+            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + 1e-3
             near[corner[bent]] = True
         return near[self.faces].any(dim=1)
 
@@ -124,3 +127,29 @@ def facet_means(
     owner = torch.where(other == last, other, one)
     normals = face_normals(vertices, faces)
     return normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)[owner]
+
+
+def small_groups(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    among: Bool[Tensor, " vertex"],
+    max_extent: Float[Tensor, ""],
+) -> Bool[Tensor, " vertex"]:
+    """Find the vertices ``among`` whose connected component is small.
+
+    Args:
+        max_extent: Diagonal of a component's bounding box.
+    """
+    label = vertex_components(faces, among)
+    count = int(label.max()) + 1 if len(label) else 0
+    index = label[:, None].expand_as(vertices)
+    like = vertices.new_zeros(count, 3)
+    high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
+    low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
+    small = (high - low).norm(dim=-1) <= max_extent
+    return among & small[label]
+
+
+def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+    """Return the diagonal of the points' bounding box."""
+    return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

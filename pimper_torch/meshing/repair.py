@@ -9,24 +9,76 @@ from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.geometry.surfaces import side_lengths, vertex_normals
-from pimper_torch.geometry.topology import boundary_vertices, corners_of, vertex_components
+from pimper_torch.geometry.topology import (
+    boundary_vertices,
+    corners_of,
+    face_edges,
+    vertex_components,
+)
 from pimper_torch.ledger import leave_out
-from pimper_torch.meshing.faults import faults
-from pimper_torch.meshing.groups import diagonal, small_groups
-from pimper_torch.meshing.plates import least_bent
+from pimper_torch.linalg.systems import solutions
+from pimper_torch.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.records import Surface
 from pimper_torch.stage import Stage
+
+
+def least_bent(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    free: Bool[Tensor, " vertex"],
+) -> Float[Tensor, "vertex 3"]:
+    r"""Move some vertices to where the surface bends least, as a thin plate clamped all round.
+
+    Minimizes the sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over
+    free vertices and their neighbours. Weights are uniform: lengths of folded faces mean
+    nothing.
+
+    Args:
+        free: Vertices to move; every connected component needs a neighbour that is not free.
+
+    Differentiable in the fixed vertices; one solve.
+
+    Source: Kobbelt, Campagna, Vorsatz, Seidel: Interactive multi-resolution modeling on
+    arbitrary meshes, SIGGRAPH 1998, for the energy.
+    """
+    if not bool(free.any()):
+        return vertices
+    known = vertices.double()
+    ring = corners_of(faces, free[faces].any(dim=1), len(vertices))
+    edges, _ = face_edges(faces[ring[faces].any(dim=1)])
+    links = torch.cat([edges, edges.flip(1)])
+    here, there = links[ring[links[:, 0]]].unbind(dim=1)
+    (centre,) = torch.nonzero(ring, as_tuple=True)
+    degree = torch.bincount(here, minlength=len(vertices)).to(known)
+    row = (ring.cumsum(dim=0) - 1)[torch.cat([centre, here])]
+    col = torch.cat([centre, there])
+    fraction = torch.cat([torch.ones_like(degree[centre]), -1 / degree[here]])
+    unknown = free[col]
+    fixed = fraction[~unknown, None] * known[col[~unknown]]
+    target = -known.new_zeros(len(centre), 3).index_add(0, row[~unknown], fixed)
+    row, col, fraction = row[unknown], (free.cumsum(dim=0) - 1)[col[unknown]], fraction[unknown]
+    side = known.new_zeros(int(free.sum()), 3).index_add(0, col, fraction[:, None] * target[row])
+    shape = (len(centre), len(side))
+    bending = coo_array(
+        (fraction.cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())), shape=shape
+    )
+    energy = (bending.T @ bending).tocoo()
+    rows, cols, values = (
+        torch.from_numpy(part).to(side.device) for part in (*energy.coords, energy.data)
+    )
+    (found,) = solutions(rows.long(), cols.long(), values, side, what="the repairing")
+    (moved,) = torch.nonzero(free, as_tuple=True)
+    return vertices.index_copy(0, moved, found.to(vertices))
+
 
 # Rings of sound vertices that a component with defects may take in, one at a time: with twice the
 # samples a pixel, 6 left 5 openings in a skull's orbit, and 12 none (commit 3dadfd4).
 _RINGS = 12
-# Longest side of a face in typical ones, below which it is a point: a closed piece with one sound
-# vertex shrinks to that. In float32 it shrank to 1e-7.
-_POINT = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +159,7 @@ def repair(
     Differentiable in the vertices that stay; which these are is a constant.
     """
     before, count = vertices.detach(), len(vertices)
-    shortest = _POINT * side_lengths(before[faces]).amax(dim=1).median()
+    shortest = 1e-4 * side_lengths(before[faces]).amax(dim=1).median()
     fixed = boundary_vertices(faces, count)
     free = corners_of(faces, broken(before), count)
     free = _with_neighbours(faces, free & ~_components_with(faces, free, fixed))

@@ -1,14 +1,17 @@
 """Cues about the object before any view is cut."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
+from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.errors import InputError
-from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import (
     Fixation,
     Plane,
@@ -17,15 +20,112 @@ from pimper_torch.geometry.supporting_plane import (
     well_tracked,
 )
 from pimper_torch.mapped import by_view
-from pimper_torch.records import Cameras, Record, SparseScene
+from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
+from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.silhouettes.opencv import convex_hull_of
-from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
-from pimper_torch.silhouettes.seeds import MIN_POINTS
+from pimper_torch.silhouettes.parallax import (
+    WorkingPictures,
+    of_views,
+    plane_agreement,
+    room_agreement,
+    working_pictures,
+)
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
-from pimper_torch.silhouettes.soft_masks import FEW, SoftMasks, soft_masks_of
-from pimper_torch.silhouettes.working_size import WorkingPictures, of_views, working_pictures
 
-_PROBES = 5  # places along each side of a region that photographs are asked for
+FEW = 3  # soft masks: fewer have no majority
+_SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SoftMasks(Record):
+    """Silhouettes that priors state, at the working size.
+
+    Attributes:
+        inside: Probability of the object; one half where nothing is said.
+        seeds_px: Pixels of the object in each view, from maps that say nothing else.
+    """
+
+    inside: Float[Tensor, "view height width"]
+    given: Bool[Tensor, " view"]
+    seeds_px: tuple[Float[Tensor, "_ 2"], ...]
+
+    @property
+    def points(self) -> bool:
+        """Whether anything is pointed at."""
+        return any(len(pixels) for pixels in self.seeds_px)
+
+    @property
+    def masks(self) -> Bool[Tensor, "view height width"]:
+        """True where a pixel more likely shows the object than not."""
+        return self.inside > 0.5
+
+
+def soft_masks_of(views: Views, pictures: WorkingPictures) -> SoftMasks | None:
+    """Merge the silhouettes that views carry as priors; ``None`` without any.
+
+    Log odds of several maps of one view add up. A map that nowhere says that the object is not
+    there points at it, as clicks do.
+    """
+    odds, seeds = torch.zeros_like(pictures.grey), torch.zeros_like(pictures.grey, dtype=torch.bool)
+    given = torch.zeros(len(odds), dtype=torch.bool)
+    priors = [prior for prior in views.priors if isinstance(prior, SilhouettePrior)]
+    for prior in priors:
+        for name, size, full in zip(prior.names, prior.sizes_px, prior.inside, strict=True):
+            if name not in views.names:
+                continue
+            view = views.names.index(name)
+            inside = full[: size[1], : size[0]].detach().float().cpu()
+            wide, high = pictures.cameras.sizes_px[view].tolist()
+            small = interpolate(
+                inside[None, None],
+                (high, wide),
+                mode="bilinear",
+                align_corners=False,
+                antialias=True,
+            )
+            if float(inside.min()) > 0.5 - _SAYS_NOTHING:
+                seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _SAYS_NOTHING
+            else:
+                # 8 bits hold no finer probabilities.
+                odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(1e-3, 1 - 1e-3))
+                given[view] = True
+    if not priors:
+        return None
+    centres = tuple(one.nonzero().flip(1).float() + 0.5 for one in seeds)
+    return SoftMasks(inside=torch.sigmoid(odds), given=given, seeds_px=centres)
+
+
+def pointed_at(hull: Hull, cameras: Cameras, seeds_px: Sequence[Float[Tensor, "_ 2"]]) -> Hull:
+    """Keep the components of a hull that rays through seeds meet first.
+
+    Returns:
+        The hull itself where none are met.
+    """
+    labels = torch.from_numpy(label(hull.occupied.numpy())[0])
+    met: set[int] = set()
+    for view, pixels in enumerate(seeds_px):
+        if len(pixels):
+            pose, eye = cameras.cam_from_world[view], cameras.centers_world[view]
+            rays = normalize(rays_through(pixels, pose, cameras.intrinsics[view]), dim=1)
+            far = (hull.corners_world - eye).norm(dim=1).sum()
+            along = torch.arange(0, float(far), float(hull.spacing) / 2)
+            places = (eye + along[:, None] * rays[:, None] - hull.origin_world) / hull.spacing
+            index = places.round().long()
+            last = torch.tensor(labels.shape) - 1
+            inside = ((index >= 0) & (index <= last)).all(dim=-1)
+            x, y, z = torch.minimum(index.clamp_min(0), last).unbind(dim=-1)
+            found = labels[x, y, z] * inside
+            first = found.gather(1, (found > 0).int().argmax(dim=1, keepdim=True))
+            met |= set(first.flatten().tolist()) - {0}
+    if not met:
+        return hull
+    kept = torch.isin(labels, torch.tensor(sorted(met)))
+    away = torch.from_numpy(distance_transform_edt(~kept.numpy())).to(hull.distance)
+    outside = torch.minimum(hull.distance, (1 - away) * hull.spacing)
+    return hull.replace(distance=torch.where(kept, hull.distance, outside))
+
+
+MIN_POINTS = 12  # of the object that a view must observe for them to tell anything
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 
 
@@ -35,7 +135,6 @@ class Cues(Record):
 
     Attributes:
         object_px: Pixels of the object's points, one tensor a view.
-        plane: That the object stands on.
         background_from_view: Maps to a room at rest before which the object turns; empty without.
         agreement: With the texture of plane and room, the better of both.
         soft: Masks that the photographs come with as priors.
@@ -167,7 +266,7 @@ def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 
     offset = low.new_tensor(scene.offset_world)
     box, points = torch.stack([low, high]) - offset, scene.points_world
     inside = ((points > box[0]) & (points < box[1])).all(dim=1)
-    steps = torch.cartesian_prod(*[torch.linspace(0, 1, _PROBES, dtype=torch.float64)] * 3)
+    steps = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=torch.float64)] * 3)
     cameras = scene.cameras
     places = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
     pixels, depth = project(places, cameras.cam_from_world, cameras.intrinsics)

@@ -1,4 +1,7 @@
-"""Alternate cuts of every view with a vote of all views on their visual hull."""
+"""Alternate cuts of every view with a vote of all views on their visual hull.
+
+Cuts start from labels that are certain: of points, of parallax and, after a vote, of the hull.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,41 +12,43 @@ from torch import Tensor
 
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Record, Silhouettes
-from pimper_torch.silhouettes.cues import Cues
+from pimper_torch.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
 from pimper_torch.silhouettes.hull import margins, visual_hull
 from pimper_torch.silhouettes.opencv import (
+    BACKGROUND,
     OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    blind_holes,
+    closed,
     convex_hull_of,
+    dilated,
+    discs_at,
     grab_cut,
     grab_cut_halved,
+    opened,
     signed_distance,
     without_specks,
 )
-from pimper_torch.silhouettes.seeds import (
-    DISPUTED,
-    exposed_fraction,
-    filled,
-    held_fraction,
-    in_front,
-    is_deep,
-    labels_from_hull,
-    labels_from_points,
-    labels_from_soft,
-    not_seen_through,
-    off_level,
-    off_plane,
-    surely_on_plane,
-)
+from pimper_torch.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
-from pimper_torch.silhouettes.soft_masks import FEW, pointed_at
-from pimper_torch.silhouettes.working_size import of_views
 
-_WELL = 2.0  # times as deep as is_deep asks for
-_CUTS = 2  # rounds of mixtures and cut inside GrabCut
-_SPECK = 2e-4  # fraction of the picture
 # Fractions of the views that may lack what the others have in common, tried in turn until that
 # takes so much of a median mask; a mask that shows less than this of it is of something else.
 _DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
+
+# Lengths are fractions of the pictures' longer side.
+_DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
+_CLOSING = 1 / 90
+_DEEP = 1 / 50  # parallax this far inside the projection tells object
+_THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
+_MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
+
+# Agreement with neighbours moved by the plane: below is not the plane, above is.
+_OFF_PLANE = 0.4
+_NOT_PLANE = 0.6
+_ON_PLANE = 0.75
+_THROUGH = 0.2  # of a hole: its border agrees with nothing
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
 
@@ -147,9 +152,7 @@ def _in_front(
 
 
 def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Cut from points and parallax; by parallax alone where backgrounds are all round.
-
-    So they do where hardly any points are the object's.
+    """Cut from points and parallax; by parallax alone before a room, or with hardly a point.
 
     Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
     """
@@ -185,7 +188,7 @@ def _again(
         if cues.soft is not None and cues.soft.given[view]:
             labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
         cut = _cut(grab_cut, cues, view, labels, seen[view])
-        return without_specks(cut, seen[view] > 0, round(_SPECK * cut.numel()))
+        return without_specks(cut, seen[view] > 0, round(2e-4 * cut.numel()))
 
     return of_views(again, cues.num_views)
 
@@ -203,12 +206,12 @@ def _cut(
     object's unless the plane is seen there.
     """
     if cues.agreement is None:
-        return how(cues.pictures.opponent[view], labels, _CUTS)
+        return how(cues.pictures.opponent[view], labels, 2)
     agreement = cues.agreement[view]
     surrounded = not_seen_through(cues.object_px[view], agreement)
     surrounded &= ~(agreement >= DISPUTED)
-    labels = torch.where(is_deep(margin / _WELL) & surrounded, OBJECT, labels)
-    return how(cues.pictures.opponent[view], labels, _CUTS)
+    labels = torch.where(is_deep(margin / 2.0) & surrounded, OBJECT, labels)
+    return how(cues.pictures.opponent[view], labels, 2)
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
@@ -284,3 +287,157 @@ def _voted(
         return margins(hull, cameras.intrinsics[view], frame, (width, height))
 
     return of_views(margin, len(masks))
+
+
+def labels_from_points(
+    object_px: Float[Tensor, "point 2"],
+    background_px: Float[Tensor, "other 2"],
+    agreement: Float[Tensor, "height width"] | None,
+    size_px: tuple[int, int],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with the points that a view observes, the object's and others, and with parallax.
+
+    Without parallax a strip along the border is background.
+    """
+    longer = max(size_px)
+    region = convex_hull_of(object_px, size_px)
+    labels = torch.full(size_px[::-1], PERHAPS_BACKGROUND, dtype=torch.uint8)
+    if agreement is not None:
+        labels[surely_on_plane(agreement)] = BACKGROUND
+        region &= ~_shows_plane(agreement)
+    else:
+        strip = max(1, round(1 / 64 * longer))
+        border = torch.ones_like(labels, dtype=torch.bool)
+        border[strip:-strip, strip:-strip] = False
+        labels[border] = BACKGROUND
+    labels[region & (labels != BACKGROUND)] = PERHAPS_OBJECT
+    labels[discs_at(background_px, _DISC * longer, size_px)] = BACKGROUND
+    labels[discs_at(object_px, _DISC * longer, size_px)] = OBJECT
+    return labels
+
+
+def labels_from_hull(
+    margin: Float[Tensor, "height width"],
+    cut: Bool[Tensor, "height width"],
+    object_px: Float[Tensor, "point 2"],
+    agreement: Float[Tensor, "height width"] | None,
+    unknown: Bool[Tensor, "height width"] | None = None,
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a view's last cut, the projection of the hull, points in it, and parallax.
+
+    Nothing is certain where the vote on the hull was ``unknown``, none by default.
+    """
+    height, width = margin.shape
+    longer = max(height, width)
+    labels = torch.full(margin.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
+    region = cut | closed(margin > 0, max(1, round(_CLOSING * longer)))
+    if agreement is not None:
+        region &= ~_shows_plane(agreement)
+    labels[region] = PERHAPS_OBJECT
+    if agreement is not None:
+        labels[surely_on_plane(agreement)] = BACKGROUND
+        labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
+    beyond = margin < -1 / 25 * longer
+    labels[beyond if unknown is None else beyond & ~unknown] = BACKGROUND
+    discs = discs_at(object_px, _DISC * longer, (width, height))
+    labels[discs & (margin > 0)] = OBJECT
+    return labels
+
+
+def labels_from_soft(
+    labels: UInt8[Tensor, "height width"],
+    mask: Bool[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
+    border, reach = signed_distance(mask), 1 / 160 * max(mask.shape)
+    labels = torch.where((border > reach) & (margin > 0), OBJECT, labels)
+    outside = (border < -reach) & ~is_deep(margin) | (margin < -2 * reach)
+    return torch.where(outside, BACKGROUND, labels)
+
+
+def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
+    found = _grainless(agreement < _NOT_PLANE)
+    return filled(closed(found, round(1 / 50 * max(agreement.shape))), agreement)
+
+
+def in_front(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find what stands before the plane and is not the object, as a person who may hide some of it.
+
+    Windows that hold some of the object do not agree with the plane either: what is as narrow as
+    these is left out.
+    """
+    longer = max(cut.shape)
+    other = closed(agreement < _OFF_PLANE, round(1 / 200 * longer)) & ~cut
+    return opened(other, round(_DEEP * longer))
+
+
+def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is so far inside that shadows beside the object do not reach it."""
+    return margin > _DEEP * max(margin.shape)
+
+
+def is_inmost(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is deep inside, and the middle of what is too thin to be deep."""
+    longer = max(margin.shape)
+    middle = margin > _MIDDLE * dilated(margin, max(1, round(_DEEP * longer)))
+    return is_deep(margin) | (middle & (margin > _THIN * longer))
+
+
+def not_seen_through(
+    object_px: Float[Tensor, "point 2"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find what the object's points surround, where the plane is not seen."""
+    height, width = agreement.shape
+    return convex_hull_of(object_px, (width, height)) & ~_shows_plane(agreement)
+
+
+def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is so bright or dark that light cannot make it so on the plane."""
+    return _grainless(agreement == -1)
+
+
+def filled(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Fill holes that the plane is not seen through, such as the inside of a vessel."""
+    whole = closed(cut, max(1, round(_CLOSING * max(cut.shape))))
+    return cut | blind_holes(whole, agreement > _ON_PLANE, _THROUGH)
+
+
+def exposed_fraction(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"] | None
+) -> Float[Tensor, ""]:
+    """Return the fraction of a cut that shows a background for certain; 0 where none is known."""
+    if agreement is None:
+        return torch.zeros((), dtype=torch.float64)
+    return (cut & surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
+
+
+def held_fraction(
+    cut: Bool[Tensor, "height width"], object_px: Float[Tensor, "point 2"]
+) -> Float[Tensor, ""]:
+    """Return the fraction of the object's points that a cut holds; 1 where too few are known."""
+    if len(object_px) < MIN_POINTS:
+        return torch.ones((), dtype=torch.float64)
+    column, row = object_px.floor().long().unbind(dim=1)
+    height, width = cut.shape
+    return cut[row.clamp(0, height - 1), column.clamp(0, width - 1)].double().mean()
+
+
+def surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find the plane, but not what is next to something else: the object's foot agrees, too."""
+    sure = _grainless(agreement > _ON_PLANE)
+    return signed_distance(sure) > 1 / 200 * max(agreement.shape)
+
+
+def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what some window that agrees with the plane holds."""
+    return signed_distance(_grainless(agreement > _ON_PLANE)) > -1 / 160 * max(agreement.shape)
+
+
+def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    return opened(mask, max(1, round(1 / 200 * max(mask.shape))))

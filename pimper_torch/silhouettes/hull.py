@@ -12,15 +12,12 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.projection import rays_through, triangulate_rays
 from pimper_torch.mapped import parts
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, Silhouettes
 from pimper_torch.silhouettes.opencv import signed_distance
 
-_VOXELS = 2**16  # at once: their 256 kB stay in a core's cache
-_SAMPLES = 2**18  # of rays at once: 3 MB
-_FIRST = 64**3  # voxels that look for the hull's extent
 _STRIDE = 4  # pixels between rays; how deep they get is interpolated
 _UNSEEN = 1e9  # pixels; stands beyond the photograph's border, where a view abstains
 
@@ -102,36 +99,7 @@ class Hull(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Everywhere(Hull):
-    """The hull of silhouettes that leave nothing out."""
-
-    @classmethod
-    def of(cls, cameras: Cameras) -> "Everywhere":
-        """Make it, of the cameras' floating-point type and device."""
-        like = cameras.cam_from_world
-        return cls(
-            origin_world=like.new_zeros(3),
-            spacing=like.new_ones(()),
-            distance=like.new_full((1, 1, 1), torch.inf),
-        )
-
-    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "HalfSpace":
-        """Keep what is above a plane."""
-        return HalfSpace(
-            origin_world=self.origin_world,
-            spacing=self.spacing,
-            distance=self.distance,
-            normals_world=normal_world.to(self.origin_world)[None],
-            offsets=offset.to(self.origin_world)[None],
-        )
-
-    def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """State that points lie infinitely deep inside."""
-        return torch.full_like(points_world[..., 0], torch.inf)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class HalfSpace(Everywhere):
-    """Half-space above planes, where silhouettes constrain nothing.
+    """The hull of silhouettes that leave nothing out: everything above planes, if there are any.
 
     Points of the planes are as deep inside as all others, and shape the surface with them; surface
     on a plane is not held.
@@ -144,13 +112,21 @@ class HalfSpace(Everywhere):
     normals_world: Float[Tensor, "plane 3"]
     offsets: Float[Tensor, " plane"]
 
-    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "HalfSpace":
-        """Keep what is above one more plane."""
-        more = Everywhere.above(self, normal_world, offset)
-        return self.replace(
-            normals_world=torch.cat([self.normals_world, more.normals_world]),
-            offsets=torch.cat([self.offsets, more.offsets]),
+    @classmethod
+    def of(cls, cameras: Cameras, planes_world: Float[Tensor, "plane 4"]) -> "Everywhere":
+        """Make it, of the cameras' floating-point type and device."""
+        like = cameras.cam_from_world
+        return cls(
+            origin_world=like.new_zeros(3),
+            spacing=like.new_ones(()),
+            distance=like.new_full((1, 1, 1), torch.inf),
+            normals_world=planes_world[:, :3].to(like),
+            offsets=-planes_world[:, 3].to(like),
         )
+
+    def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """State that points lie infinitely deep inside."""
+        return torch.full_like(points_world[..., 0], torch.inf)
 
     def holds(
         self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
@@ -158,6 +134,34 @@ class HalfSpace(Everywhere):
         """Find points above the planes; the tolerance is of silhouettes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
+
+
+def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+    """Return the corners of a box that holds what the silhouettes show.
+
+    Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
+    there it reaches as far as the largest of them, seen from its camera, and half as far again:
+    a silhouette may be cut by the photograph's border.
+
+    Returns:
+        ``None`` where fewer than two reliable views show anything.
+    """
+    masks = silhouettes.masks
+    views = (silhouettes.reliable & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
+    if len(views) < 2:
+        return None
+    chosen, boxes = cameras.take(views), []
+    for view in views:
+        rows, columns = (masks[view].any(dim=1 - axis).nonzero() for axis in (0, 1))
+        low = torch.stack([columns.amin(), rows.amin()])
+        boxes.append(torch.stack([low, torch.stack([columns.amax(), rows.amax()]) + 1]))
+    low, high = torch.stack(boxes).to(chosen.intrinsics).unbind(dim=1)
+    seen = torch.ones(1, len(views), dtype=torch.bool, device=low.device)
+    centre = triangulate_rays(chosen, (low + high)[None] / 2, seen)[0]
+    distance = (centre - chosen.centers_world).norm(dim=1)
+    half = (high - low).norm(dim=1) / 2 / chosen.intrinsics[:, 0, 0]
+    reach = 1.5 * (distance * half).amax()
+    return torch.stack([centre - reach, centre + reach])
 
 
 def visual_hull(
@@ -200,7 +204,7 @@ def visual_hull(
         whole.copy_(found)
     chosen = cameras.take(views)
     low, high = box_world.to(chosen.intrinsics)
-    first = _voted(maps, chosen, box_world, _FIRST, (disagreeing, min_seen))
+    first = _voted(maps, chosen, box_world, 64**3, (disagreeing, min_seen))
     # A voxel whose border lies within half its diagonal may be met by a part of the hull.
     where = (first.distance > -0.87 * first.spacing).nonzero()
     if len(where) == 0:
@@ -258,7 +262,7 @@ def _deepest(
     lengths = ((far - near) * rays.norm(dim=-1))[meets]
     count = int(lengths.max() / hull.spacing) + 2
     fraction = torch.linspace(0, 1, count).to(rays)
-    for some in torch.split(meets, max(1, _SAMPLES // count)):
+    for some in torch.split(meets, max(1, 2**18 // count)):
         along = torch.addcmul(near[some, None], fraction, (far - near)[some, None])
         grid = torch.addcmul(start, along[..., None], step[some, None]).flip(-1)
         depths = grid_sample(field, grid[None, None], padding_mode="border", align_corners=True)
@@ -293,7 +297,8 @@ def _voted(
     first = from_world[..., :3] @ low + from_world[..., 3]
     steps = spacing * from_world[..., :3]
     reach = [torch.arange(count).to(low) for count in counts.tolist()]
-    slab = max(1, _VOXELS // int(counts[1:].prod()))
+    # Their 256 kB stay in a core's cache.
+    slab = max(1, 2**16 // int(counts[1:].prod()))
 
     def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "x y z"]:
         return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), fractions)

@@ -92,7 +92,6 @@ def grab_cut(
     Args:
         labels: ``BACKGROUND`` or ``OBJECT`` for certain, or ``PERHAPS_BACKGROUND`` or
             ``PERHAPS_OBJECT``; some of each side.
-        iterations: Of estimating the mixtures and cutting.
     """
     seeded = labels & 1 > 0
     if not seeded.any() or seeded.all():

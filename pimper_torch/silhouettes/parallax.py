@@ -7,21 +7,91 @@ Where a view agrees with it, it shows the background; where it does not, somethi
 textured or not. Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.geometry.supporting_plane import Fixation, Plane
+from pimper_torch.mapped import stacked, zeros
 from pimper_torch.parallel import side_by_side
-from pimper_torch.records import Cameras, Record
-from pimper_torch.silhouettes.opencv import warped, window_means
-from pimper_torch.silhouettes.seeds import DISPUTED
-from pimper_torch.silhouettes.working_size import WorkingPictures, of_views
+from pimper_torch.radiometry.srgb import srgb_from_linear
+from pimper_torch.records import Cameras, Record, Views
+from pimper_torch.silhouettes.opencv import shrunk, warped, window_means
 
+_FAINT = 0.03  # of white; ratios of darker colours tell noise
+_RATIO = 100.0  # grey levels for a ratio of e
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class WorkingPictures(Record):
+    """Photographs in display colours, reduced.
+
+    Attributes:
+        colours: Encoded as sRGB, exposed alike; padding is black.
+        opponent: Brightness and two ratios of colours, which shadows change little.
+        grey: Logarithm of the mean radiance.
+        factors: Size of these pictures over that of the photographs, across and down.
+    """
+
+    colours: UInt8[Tensor, "view height width 3"]
+    opponent: UInt8[Tensor, "view height width 3"]
+    grey: Float[Tensor, "view height width"]
+    cameras: Cameras
+    factors: tuple[float, float]
+
+
+def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPictures:
+    """Shrink photographs so that the longer side of the raster is at most so long."""
+    height, width = views.images.shape[-2:]
+    factor = min(1.0, size_px / max(height, width))
+    wide, high = max(1, round(factor * width)), max(1, round(factor * height))
+    factors = (wide / width, high / height)
+
+    def shown(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
+        small = shrunk(image, wide, high)
+        level = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
+        radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
+        colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
+        # Logarithms of what is darker tell noise.
+        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + 0.005)
+
+    images = views.images.detach().cpu().unbind()
+    colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
+    grey = zeros((len(images), high, wide))
+    for view, layers in enumerate(side_by_side(shown, images, tracked=False)):
+        colours[view], opponent[view], grey[view] = layers
+    scale = torch.tensor(factors)
+    return WorkingPictures(
+        colours=colours,
+        opponent=opponent,
+        grey=grey,
+        cameras=cameras.to("cpu", torch.float32).replace(
+            intrinsics=scale_intrinsics(cameras.intrinsics.cpu().float(), *factors),
+            sizes_px=(cameras.sizes_px.cpu() * scale).round().long().clamp_min(1),
+        ),
+        factors=factors,
+    )
+
+
+def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
+    """Stack what is computed of every view by itself."""
+    return stacked(side_by_side(work, range(count)), count)
+
+
+def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:
+    """Return brightness and two ratios of colours, which shadows and shading leave as they are."""
+    red, green, blue = torch.log(radiance + _FAINT)
+    luma = 255 * srgb_from_linear(radiance.mean(dim=0))
+    ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
+    return torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
+
+
+DISPUTED = 0.5  # agreement where views do not agree on what the background looks like
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
 _SHADING = 1 / 25  # what is smoother than this is light, not texture
@@ -33,8 +103,6 @@ _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
 _ROOM = 1.0  # of the picture's size beyond it: a room that shifts by more is not looked at
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
-_MIN_VIEWS = 3  # of which two agree
-_SAMPLES = 2**20  # of the plane, over all views, at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -139,7 +207,7 @@ def _common(
         return warped(seen, maps[view], raster.size_px)
 
     seen = of_views(rectified, len(values))
-    rows = torch.split(seen, max(1, _SAMPLES // (len(seen) * raster.size_px[0])), dim=1)
+    rows = torch.split(seen, max(1, 2**20 // (len(seen) * raster.size_px[0])), dim=1)
     common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
@@ -156,7 +224,7 @@ def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row colu
     """Return the views' median and the spread round it; NaN where too few see the plane."""
     common = seen.nanmedian(dim=0).values
     spread = (seen - common).abs().nanmedian(dim=0).values
-    few = seen.isfinite().sum(dim=0) < _MIN_VIEWS
+    few = seen.isfinite().sum(dim=0) < 3
     return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 

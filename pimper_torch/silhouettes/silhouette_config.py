@@ -40,7 +40,6 @@ class SilhouetteDetails:
 
     Attributes:
         iterations: Of cutting and voting after the first cut.
-        num_voxels: Of the visual hull.
         disagreeing: Fraction of the views that may see a voxel of the hull outside.
         min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
             view is not reliable.

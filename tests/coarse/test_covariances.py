@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.coarse.covariances import point_covariances
+from pimper_torch.coarse.surface import point_covariances
 from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.true_clouds import sparse_scene

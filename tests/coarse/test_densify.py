@@ -9,7 +9,6 @@ from pimper_torch.coarse.densify import (
     step_for_one_pixel,
     sweep,
 )
-from pimper_torch.coarse.fine_surface import near_points
 from pimper_torch.coarse.oriented import (
     OrientedPoints,
     no_points,
@@ -20,6 +19,7 @@ from pimper_torch.coarse.oriented import (
 from pimper_torch.coarse.trim import (
     ViewCounts,
     fringes,
+    near_points,
     supported_components,
     without_small_holes,
 )

@@ -4,11 +4,14 @@ from derivatives import check_derivatives
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.contacts import BaseSurface, cloud_points, contour_tangents, passing
 from pimper_torch.fusion.equations import (
+    BaseSurface,
     Common,
+    cloud_points,
+    contour_tangents,
     kept_slopes,
     kept_steps,
+    passing,
     slopes,
     swept_heights,
     upright,

@@ -8,7 +8,7 @@ from pimper_torch.errors import PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
 from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 
 COUNT = 900
 

@@ -3,10 +3,10 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.bands import CoarsePart
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions
+from pimper_torch.fusion.normal_bias import CoarsePart
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.topology import face_edges
 

@@ -8,7 +8,7 @@ from pimper_torch.linalg import hierarchy
 from pimper_torch.linalg.aggregation import prolongation
 from pimper_torch.linalg.hierarchy import Hierarchy, sparse_product
 from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare
 

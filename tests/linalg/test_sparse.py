@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.linalg.singular import SingularSystemError
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
 
 

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.groups import diagonal
+from pimper_torch.meshing.faults import diagonal
 from tests.meshing.sheets import sheet_of
 
 SIDE = 21

@@ -16,8 +16,7 @@ from pimper_torch.geometry.topology import (
 )
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.faults import faults
-from pimper_torch.meshing.plates import least_bent
-from pimper_torch.meshing.repair import Repair, RepairConfig, repair, surroundings
+from pimper_torch.meshing.repair import Repair, RepairConfig, least_bent, repair, surroundings
 from pimper_torch.records import Mesh
 
 OLD = ExtractConfig(overturned="all")

@@ -11,9 +11,8 @@ from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import Cuts, cuts_of
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.silhouettes.opencv import signed_distance
-from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement
+from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement, working_pictures
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
-from pimper_torch.silhouettes.working_size import working_pictures
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
 

@@ -3,14 +3,7 @@
 import pytest
 import torch
 
-from pimper_torch.silhouettes.opencv import (
-    BACKGROUND,
-    OBJECT,
-    PERHAPS_BACKGROUND,
-    PERHAPS_OBJECT,
-    signed_distance,
-)
-from pimper_torch.silhouettes.seeds import (
+from pimper_torch.silhouettes.cuts import (
     exposed_fraction,
     filled,
     held_fraction,
@@ -20,6 +13,13 @@ from pimper_torch.silhouettes.seeds import (
     not_seen_through,
     off_level,
     off_plane,
+)
+from pimper_torch.silhouettes.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    signed_distance,
 )
 
 WIDTH, HEIGHT = 320, 240

@@ -2,9 +2,8 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.evidence.metrics.in_view import angles_deg
+from pimper_torch.silhouettes.contours import ambiguous, contour_points, contour_rays
 from pimper_torch.silhouettes.hull import visual_hull
-from pimper_torch.silhouettes.rays import contour_rays
-from pimper_torch.silhouettes.tangency import ambiguous, contour_points
 from tests.silhouettes.shapes import CENTERS, DISTANCE, PIXEL, ball, ring, silhouettes_of, two_balls
 
 BOX = torch.tensor([[-1.6, -1.6, -1.6], [1.6, 1.6, 1.6]])

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.bands import CoarsePart
+from pimper_torch.fusion.normal_bias import CoarsePart
 from pimper_torch.geometry.subdivision import subdivide
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
