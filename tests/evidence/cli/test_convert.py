@@ -102,14 +102,6 @@ def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
     assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
 
 
-def test_a_reader_whose_files_are_known_is_told_nothing_of_them(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "rendered"]
-    assert main([*arguments, "--target", "idr", "--photographs.response", "2.2"]) == 2
-    assert "--photographs.response: the reader of rendered does not know it" in (
-        capsys.readouterr().err
-    )
-
-
 def test_a_set_of_scans_needs_the_scans_number(data, tmp_path, capsys):
     arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
     assert main([*arguments, "--target", "idr"]) == 2
