@@ -223,14 +223,7 @@ def lift():
     from pimper_torch.geometry.rigid import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
-    from pimper_torch.photometry.harmonics import rotate_lights
-    from pimper_torch.records import (
-        CoarseMesh,
-        Convergence,
-        Mesh,
-        PhotometricPatches,
-        Photometry,
-    )
+    from pimper_torch.records import CoarseMesh, Mesh, PhotometricPatches
 
     slant = (0.15, -0.1, 1.0)
 
@@ -263,27 +256,24 @@ def lift():
         # The arc looks from +z, so the facets must be wound to face it.
         patches = Decompose(DecomposeConfig(overlap_samples=2.0))(coarse, cameras)
         seen = Warp()(scene.views, cameras, patches)
+        photometric = PhotometricPatches.of(
+            patches,
+            normals=[
+                rotate(one.patch_from_world, normal.expand(len(one.facet), 1, 3))[
+                    :, :, None
+                ].expand(*one.depth.shape, 3)
+                for one in patches.buckets
+            ],
+            albedo=[torch.ones(*one.depth.shape, 3) for one in patches.buckets],
+            lights=scene.lights_world,
+            information=1 / math.radians(8 / 3) ** 2,
+        )
         buckets = []
-        for templates in patches.buckets:
-            shape = templates.depth.shape
-            rotated = rotate(templates.patch_from_world, normal.expand(len(templates.facet), 1, 3))
-            count = len(templates.facet)
-            buckets.append(
-                Photometry(
-                    normals_patch=rotated[:, :, None].expand(*shape, 3),
-                    albedo=torch.ones(*shape, 3).double(),
-                    lights_patch=rotate_lights(templates.patch_from_world, scene.lights_world),
-                    valid=templates.inside,
-                    information=torch.full(shape, 1 / math.radians(8 / 3) ** 2).double(),
-                    status=torch.zeros(count, dtype=torch.long),
-                    convergence=Convergence(
-                        iterations=torch.ones(count, dtype=torch.long),
-                        residual=torch.full((count,), 0.005, dtype=torch.float64),
-                        cause=torch.zeros(count, dtype=torch.long),
-                    ),
-                )
-            )
-        photometric = PhotometricPatches(patches=patches, buckets=tuple(buckets))
+        for bucket in photometric.buckets:
+            residual = torch.full_like(bucket.convergence.residual, 0.005)
+            rest = bucket.convergence.replace(residual=residual)
+            buckets.append(bucket.replace(convergence=rest))
+        photometric = photometric.replace(buckets=tuple(buckets))
         return SimpleNamespace(
             normal=normal,
             scene=scene,

@@ -18,11 +18,9 @@ from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Convergence,
     Heights,
     Mesh,
     PhotometricPatches,
-    Photometry,
     Silhouettes,
     SweptPatches,
 )
@@ -74,10 +72,12 @@ def cap_of(count):
     mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces))
     coarse = CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
     patches = Decompose(DecomposeConfig(overlap_samples=3.0))(coarse, cameras())
-    photometry, heights = zip(
+    normals, heights = zip(
         *(exact(coarse, templates) for templates in patches.buckets), strict=True
     )
-    photometric = PhotometricPatches(patches=patches, buckets=photometry)
+    photometric = PhotometricPatches.of(
+        patches, normals=normals, lights=torch.ones(1, 4), information=1e4
+    )
     return SweptPatches(photometric=photometric, buckets=heights, averaged=1.0)
 
 
@@ -90,23 +90,12 @@ def exact(coarse, templates):
     distance = -middle + (middle.square() - start.square().sum(dim=-1) + 1).sqrt()
     outward = start + distance[..., None] * along
     shape = templates.depth.shape
-    inside, count = templates.inside, len(templates.facet)
-    zeros = torch.zeros(count, dtype=torch.long)
-    photometry = Photometry(
-        normals_patch=rotate(templates.patch_from_world, outward).reshape(*shape, 3),
-        albedo=torch.ones(*shape, 1).double(),
-        lights_patch=torch.ones(count, 1, 4).double(),
-        valid=inside,
-        information=1e4 * inside.double(),
-        status=zeros,
-        convergence=Convergence(iterations=zeros, residual=zeros.double(), cause=zeros),
+    normals = rotate(templates.patch_from_world, outward).reshape(*shape, 3)
+    return normals, Heights(
+        offset=distance.reshape(shape) * templates.inside,
+        information=templates.inside / (0.2 * SPACING) ** 2,
+        num_views=torch.full_like(templates.facet, 8),
     )
-    heights = Heights(
-        offset=distance.reshape(shape) * inside,
-        information=inside / (0.2 * SPACING) ** 2,
-        num_views=zeros + 8,
-    )
-    return photometry, heights
 
 
 def noisy(cap, rotation, lift, generator):

@@ -1,8 +1,6 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import unit_face_normals
@@ -162,8 +160,3 @@ def test_height_field_that_is_valid_nowhere_leaves_the_facets_without_confidence
     off_facet = (away * unit_face_normals(mesh.vertices_world, mesh.faces)[flat.facet]).sum(dim=1)
     assert off_facet.abs().median() < 0.2 * SPACING
     assert (surface.confidence == 0).all()
-
-
-def test_settings_that_mean_nothing_are_refused():
-    with pytest.raises(ConfigError, match="smoothing_radius_samples"):
-        RefineConfig(smoothing_radius_samples=0.0)
