@@ -185,15 +185,6 @@ def test_a_worker_without_memory_is_repeated_alone():
     assert [each.what for each in failures] == ["memory"]
 
 
-def test_a_worker_that_raises_anything_else_ends_the_work():
-    def work(item):
-        if item == 3:
-            raise KeyError("wrong")
-
-    with pytest.raises(KeyError), collecting():
-        list(side_by_side(work, range(8)))
-
-
 def test_a_kind_of_failure_is_warned_of_once_with_its_count():
     failures = [
         Failure(stage="sweep", what="patch", name=str(name), reason="NaN", done="Kept")

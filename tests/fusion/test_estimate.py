@@ -1,6 +1,5 @@
 import pytest
 import torch
-from derivatives import check_derivatives
 from torch.testing import assert_close
 from twins import using
 
@@ -104,27 +103,6 @@ def test_vertices_that_nothing_is_known_of_stay():
     assert_close(found[:10], smooth()[:10], rtol=0, atol=1e-6)
 
 
-def test_gradients_go_through_the_noise_that_is_estimated(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.02)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.1)
-
-    def answer(x):
-        kinds = [
-            noisy.replace(coefficients=x["coefficients"]),
-            kind.replace(targets=x["targets"], information=x["information"]),
-        ]
-        return {"heights": fused(kinds, 3).heights}
-
-    inputs = {
-        "coefficients": noisy.coefficients,
-        "targets": kind.targets,
-        "information": kind.information,
-    }
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3
-
-
 def with_common_errors(kind, together: float):
     """Let equations share an error, beside their own, that is so many times its variance."""
     total = 1 / kind.information + together / kind.information
@@ -153,21 +131,6 @@ def test_a_solve_with_common_errors_takes_the_weights_of_one_without(generator):
     matrix = rows.T @ weighted + 1e-9 * torch.eye(COUNT)
     assert_close(found.heights, torch.linalg.solve(matrix, weighted.T @ targets))
     assert_close(torch.stack(found.factors), torch.ones(2).double())
-
-
-def test_gradients_go_through_the_weights_of_the_other_solve(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.1)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.2)
-
-    def answer(x):
-        kinds = [noisy, kind.replace(targets=x["targets"], information=x["information"])]
-        common = [with_common_errors(noisy, 8.0), kinds[1]]
-        return {"heights": fuse_like(fused(kinds, 3), common, torch.zeros(COUNT).double()).heights}
-
-    inputs = {"targets": kind.targets, "information": kind.information}
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3
 
 
 @pytest.mark.parametrize("kernels", ["numba", "torch"])

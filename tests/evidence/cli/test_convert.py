@@ -117,18 +117,6 @@ def test_another_layout_is_refused_and_nothing_is_written(data, tmp_path, capsys
     assert not (tmp_path / "out").exists()
 
 
-def test_a_former_result_is_replaced_only_on_demand(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "transforms"]
-    assert main([*arguments, "--target", "idr"]) == 0
-    assert main([*arguments, "--target", "colmap"]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main([*arguments, "--target", "colmap", "--overwrite"]) == 0
-    assert not (tmp_path / "out" / "cameras.npz").exists()
-    (tmp_path / "out" / "notes.txt").touch()
-    assert main([*arguments, "--target", "idr", "--overwrite"]) == 2
-    assert "notes.txt" in capsys.readouterr().err
-
-
 def test_a_large_cloud_is_thinned_from_end_to_end():
     points = torch.arange(3 * 250_001).reshape(-1, 3).float()
     thin = cloud(Truth(points_world=points))

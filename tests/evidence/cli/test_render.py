@@ -84,23 +84,3 @@ def test_a_conductor_mirrors_an_environment_that_changes_on_demand(ball, tmp_pat
     assert capture.truth.highlight[capture.truth.foreground].float().mean() > 0.5
     assert render(ball, tmp_path / "other", "--conductor", "copper", "--albedo", *"000") == 2
     assert "no matte part" in capsys.readouterr().err
-
-
-def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
-    assert render(ball, tmp_path / "out") == 0
-    assert render(ball, tmp_path / "out") == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert render(ball, tmp_path / "out", "--overwrite", "--seed", "9") == 0
-    report = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
-    assert report["settings"]["seed"] == 9
-
-
-def test_a_scene_that_does_not_exist_is_told_in_a_sentence(tmp_path, capsys):
-    assert render("teapot", tmp_path / "out") == 2
-    assert "no scene 'teapot'" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_impossible_setting_is_told_in_a_sentence(ball, tmp_path, capsys):
-    assert render(ball, tmp_path / "out", "--exposure", "0") == 2
-    assert "exposure is 0.0" in capsys.readouterr().err

@@ -6,10 +6,7 @@ from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.records import AlignStatus, Mesh
 from tests.paper.alignment.caps import (
-    CENTER,
-    RADIUS,
     by_facet,
-    cap,
     random_transforms,
     spoiled,
     waves,
@@ -108,30 +105,6 @@ def test_patches_that_meet_nobody_are_handed_back(sphere):
     )
     alone = sphere.replace(buckets=nothing)
     assert Align()(alone) is alone
-
-
-def test_gradients_run_from_depths_to_aligned_depths(
-    facets_over, height_fields, sphere_height_field, generator
-):
-    patches = facets_over(cap, side=3, sample=0.06, overlap=4.0)
-    bad = spoiled(
-        height_fields(patches, sphere_height_field(CENTER, RADIUS)),
-        random_transforms(patches.num_patches, generator),
-    )
-    align = Align(AlignConfig(iterations=2))
-    probe = [torch.randn(b.depth.shape, generator=generator).double() for b in bad.buckets]
-    change = 0.1 * random_transforms(patches.num_patches, generator)
-
-    def outcome(step):
-        found = align(spoiled(bad, torch.tensor([0.0, 0, 1, 0]).double() + step * change))
-        return sum((b.depth * p)[b.valid].sum() for b, p in zip(found.buckets, probe, strict=True))
-
-    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(outcome(step), step)
-    tiny = 1e-6
-    numeric = (outcome(torch.tensor(tiny)) - outcome(torch.tensor(-tiny))) / (2 * tiny)
-    assert slope.abs() > 1e-3
-    assert_close(slope, numeric, rtol=1e-3, atol=1e-6)  # Newton's bilinear cells end in kinks
 
 
 def _but_first(depths):
