@@ -12,7 +12,7 @@ from pimper_torch.chains.streaming import warn_of_priors
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.fusion.terms import ContourRays, KeptSlopes, Normals, SweptHeights, Term
+from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights, Term, TouchedRays
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
@@ -370,7 +370,7 @@ def test_a_term_from_elsewhere_joins_the_list_and_its_parameters_have_gradients(
 def test_the_list_of_settings_is_the_list_of_terms(swept):
     _, given = swept(1.0)
     named = Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
-    listed = [KeptSlopes(), ContourRays(), SweptHeights(), Normals()]
+    listed = [KeptSlopes(), TouchedRays(), SweptHeights(), Normals()]
     assert torch.equal(named.vertices_world, Fuse(terms=listed)(given, FREE).vertices_world)
 
 
