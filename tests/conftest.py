@@ -88,6 +88,7 @@ def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize
 
+    from pimper_torch.evidence.scenes.procedural_meshes import table
     from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.geometry.projection import project
     from pimper_torch.geometry.rigid import rigid
@@ -115,13 +116,10 @@ def reconstruction():
     cameras = cameras.replace(
         intrinsics=cameras.intrinsics.float(), cam_from_world=cameras.cam_from_world.float()
     )
-    side = torch.linspace(-1, 1, 15)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    vertices = torch.stack([x, y, 0.5 * torch.exp(-3 * (x**2 + y**2))], dim=-1).reshape(-1, 3)
-    first = (torch.arange(14)[:, None] * 15 + torch.arange(14)).reshape(-1)
-    lower = torch.stack([first, first + 1, first + 16], dim=1)
-    upper = torch.stack([first, first + 16, first + 15], dim=1)
-    faces = torch.cat([lower, upper])
+    flat = table(1.0, cells=14).to(torch.float32)
+    faces, xy = flat.faces, flat.vertices_world[:, :2]
+    height = 0.5 * torch.exp(-3 * xy.square().sum(dim=1, keepdim=True))
+    vertices = torch.cat([xy, height], dim=1)
     mesh = Mesh(
         vertices_world=vertices,
         faces=faces,

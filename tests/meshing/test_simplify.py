@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.meshing.simplify import Bounds, simplify
@@ -14,12 +14,10 @@ from tests.threads import on_threads
 def square(side, height):
     """A height field over the unit square, with random values at its vertices."""
     generator = torch.Generator().manual_seed(3)
-    steps = torch.linspace(0, 1, side, dtype=torch.float64)
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    vertices = torch.stack([x, y, height(x, y)], dim=-1).reshape(-1, 3)
-    first = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1)
-    lower = torch.stack([first, first + 1, first + side + 1], dim=1)
-    faces = torch.cat([lower, torch.stack([first, first + side + 1, first + side], dim=1)])
+    flat = table(0.5, cells=side - 1)
+    faces, xy = flat.faces, flat.vertices_world[:, :2] + 0.5
+    xy = xy.reshape(side, side, 2)
+    vertices = torch.cat([xy, height(*xy.unbind(dim=-1))[..., None]], dim=-1).reshape(-1, 3)
     return Mesh(
         vertices_world=vertices,
         faces=faces,

@@ -3,6 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.procedural_meshes import table
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.transfer import coarse_normals, transfer, transferred_normals
@@ -16,18 +17,9 @@ def bump(xy: torch.Tensor) -> torch.Tensor:
 
 def surface(size: int = 100) -> Mesh:
     """A low dome over the square of the facets, facing +z."""
-    side = torch.linspace(-2.0, 2.0, size, dtype=torch.float64)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    xy = torch.stack([x, y], dim=-1).reshape(-1, 2)
-    vertices = torch.cat([xy, bump(xy)[:, None]], dim=1)
-    first = (torch.arange(size - 1)[:, None] * size + torch.arange(size - 1)).reshape(-1)
-    faces = torch.cat(
-        [
-            torch.stack([first, first + 1, first + size + 1], dim=1),
-            torch.stack([first, first + size + 1, first + size], dim=1),
-        ]
-    )
-    return Mesh(vertices_world=vertices, faces=faces)
+    flat = table(2.0, cells=size - 1)
+    xy = flat.vertices_world[:, :2]
+    return Mesh(vertices_world=torch.cat([xy, bump(xy)[:, None]], dim=1), faces=flat.faces)
 
 
 @pytest.fixture
