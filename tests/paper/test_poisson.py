@@ -1,4 +1,3 @@
-import pytest
 import scipy.fft
 import torch
 from torch.testing import assert_close
@@ -10,11 +9,6 @@ from pimper_torch.paper.integrate import (
     integrate_steps,
     solve_poisson,
 )
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(5209)
 
 
 def random(generator, *shape):
