@@ -88,6 +88,7 @@ def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize
 
+    from pimper_torch.evidence.scenes.procedural_meshes import table
     from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
     from pimper_torch.geometry.projection import project
     from pimper_torch.geometry.rigid import rigid
@@ -115,13 +116,10 @@ def reconstruction():
     cameras = cameras.replace(
         intrinsics=cameras.intrinsics.float(), cam_from_world=cameras.cam_from_world.float()
     )
-    side = torch.linspace(-1, 1, 15)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    vertices = torch.stack([x, y, 0.5 * torch.exp(-3 * (x**2 + y**2))], dim=-1).reshape(-1, 3)
-    first = (torch.arange(14)[:, None] * 15 + torch.arange(14)).reshape(-1)
-    lower = torch.stack([first, first + 1, first + 16], dim=1)
-    upper = torch.stack([first, first + 16, first + 15], dim=1)
-    faces = torch.cat([lower, upper])
+    flat = table(1.0, cells=14).to(torch.float32)
+    faces, xy = flat.faces, flat.vertices_world[:, :2]
+    height = 0.5 * torch.exp(-3 * xy.square().sum(dim=1, keepdim=True))
+    vertices = torch.cat([xy, height], dim=1)
     mesh = Mesh(
         vertices_world=vertices,
         faces=faces,
@@ -223,14 +221,7 @@ def lift():
     from pimper_torch.geometry.rigid import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
-    from pimper_torch.photometry.light_field import rotate_lights
-    from pimper_torch.records import (
-        CoarseMesh,
-        Convergence,
-        Mesh,
-        PhotometricPatches,
-        Photometry,
-    )
+    from pimper_torch.records import CoarseMesh, Mesh, PhotometricPatches
 
     slant = (0.15, -0.1, 1.0)
 
@@ -263,27 +254,24 @@ def lift():
         # The arc looks from +z, so the facets must be wound to face it.
         patches = Decompose(DecomposeConfig(overlap_samples=2.0))(coarse, cameras)
         seen = Warp()(scene.views, cameras, patches)
+        photometric = PhotometricPatches.of(
+            patches,
+            normals=[
+                rotate(one.patch_from_world, normal.expand(len(one.facet), 1, 3))[
+                    :, :, None
+                ].expand(*one.depth.shape, 3)
+                for one in patches.buckets
+            ],
+            albedo=[torch.ones(*one.depth.shape, 3) for one in patches.buckets],
+            lights=scene.lights_world,
+            information=1 / math.radians(8 / 3) ** 2,
+        )
         buckets = []
-        for templates in patches.buckets:
-            shape = templates.depth.shape
-            rotated = rotate(templates.patch_from_world, normal.expand(len(templates.facet), 1, 3))
-            count = len(templates.facet)
-            buckets.append(
-                Photometry(
-                    normals_patch=rotated[:, :, None].expand(*shape, 3),
-                    albedo=torch.ones(*shape, 3).double(),
-                    lights_patch=rotate_lights(templates.patch_from_world, scene.lights_world),
-                    valid=templates.inside,
-                    information=torch.full(shape, 1 / math.radians(8 / 3) ** 2).double(),
-                    status=torch.zeros(count, dtype=torch.long),
-                    convergence=Convergence(
-                        iterations=torch.ones(count, dtype=torch.long),
-                        residual=torch.full((count,), 0.005, dtype=torch.float64),
-                        cause=torch.zeros(count, dtype=torch.long),
-                    ),
-                )
-            )
-        photometric = PhotometricPatches(patches=patches, buckets=tuple(buckets))
+        for bucket in photometric.buckets:
+            residual = torch.full_like(bucket.convergence.residual, 0.005)
+            rest = bucket.convergence.replace(residual=residual)
+            buckets.append(bucket.replace(convergence=rest))
+        photometric = photometric.replace(buckets=tuple(buckets))
         return SimpleNamespace(
             normal=normal,
             scene=scene,

@@ -83,7 +83,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
         return found.replace(views=views)
 
     monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
-    few = FEW | {"scales": [0.5, 1.0]}
+    few = FEW | {"scales": [1.0]}
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
 

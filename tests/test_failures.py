@@ -25,7 +25,6 @@ from pimper_torch.failures import collecting as collecting_entries
 from pimper_torch.fusion import estimate
 from pimper_torch.io.reports import summary_report
 from pimper_torch.linalg.prepared import SingularSystemError
-from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry import factorize as factorization
@@ -114,15 +113,6 @@ def test_memory_that_does_not_suffice_ends_the_run_and_says_what_was_needed(erro
     refused = pytest.raises(ReconstructionError, match=r"Memory did not suffice.*--max-size-px")
     with refused, collecting():
         divided(lambda some: error if holds(some, 3) else None)
-
-
-def test_a_worker_that_raises_anything_else_ends_the_work():
-    def work(item):
-        if item == 3:
-            raise KeyError("wrong")
-
-    with pytest.raises(KeyError), collecting():
-        list(side_by_side(work, range(8)))
 
 
 def test_a_kind_of_failure_is_warned_of_once_with_its_count():

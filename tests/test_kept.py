@@ -1,7 +1,5 @@
 """Runs that go on where an earlier one ended."""
 
-import warnings
-
 import pytest
 import torch
 from probes import small_scene
@@ -113,18 +111,6 @@ def test_other_photographs_are_another_run(given, whole):
     assert "photometry" not in listener.kept
 
 
-def test_damaged_records_are_made_again(given, whole, tmp_path):
-    expected, folder, _ = whole
-    for path in folder.iterdir():
-        data = bytearray(path.read_bytes())
-        if path.suffix == ".safetensors":
-            data[len(data) * 3 // 4] ^= 16
-        (tmp_path / path.name).write_bytes(data)
-    result, listener = run(given, tmp_path)
-    assert listener.kept == []
-    assert bits(result) == bits(expected)
-
-
 class Doubtful(Extract):
     """The package's own, but of another module."""
 
@@ -141,30 +127,6 @@ def test_a_stage_of_ones_own_is_called_every_time(given, whole):
         with pytest.warns(PimperWarning, match="doubtful"):
             chain(given[0].views)
     assert listener.done.count("extract") == 2
-
-
-def test_what_asks_for_gradients_is_not_kept(given, tmp_path):
-    scene, _ = given
-    chain, _ = chain_of(given, tmp_path)
-    chain.running()(chain.silhouettes, scene)
-    kept = sorted(tmp_path.iterdir())
-    assert len(kept) == 2
-    images = scene.views.images.clone().requires_grad_()
-    chain.running()(chain.silhouettes, scene.replace(views=scene.views.replace(images=images)))
-    assert sorted(tmp_path.iterdir()) == kept
-
-
-def test_what_was_warned_of_is_warned_of_again(given, tmp_path):
-    for _ in range(2):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            _, listener = run(
-                given, tmp_path, factorize={"min_views": 6, "min_light_variation": 0.9}
-            )
-        messages = {str(one.message) for one in caught if one.category is PimperWarning}
-        assert any("patches keep the normals" in message for message in messages)
-    assert "photometry" in listener.kept
-    assert "photometry" not in listener.done
 
 
 def test_a_store_that_cannot_be_written_ends_no_run(given, whole, tmp_path):

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
@@ -90,26 +89,6 @@ def test_a_run_closes_with_what_guards_left_out(
     assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
-
-
-def test_options_reach_their_stages(photos, chain, tmp_path):
-    out = tmp_path / "out"
-    code = run(
-        *("reconstruct", "--photographs.saturation", "250,251,252", photos, "--out", out),
-        *("--photographs.response", "linear", "--max-size-px", "32"),
-        *("--reference", "1.png", "--sparse", tmp_path, "--reconstruct.starts", "7"),
-    )
-    assert code == 0
-    config, views, sparse = chain.given
-    assert views.images.shape[-2:] == (24, 32)
-    assert (config.reconstruct.starts, config.coarse_surface.reference) == (7, "1.png")
-    assert sparse == tmp_path
-    written = yaml.safe_load((out / "config.yaml").read_text())
-    assert written["reconstruct"]["starts"] == 7
-    assert load_config(out / "config.yaml") == config
-    assert config.photographs == Encoding(response="linear", saturation=(250, 251, 252))
-    summary = json.loads((out / "summary.json").read_text())
-    assert (summary["response"], summary["photographs"]) == ("linear", str(photos))
 
 
 def test_a_linear_profile_is_followed_unless_a_response_is_given(

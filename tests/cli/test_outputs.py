@@ -8,7 +8,6 @@ from pimper_torch.cli.main import main
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.outputs.folders import held_output
-from pimper_torch.outputs.marker import MARKER
 from pimper_torch.records import Mesh
 
 
@@ -46,23 +45,6 @@ def test_an_input_in_the_folder_of_the_result_is_refused(
     assert "PHOTOS" in capsys.readouterr().err
     assert contents(project) == before
     assert chain.given is None
-
-
-def test_a_folder_that_only_looks_like_a_result_is_refused(photos, chain, project, capsys):
-    before = contents(project)
-    assert run("reconstruct", photos, "-o", project, "--overwrite") == 2
-    assert f"no list of what a former run wrote ({MARKER})" in capsys.readouterr().err
-    assert contents(project) == before
-
-
-def test_a_persons_own_file_in_a_result_is_not_overwritten(photos, chain, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run("reconstruct", photos, "-o", out) == 0
-    (out / "sparse" / "notes.txt").write_text("mine")
-    before = contents(out)
-    assert run("reconstruct", photos, "-o", out, "--overwrite") == 2
-    assert "out: holds sparse/notes.txt, which is no part" in capsys.readouterr().err
-    assert contents(out) == before
 
 
 def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, capsys):

@@ -1,12 +1,11 @@
 import pytest
 import torch
-from derivatives import check_derivatives
 from torch.testing import assert_close
 from twins import using
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.fusion.equations import Equations
-from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
+from pimper_torch.fusion.estimate import fuse_like, fuse_terms
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.prepared import SingularSystemError
 
@@ -104,27 +103,6 @@ def test_vertices_that_nothing_is_known_of_stay():
     assert_close(found[:10], smooth()[:10], rtol=0, atol=1e-6)
 
 
-def test_gradients_go_through_the_noise_that_is_estimated(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.02)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.1)
-
-    def answer(x):
-        kinds = [
-            noisy.replace(coefficients=x["coefficients"]),
-            kind.replace(targets=x["targets"], information=x["information"]),
-        ]
-        return {"heights": fused(kinds, 3).heights}
-
-    inputs = {
-        "coefficients": noisy.coefficients,
-        "targets": kind.targets,
-        "information": kind.information,
-    }
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3
-
-
 def with_common_errors(kind, together: float):
     """Let equations share an error, beside their own, that is so many times its variance."""
     total = 1 / kind.information + together / kind.information
@@ -153,28 +131,6 @@ def test_a_solve_with_common_errors_takes_the_weights_of_one_without(generator):
     matrix = rows.T @ weighted + 1e-9 * torch.eye(COUNT)
     assert_close(found.heights, torch.linalg.solve(matrix, weighted.T @ targets))
     assert_close(torch.stack(found.factors), torch.ones(2).double())
-
-
-def test_gradients_go_through_the_weights_of_the_other_solve(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.1)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.2)
-
-    def answer(x):
-        kinds = [noisy, kind.replace(targets=x["targets"], information=x["information"])]
-        common = [with_common_errors(noisy, 8.0), kinds[1]]
-        return {"heights": fuse_like(fused(kinds, 3), common, torch.zeros(COUNT).double()).heights}
-
-    inputs = {"targets": kind.targets, "information": kind.information}
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3
-
-
-@pytest.mark.parametrize("outliers", [0, 1000])
-def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
-    square = 9.0 * drawn(generator, 1.0, 20000).square()
-    square[:outliers] = 1e6
-    assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)
 
 
 @pytest.mark.parametrize("kernels", ["numba", "torch"])

@@ -3,6 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_torch.evidence.scenes.procedural_meshes import table
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions
@@ -17,12 +18,8 @@ DRAWS, CLOSE = 300, 0.13
 @pytest.fixture(scope="module")
 def square():
     """A square of 32 facets, subdivided; four regions that err alike."""
-    side = torch.linspace(0, 1, 5, dtype=torch.float64)
-    y, x = torch.meshgrid(side, side, indexing="ij")
-    corners = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
-    first = (torch.arange(4)[:, None] * 5 + torch.arange(4)).reshape(-1)
-    lower = torch.stack([first, first + 1, first + 6], dim=1)
-    facets = torch.cat([lower, torch.stack([first, first + 6, first + 5], dim=1)])
+    mesh = table(0.5, cells=4)
+    corners, facets = mesh.vertices_world + torch.tensor([0.5, 0.5, 0.0]), mesh.faces
     return subdivide(corners, facets, torch.full((32,), 0.1).double()), facets
 
 

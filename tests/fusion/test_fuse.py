@@ -322,32 +322,6 @@ def test_what_is_continued_does_not_outvote_points(swept):
     assert off[surface.confidence > 0].median() < 0.01
 
 
-@pytest.mark.parametrize("name", ["normals_patch", "offset"])
-def test_the_surface_has_the_slope_of_its_differences_by_normals_and_offsets(swept, name):
-    _, given = swept(0.5)
-    generator = torch.Generator().manual_seed(1)
-    rotated = name == "normals_patch"
-    held = given.photometric if rotated else given
-    values = [getattr(bucket, name) for bucket in held.buckets]
-    unit = 1.0 if rotated else float(given.patches.buckets[0].spacing[0])
-    along = [unit * torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in values]
-
-    def fused(step):
-        moved = [value + step * each for value, each in zip(values, along, strict=True)]
-        moved = [normalize(each, dim=-1) for each in moved] if rotated else moved
-        pairs = zip(held.buckets, moved, strict=True)
-        new = held.replace(buckets=tuple(bucket.replace(**{name: each}) for bucket, each in pairs))
-        return Fuse()(given.replace(photometric=new) if rotated else new, FREE).vertices_world
-
-    here = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    surface = fused(here)
-    weight = torch.randn(surface.shape, generator=generator, dtype=torch.float64)
-    (gradient,) = torch.autograd.grad((weight * surface).sum(), here)
-    slope = (weight * (fused(1e-6) - fused(-1e-6))).sum() / 2e-6
-    # Measured 5e-9 and 2e-7.
-    assert_close(gradient, slope.detach(), rtol=1e-5, atol=0)
-
-
 def test_without_any_evidence_nothing_can_be_fused():
     with pytest.raises(ConfigError, match=r"fuse\.terms"):
         FuseConfig(terms=())

@@ -42,6 +42,7 @@ from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.rendered_folder import render_scene
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_torch.exchange.alicevision import write_sfm
 from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid
@@ -319,36 +320,23 @@ def _datasets(root: Path) -> list[Seed]:
         (root / kind).mkdir(parents=True)
         for name in views.names:
             Image.fromarray(_pixels()).save(root / kind / name)
-    rows, frames, placed = [], [], []
+    rows, placed = [], []
     for index, name in enumerate(views.names):
-        pose, cam = world_from_cam[index], cameras.cam_from_world[index].numpy()
+        pose = world_from_cam[index]
         columns = np.stack([pose[:3, 1], pose[:3, 0], -pose[:3, 2], pose[:3, 3], [18, 24, 30]], 1)
         rows.append([*columns.reshape(-1), 1.0, 9.0])
-        rotation = [str(value) for value in cam[:3, :3].T.reshape(-1)]
-        center = [str(value) for value in pose[:3, 3]]
-        frames.append((str(index), name, rotation, center))
         text = " ".join(f"{value:.9g}" for value in pose.reshape(-1))
         placed.append(
             f'<camera id="{index}" sensor_id="0" label="{name}"><transform>{text}</transform>'
             "</camera>"
         )
     np.save(root / "llff" / "poses_bounds.npy", np.array(rows))
-    intrinsic = {"intrinsicId": "3", "width": "24", "height": "18", "type": "radial3"}
-    intrinsic |= {"sensorWidth": "36", "focalLength": "45", "pixelRatio": "1"}
-    more = {"principalPoint": ["0", "0"], "distortionParams": ["0.01", "0", "0"]}
-    whole = {
-        "version": ["1", "2", "6"],
-        "views": [
-            {"viewId": key, "poseId": key, "intrinsicId": "3", "path": f"/x/{name}"}
-            for key, name, _, _ in frames
-        ],
-        "intrinsics": [intrinsic | more],
-        "poses": [
-            {"poseId": key, "pose": {"transform": {"rotation": rotation, "center": center}}}
-            for key, _, rotation, center in frames
-        ],
-    }
-    (root / "meshroom" / "cameras.sfm").write_text(json.dumps(whole))
+    sfm = root / "meshroom" / "cameras.sfm"
+    write_sfm(cameras, [f"/x/{name}" for name in views.names], sfm)
+    whole = json.loads(sfm.read_text())
+    for intrinsic in whole["intrinsics"]:
+        intrinsic |= {"distortionType": "radialk3", "distortionParams": ["0.01", "0", "0"]}
+    sfm.write_text(json.dumps(whole))
     (root / "metashape" / "cameras.xml").write_text(
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
         '<sensor id="0" type="frame"><resolution width="24" height="18"/><calibration type="frame"'

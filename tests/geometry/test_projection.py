@@ -53,15 +53,6 @@ def test_points_behind_and_beside_the_camera_give_finite_values_and_gradients():
     assert points.grad.isfinite().all()
 
 
-def test_gradients_of_projection_and_rays_are_right(cameras, points):
-    some = points[:4].clone().requires_grad_()
-    frames = cameras.cam_from_world[:1].clone().requires_grad_()
-    K = cameras.intrinsics[:1].clone().requires_grad_()
-    assert torch.autograd.gradcheck(project, (some, frames, K))
-    pixels = (points[:4, :2] * 30 + 30).requires_grad_()
-    assert torch.autograd.gradcheck(rays_through, (pixels, frames, K))
-
-
 def test_triangulation_angle_is_the_widest_between_rays_that_saw_the_point(monkeypatch):
     generator = torch.Generator().manual_seed(122)
     monkeypatch.setattr(projection, "_POINTS", 3)  # in several parts

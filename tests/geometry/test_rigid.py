@@ -29,9 +29,3 @@ def test_the_inverse_undoes_the_transform_in_every_batch(generator):
     assert_close(source_from_target, torch.linalg.inv(target_from_source))
     points = torch.randn(2, 3, 7, 3, generator=generator, dtype=torch.float64)
     assert_close(transform(source_from_target, transform(target_from_source, points)), points)
-
-
-def test_gradients_reach_points_and_frames(generator):
-    frame = random_rigid(generator, 1)[0].requires_grad_()
-    points = torch.randn(3, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda f, p: transform(invert_rigid(f), p), (frame, points))

@@ -144,15 +144,6 @@ def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
     assert isinstance(subdivision, Subdivision)
 
 
-def test_points_carry_gradients_to_the_coarse_mesh():
-    vertices, facets = icosphere(0)
-    vertices = vertices.clone().requires_grad_()
-    subdivision = subdivide(vertices, facets, all_spacings(facets, 0.5))
-    subdivision.points.sum().backward()
-    assert vertices.grad is not None
-    assert_close(vertices.grad.sum(), torch.tensor(3.0 * len(subdivision.points)).double())
-
-
 def test_what_is_smooth_is_transferred_from_a_coarser_subdivided_mesh_over_the_same_facets():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets = torch.tensor([[0, 1, 2], [0, 2, 3]])

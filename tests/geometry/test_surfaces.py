@@ -83,10 +83,3 @@ def test_barycentric_coordinates_rebuild_the_point_and_tell_the_side(generator):
     assert_close(
         at_corners.movedim(0, 1), torch.eye(3).double().expand(20, 3, 3), atol=1e-9, rtol=0
     )
-
-
-def test_gradients_of_normals_are_right(generator):
-    vertices = torch.randn(7, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: vertex_normals(v, FACES), (vertices,))
-    normals = normals_from_slopes(torch.randn(5, 2, generator=generator, dtype=torch.float64))
-    assert torch.autograd.gradcheck(slopes_from_normals, (normals.requires_grad_(),))

@@ -73,13 +73,6 @@ def test_a_folder_with_a_mesh_alone_is_one_too(folder):
     assert found.cameras.num_views == 3
 
 
-def test_a_folder_without_a_mesh_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"holds no mesh\.ply"):
-        read_estimate(tmp_path)
-    with pytest.raises(InputError, match="found nothing"):
-        read_estimate(tmp_path / "away.ply")
-
-
 @pytest.mark.parametrize(
     "text", ["nonsense", "[1, 2]", '{"views": [{"name": "a.png", "light": [1, 2]}]}', "[" * 9999]
 )

@@ -75,18 +75,6 @@ def test_unlike_sizes_are_padded_right_and_below(photos, pixels):
     assert_close(views.images[1, :, :, :8], views.images[0, :, :8].mT)
 
 
-def test_orientation_and_focal_length_come_from_exif(photos, pixels):
-    exif = Image.Exif()
-    exif[274] = 6
-    exif.get_ifd(0x8769)[0xA405] = 50
-    save(photos / "2.png", pixels, exif=exif)
-    views = load_views(photos)
-    assert views.sizes_px.tolist()[1] == [8, 12]
-    upright = np.rot90(pixels, -1).copy()
-    assert_close(views.images[1, :, :12, :8], linear_from_srgb(as_planes(upright)))
-    assert views.focals_px[1].item() == pytest.approx(5000 / 3600 * 12)
-
-
 def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
     for number, zoom in enumerate([1, 1, 2, 2]):
         exif = Image.Exif()
@@ -99,10 +87,6 @@ def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
     assert choose_lenses(views) == [0, 0, 1, 1]
     photographs = read_all(list_images(tmp_path), FROM_FILES, max_size_px=6)
     assert [one.focal_px for one in photographs] == pytest.approx((views.focals_px / 2).tolist())
-
-
-def as_planes(array):
-    return torch.from_numpy(array.astype(np.float32) / 255).permute(2, 0, 1)
 
 
 def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path):

@@ -6,10 +6,8 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Convergence,
     Mesh,
     PhotometricPatches,
-    Photometry,
 )
 from tests.coarse.conftest import dome_cloud
 
@@ -47,27 +45,11 @@ def photographed():
     """Give patches the exact normals of a height field with the slopes ``(x, y) -> (p, q)``."""
 
     def build(patches, slopes, keep=lambda x, y: torch.ones_like(x, dtype=torch.bool)):
-        buckets = []
+        normals = []
         for templates in patches.buckets:
             x, y, _ = templates.points_patch.unbind(dim=-1)
-            valid = templates.inside & keep(x, y)
-            normals = normals_from_slopes(torch.stack(slopes(x, y), dim=-1))
-            normals = torch.where(valid[..., None], normals, torch.nan)
-            count = len(templates.facet)
-            one = torch.ones(count, dtype=x.dtype)
-            buckets.append(
-                Photometry(
-                    normals_patch=normals,
-                    albedo=torch.ones(*x.shape, 1, dtype=x.dtype),
-                    lights_patch=torch.ones(count, 1, 4, dtype=x.dtype),
-                    valid=valid,
-                    information=1e3 * valid.to(x),
-                    status=0 * one.long(),
-                    convergence=Convergence(
-                        iterations=one.long(), residual=0 * one, cause=0 * one.long()
-                    ),
-                )
-            )
-        return PhotometricPatches(patches=patches, buckets=tuple(buckets))
+            exact = normals_from_slopes(torch.stack(slopes(x, y), dim=-1))
+            normals.append(torch.where(keep(x, y)[..., None], exact, torch.nan))
+        return PhotometricPatches.of(patches, normals=normals, lights=torch.ones(1, 4))
 
     return build

@@ -95,14 +95,3 @@ def test_the_height_field_passes_on_average_through_the_corners(two_facets, phot
         assert_close(found.mean(dim=1), torch.zeros_like(found[:, 0]))
         identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
         assert_close(height_field.transform, identity.expand(len(found), 4))
-
-
-def test_gradients_reach_normals(generator):
-    slopes = 0.3 * torch.randn(1, 3, 4, 2, generator=generator, dtype=torch.float64)
-    normals = torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1)
-    valid = torch.ones(1, 3, 4, dtype=torch.bool)
-    valid[0, 1, 2] = False
-    spacing = torch.tensor([0.5], dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda normals: integrate_normals(normals, valid, spacing, 10.0), normals.requires_grad_()
-    )

@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError, InputError, ReconstructionError
+from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.topology import face_pairs, half_edges
+from pimper_torch.geometry.topology import half_edges
 from pimper_torch.paper.cloud_filters import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.triangulate import (
     Triangulate,
@@ -120,13 +120,6 @@ def test_bridges_over_a_depth_discontinuity_are_dropped(dome_cloud):
     assert (levels.amax(dim=1) - levels.amin(dim=1) < 0.5).all()
 
 
-def test_faces_show_their_front_to_the_camera():
-    pixels = torch.tensor([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [11.0, 12.0]])
-    faces = delaunay(pixels)
-    points_cam = torch.cat([pixels, torch.full((4, 1), 30.0)], dim=1)
-    assert (face_normals(points_cam, faces)[:, 2] < 0).all()
-
-
 def test_inverse_depth_of_a_plane_is_reproduced_exactly():
     generator = torch.Generator().manual_seed(6)
     known = 300 * torch.rand(80, 2, generator=generator, dtype=torch.float64)
@@ -145,26 +138,7 @@ def test_filled_pixels_keep_away_from_points_and_inside_the_faces():
     assert 0.4 < len(half) / len(all_filled) < 0.6
 
 
-def test_components_are_connected_by_edges_only():
-    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [2, 4, 5]])  # the last touches in a vertex
-    assert largest_component(faces).tolist() == [[0, 1, 2], [1, 3, 2]]
-    pairs, edges = face_pairs(faces)
-    assert pairs.tolist() == [[0, 1]]
-    assert edges.tolist() == [[1, 2]]
-
-
 def test_a_cloud_without_trustworthy_points_is_refused_with_counts(dome_cloud):
     bad = dome_cloud.replace(reprojection_errors_px=100 + 0 * dome_cloud.reprojection_errors_px)
     with pytest.raises(ReconstructionError, match=r"0 of \d+ sparse points .* 0 reprojected"):
         Triangulate()(bad)
-
-
-def test_an_unknown_reference_name_is_refused(dome_cloud):
-    with pytest.raises(InputError, match="nobody"):
-        Triangulate(TriangulateConfig(reference="nobody"))(dome_cloud)
-
-
-@pytest.mark.parametrize("change", [{"num_points": 2}])
-def test_impossible_settings_are_refused(change):
-    with pytest.raises(ConfigError, match=next(iter(change))):
-        TriangulateConfig(**change)

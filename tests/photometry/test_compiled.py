@@ -68,28 +68,6 @@ def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, su
     assert (whole.weight - found.weight).abs().max() > 1e-5 or "stride" not in subset
 
 
-def test_views_and_samples_without_data_make_no_difference(problem, generator):
-    given = noisy(problem, generator, patches=1, views=12, samples=80, missing=0.2)
-    weight = given.weight.clone()
-    weight[:, 3] = 0
-    weight[:, :, 50:] = 0
-    given = given.replace(weight=weight, radiance=weight * given.radiance)
-    keep = torch.arange(12) != 3
-    small = given.replace(
-        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "regularization")},
-        radiance=given.radiance[:, keep, :50].contiguous(),
-        weight=given.weight[:, keep, :50].contiguous(),
-        shading=given.shading[..., :50].contiguous(),
-        prior=given.prior[..., :50].contiguous(),
-    )
-    found = solve(given, "numba")
-    alone = solve(small, "torch")
-    assert_close(found.lights[:, keep], alone.lights, rtol=0, atol=2e-3)
-    assert_close(found.lights[:, 3], given.anchor[:, 3])
-    assert_close(found.shading[..., 50:], given.shading[..., 50:])
-    assert (found.weight[:, 3] == 0).all()
-
-
 def test_whole_factorizations_agree_and_nan_is_missing(scene):
     seen = scene().seen.to(torch.float32)
     first = seen.buckets[0]

@@ -91,19 +91,6 @@ def test_samples_lit_by_few_have_no_say(scene):
     assert found.valid[1, 8:].any()
 
 
-def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
-    true = scene()
-    first = true.seen.buckets[0]
-    valid = first.valid.clone()
-    valid[1, 3:] = False
-    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
-    with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
-        found = Factorize()(seen).buckets[0]
-    assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
-    assert (found.lights_patch[1, 3:] == 0).all()
-    assert found.convergence.residual.isfinite().all()
-
-
 def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
@@ -268,18 +255,6 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
         assert getattr(bad, name).isfinite().all()
         assert_close(getattr(bad, name)[keep], getattr(good, name)[keep])
     assert bad.determined[keep].all()
-
-
-def test_a_view_that_sees_nothing_has_no_light(scene):
-    true = scene()
-    buckets = tuple(
-        each.replace(valid=each.valid & (torch.arange(12) != 4)[:, None, None])
-        for each in true.seen.buckets
-    )
-    found = Factorize()(true.seen.replace(buckets=buckets))
-    assert (found.buckets[0].lights_patch[:, 4] == 0).all()
-    assert (found.buckets[0].lights_patch[:, 5] != 0).any()
-    assert found.buckets[0].valid.any()
 
 
 def test_nothing_seen_at_all_is_told_not_raised(scene):

@@ -8,15 +8,6 @@ def drawn(generator, *shape):
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def test_the_spread_scales_with_the_residuals(generator):
-    noise = drawn(generator, 3, 400)
-    seen = torch.rand(3, 400, generator=generator) > 0.2
-    once = robust_deviation(noise, seen)
-    assert_close(robust_deviation(7 * noise, seen), 7 * once)
-    # What is not seen does not matter.
-    assert_close(robust_deviation(torch.where(seen, noise, 1e6), seen), once)
-
-
 def test_the_spread_solves_its_equation(generator):
     noise = drawn(generator, 2, 300)
     everything = torch.ones_like(noise, dtype=torch.bool)

@@ -48,17 +48,6 @@ def test_factors_are_recovered_up_to_lorentz_with_60_percent_missing(problem, so
     assert (found.shading - given.shading).abs().max() > 0.05
 
 
-def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
-    given, _, shading = problem()
-    weight = torch.ones_like(given.weight)
-    for view in range(20):  # each view misses another contiguous half, as occlusion does
-        away = (torch.arange(150) - 7 * view) % 150 < 75
-        weight[:, view, away] = 0
-    given = given.replace(weight=weight, radiance=weight * given.radiance)
-    found = solve_projection(given, 800, 1e-8)
-    assert error(found.shading, shading, weight) < 1e-3
-
-
 def test_balm_and_variable_projection_agree_on_clean_data(problem):
     given, _, _ = problem(missing=0.3)
     regularization = torch.full_like(

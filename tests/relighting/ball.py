@@ -1,5 +1,7 @@
 """Photographs of a unit ball in closed form, and the ball as a mesh."""
 
+from functools import cache
+
 import torch
 from torch.nn.functional import normalize
 
@@ -76,6 +78,7 @@ def textbook(normal, to_light, to_eye, base, material):
     return cosine * ((1 - metallic) * base + torch.pi * density * visible * fresnel)
 
 
+@cache
 def photographed(material, views=6, albedo=colours):
     """Photographs of a ball of one material, as a scene, and their lights."""
     cameras = ring(views)

@@ -39,6 +39,12 @@ def whole() -> Views:
 
 
 @pytest.fixture(scope="module")
+def unlit() -> Views:
+    """Photographs whose light stays, so that features match."""
+    return photographs(cameras_on_an_arc(), lit=False)
+
+
+@pytest.fixture(scope="module")
 def sparse(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sparse")
     generator = torch.Generator().manual_seed(11)
@@ -104,11 +110,10 @@ RECONSTRUCT = Reconstruct(ReconstructConfig(threads=1))
         (-9, -4, -9, -4),  # margins of raw
     ],
 )
-def test_matches_tell_where_photographs_were_cropped(whole, sparse, transforms, borders):
-    plain = photographs(cameras_on_an_arc(), lit=False)
+def test_matches_tell_where_photographs_were_cropped(unlit, sparse, transforms, borders):
     for path in (sparse, transforms):
         with pytest.warns(PimperWarning) as told:
-            scene = RECONSTRUCT(cropped(plain, *borders), path)
+            scene = RECONSTRUCT(cropped(unlit, *borders), path)
         about = [str(one.message) for one in told if "resized" in str(one.message)]
         assert len(about) == 1
         assert "6 of 6 photographs (0.png" in about[0]
@@ -165,10 +170,9 @@ def test_other_photographs_of_another_shape_are_no_crop(whole, sparse):
         RECONSTRUCT(shuffled, sparse)
 
 
-def test_photographs_of_cameras_without_points_that_were_resized_are_no_crop(transforms):
-    plain = photographs(cameras_on_an_arc(), lit=False)
+def test_photographs_of_cameras_without_points_that_were_resized_are_no_crop(unlit, transforms):
     with pytest.warns(PimperWarning) as told:
-        scene = RECONSTRUCT(resized(plain, 341, 256), transforms)
+        scene = RECONSTRUCT(resized(unlit, 341, 256), transforms)
     assert not [one for one in told if "resized" in str(one.message)]
     assert scene.lenses[0].params[2:4] == pytest.approx((170.5, 128))
 

@@ -85,14 +85,6 @@ def test_the_padding_of_a_smaller_photograph_never_leaks_in():
     assert_close(undistorted.images, ones.images)
 
 
-def test_a_photograph_without_distortion_stays_bit_for_bit():
-    views = ramp_views([(50, 40)])
-    plain = Lens(camera=1, model="PINHOLE", params=(60.0, 61.0, 20.0, 22.0), width=50, height=40)
-    undistorted, _ = undistort(views, (plain,))
-    assert torch.equal(undistorted.images, views.images)
-    assert undistorted.masks is None
-
-
 def test_a_drawn_mask_moves_with_the_photograph():
     views = ramp_views([(50, 40)])
     drawn = views.images[:, 0] * 100 < 11.0  # left of a straight line in the photograph

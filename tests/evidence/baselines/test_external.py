@@ -113,14 +113,6 @@ def test_at_the_deadline_the_program_and_its_children_are_stopped(tmp_path):
     assert not (tmp_path / "late").exists()
 
 
-def test_a_deadline_is_shared_by_the_programs_that_it_is_given_to(tmp_path):
-    tool = script(tmp_path / "tool", "import time; time.sleep(60)")
-    deadline = soon(0.005)
-    for _ in range(2):
-        with pytest.raises(ReconstructionError, match="minutes are over"):
-            run_program([tool], tmp_path, deadline, 1)
-
-
 def test_a_file_that_is_no_program_for_this_machine_counts_as_missing(tmp_path):
     (tmp_path / "tool").write_bytes(b"\x7fELF of another kind")
     (tmp_path / "tool").chmod(0o755)

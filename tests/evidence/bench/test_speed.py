@@ -90,6 +90,7 @@ def test_each_round_has_the_floor_of_its_own_samples(speed):
     assert math.isnan(floor[5])
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch, tmp_path, capsys):
     class Chain:
         """The hand-overs of a run, without the work."""

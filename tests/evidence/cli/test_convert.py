@@ -102,14 +102,6 @@ def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
     assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
 
 
-def test_a_reader_whose_files_are_known_is_told_nothing_of_them(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "rendered"]
-    assert main([*arguments, "--target", "idr", "--photographs.response", "2.2"]) == 2
-    assert "--photographs.response: the reader of rendered does not know it" in (
-        capsys.readouterr().err
-    )
-
-
 def test_a_set_of_scans_needs_the_scans_number(data, tmp_path, capsys):
     arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
     assert main([*arguments, "--target", "idr"]) == 2
@@ -123,18 +115,6 @@ def test_another_layout_is_refused_and_nothing_is_written(data, tmp_path, capsys
     assert "not the layout of an LLFF set" in message
     assert "poses_bounds.npy" in message
     assert not (tmp_path / "out").exists()
-
-
-def test_a_former_result_is_replaced_only_on_demand(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "transforms"]
-    assert main([*arguments, "--target", "idr"]) == 0
-    assert main([*arguments, "--target", "colmap"]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main([*arguments, "--target", "colmap", "--overwrite"]) == 0
-    assert not (tmp_path / "out" / "cameras.npz").exists()
-    (tmp_path / "out" / "notes.txt").touch()
-    assert main([*arguments, "--target", "idr", "--overwrite"]) == 2
-    assert "notes.txt" in capsys.readouterr().err
 
 
 def test_a_large_cloud_is_thinned_from_end_to_end():

@@ -48,6 +48,7 @@ def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     assert "rays" not in told
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_how_near_a_result_comes_to_photographs_is_told(ball, reconstruction, tmp_path, capsys):
     write_result(reconstruction, CoarseToFineConfig(), tmp_path / "result")
     out = tmp_path / "report.json"

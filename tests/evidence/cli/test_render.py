@@ -71,23 +71,3 @@ def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_p
     capture = read_rendered(tmp_path / "out")
     seen = capture.truth.albedo[capture.truth.foreground]
     assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
-
-
-def test_a_former_rendering_is_replaced_only_on_demand(ball, tmp_path, capsys):
-    assert render(ball, tmp_path / "out") == 0
-    assert render(ball, tmp_path / "out") == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert render(ball, tmp_path / "out", "--overwrite", "--seed", "9") == 0
-    report = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())
-    assert report["settings"]["seed"] == 9
-
-
-def test_a_scene_that_does_not_exist_is_told_in_a_sentence(tmp_path, capsys):
-    assert render("teapot", tmp_path / "out") == 2
-    assert "no scene 'teapot'" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_impossible_setting_is_told_in_a_sentence(ball, tmp_path, capsys):
-    assert render(ball, tmp_path / "out", "--exposure", "0") == 2
-    assert "exposure is 0.0" in capsys.readouterr().err

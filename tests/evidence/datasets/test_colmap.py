@@ -60,26 +60,23 @@ def test_a_lens_is_undistorted(folder):
     assert (capture.views.images[0, :, 11, 15] > 0).all()
 
 
-def test_an_image_that_leads_out_of_the_folder_is_refused(folder, paint):
-    paint(folder / "secret.png", 100)
-    write_text(folder / "sparse" / "0", second="../secret.png")
-    with pytest.raises(InputError, match="leads out of it"):
-        read_colmap(folder)
-
-
-def test_a_missing_photograph_is_named(folder):
-    (folder / "images" / "a.png").unlink()
-    with pytest.raises(InputError, match=r"no a\.png"):
-        read_colmap(folder)
-
-
-def test_a_folder_without_a_model_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"cameras\.bin or cameras\.txt"):
-        read_colmap(tmp_path)
-
-
 def test_a_cloud_is_written_with_the_model(capture, tmp_path):
     points = torch.tensor([[6.0, 3, 5], [1, 2, 4]])
     write_colmap(capture.views, capture.cameras, tmp_path, points_world=points)
     found = read_model(tmp_path / "sparse" / "0").points_world
     assert_close(found, points.double())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "needed"),
+    [
+        (lambda at: write_text(at / "sparse" / "0", second="../secret.png"), "leads out of it"),
+        (lambda at: (at / "images" / "a.png").unlink(), r"no a\.png"),
+        (lambda at: (at / "sparse").rename(at / "dense"), r"cameras\.bin or cameras\.txt"),
+    ],
+)
+def test_read_colmap_refuses_what_leads_out_or_is_missing(folder, paint, spoil, needed):
+    paint(folder / "secret.png", 100)
+    spoil(folder)
+    with pytest.raises(InputError, match=needed):
+        read_colmap(folder)

@@ -103,25 +103,6 @@ def test_the_protocol_has_the_grid_of_the_files(folder):
     assert protocol.plane.tolist() == [0, 1, -2, 3]
 
 
-def test_a_scan_that_is_not_there_is_refused_by_name(folder):
-    with pytest.raises(InputError, match=r"Rectified/scan2.*Found: Calibration"):
-        read_dtu_mvs(folder, 2)
-
-
-def test_the_protocol_of_a_scan_without_files_is_refused(folder):
-    with pytest.raises(InputError, match=r"ObsMask2_10\.mat.*Found: ObsMask9_10\.mat, Plane9\.mat"):
-        read_dtu_protocol(folder, 2)
-
-
-def test_a_grid_that_is_no_grid_is_refused(folder):
-    scipy.io.savemat(
-        folder / "ObsMask" / "ObsMask9_10.mat",
-        {"ObsMask": np.eye(3), "BB": np.eye(3)[:2], "Res": 10.0},
-    )
-    with pytest.raises(InputError, match=r"a grid as ObsMask.*3 x 3"):
-        read_dtu_protocol(folder, 9)
-
-
 def test_cameras_for_mvsnets_small_training_copies_are_refused(folder, rig):
     (folder / "Calibration" / "cal18").rename(folder / "Calibration" / "cal19")
     save_mvsnet(folder, rig, factor=0.1)
@@ -140,3 +121,22 @@ def test_a_camera_file_with_something_else_is_refused(folder, text):
     (folder / "Calibration" / "cal18" / "pos_002.txt").write_text(text)
     with pytest.raises(InputError, match=r"pos_002\.txt"):
         read_dtu_mvs(folder, 9)
+
+
+@pytest.mark.parametrize(
+    ("read", "needed"),
+    [
+        (read_dtu_mvs, r"Rectified/scan2.*Found: Calibration"),
+        (read_dtu_protocol, r"ObsMask2_10\.mat.*Found: ObsMask9_10\.mat, Plane9\.mat"),
+    ],
+)
+def test_readers_refuse_a_scan_that_is_not_there(folder, read, needed):
+    with pytest.raises(InputError, match=needed):
+        read(folder, 2)
+
+
+def test_read_dtu_protocol_refuses_a_matrix(folder):
+    matrices = {"ObsMask": np.eye(3), "BB": np.eye(3)[:2], "Res": 10.0}
+    scipy.io.savemat(folder / "ObsMask" / "ObsMask9_10.mat", matrices)
+    with pytest.raises(InputError, match=r"a grid as ObsMask.*3 x 3"):
+        read_dtu_protocol(folder, 9)

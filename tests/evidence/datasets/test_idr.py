@@ -53,18 +53,6 @@ def test_other_camera_files_are_found(folder, sees):
         read_idr(folder)
 
 
-def test_matrices_for_other_images_are_refused(folder, paint):
-    save(folder, count=3)
-    with pytest.raises(InputError, match=r"2 photographs.*Found: 3 cameras"):
-        read_idr(folder)
-
-
-def test_a_mask_too_few_is_refused(folder):
-    (folder / "mask" / "000.png").unlink()
-    with pytest.raises(InputError, match="2 masks"):
-        read_idr(folder)
-
-
 @pytest.mark.parametrize(
     ("matrix", "needed"),
     [
@@ -118,11 +106,21 @@ def test_masks_tell_the_size_of_the_sphere():
     assert abs(reach * 0.9 * 200 / 4 - 20) < 0.71  # the farthest pixel's centre
 
 
-def test_cameras_that_look_the_same_way_do_not_tell_where_the_object_is(capture):
+@pytest.mark.parametrize(
+    ("spoil", "needed"),
+    [
+        (lambda at: save(at, count=3), r"2 photographs.*Found: 3 cameras"),
+        (lambda at: (at / "mask" / "000.png").unlink(), "2 masks"),
+    ],
+)
+def test_read_idr_refuses_other_numbers_of_cameras_and_masks(folder, spoil, needed):
+    spoil(folder)
+    with pytest.raises(InputError, match=needed):
+        read_idr(folder)
+
+
+def test_unit_sphere_refuses_what_has_no_size(capture):
     with pytest.raises(InputError, match="look the same way"):
         unit_sphere(capture.cameras.take([0, 0]))
-
-
-def test_a_cloud_of_one_point_has_no_sphere(capture):
     with pytest.raises(InputError, match="has no size"):
         unit_sphere(capture.cameras, torch.ones(4, 3))

@@ -54,44 +54,36 @@ def test_masks_beside_the_photographs_are_found(folder, paint):
     assert masks[:, :6, :8].all()
 
 
-def test_a_photograph_more_than_rows_is_refused(folder, paint):
-    paint(folder / "images" / "11.png", 100)
-    with pytest.raises(InputError, match=r"2 photographs, one for each row.*Found: 3"):
-        read_llff(folder)
+def _with(row, column, value):
+    def spoil(rows):
+        rows[row, column] = value
+        return rows
 
-
-def test_another_folder_is_refused(tmp_path):
-    (tmp_path / "cameras.npz").touch()
-    with pytest.raises(InputError, match=r"a file poses_bounds\.npy.*cameras\.npz"):
-        read_llff(tmp_path)
+    return spoil
 
 
 @pytest.mark.parametrize(
-    "array", [np.zeros((2, 15)), np.full((2, 17), np.nan), np.zeros((2, 17), dtype=int)]
+    ("spoil", "needed"),
+    [
+        (lambda rows: rows[:, :15], r"shape \(views, 17\)"),
+        (lambda rows: np.full((2, 17), np.nan), r"shape \(views, 17\)"),
+        (lambda rows: rows.astype(int), r"shape \(views, 17\)"),
+        (lambda rows: rows[:1], r"1 photographs, one for each row.*Found: 2"),
+        (_with(0, 2, 1.0), "a reflection"),  # back becomes forward
+        (_with(0, 14, 0.0), "height, width and focal length"),
+    ],
 )
-def test_another_array_is_refused(folder, array):
-    np.save(folder / "poses_bounds.npy", array)
-    with pytest.raises(InputError, match=r"shape \(views, 17\)"):
+def test_read_llff_refuses_other_arrays(folder, spoil, needed):
+    np.save(folder / "poses_bounds.npy", spoil(np.load(folder / "poses_bounds.npy")))
+    with pytest.raises(InputError, match=needed):
         read_llff(folder)
 
 
-def test_columns_that_are_no_rotation_are_refused(folder):
-    rows = np.load(folder / "poses_bounds.npy")
-    rows[0, 2] = 1.0  # back becomes forward: a reflection
-    np.save(folder / "poses_bounds.npy", rows)
-    with pytest.raises(InputError, match="a reflection"):
-        read_llff(folder)
-
-
-def test_a_row_without_a_size_is_refused(folder):
-    rows = np.load(folder / "poses_bounds.npy")
-    rows[0, 14] = 0.0
-    np.save(folder / "poses_bounds.npy", rows)
-    with pytest.raises(InputError, match="height, width and focal length"):
-        read_llff(folder)
-
-
-def test_a_set_without_photographs_is_refused(folder):
-    (folder / "images").rename(folder / "pictures")
-    with pytest.raises(InputError, match="a folder `images`"):
+@pytest.mark.parametrize(
+    ("missing", "needed"),
+    [("poses_bounds.npy", r"a file poses_bounds\.npy"), ("images", "a folder `images`")],
+)
+def test_read_llff_names_what_is_missing(folder, missing, needed):
+    (folder / missing).rename(folder / "elsewhere")
+    with pytest.raises(InputError, match=needed):
         read_llff(folder)

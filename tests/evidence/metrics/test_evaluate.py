@@ -7,7 +7,7 @@ from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.evidence.metrics import EvaluateConfig, evaluate, report, rows
 from pimper_torch.evidence.metrics.evaluation import chosen_views
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.records import DtuProtocol, Estimate, Truth
+from pimper_torch.records import Estimate, Truth
 
 FEW = {"samples": 3000}
 
@@ -86,15 +86,6 @@ def test_a_mesh_alone_is_judged_by_its_surface_and_the_centre_view(parts, make):
     assert found.cameras is None
 
 
-def test_icp_takes_out_what_the_cameras_left(parts, make):
-    _, capture = parts
-    config = EvaluateConfig(alignment="icp", **FEW)
-    found = evaluate(Estimate(mesh=make.sphere(1.1, level=4)), capture, config)
-    assert found.alignment.scale == pytest.approx(1 / 1.1, rel=2e-3)
-    assert found.surface.accuracy.mean < 2e-3
-    assert "20 % of the estimate trimmed, from identity" in found.alignment.description
-
-
 def test_views_are_chosen_by_name_whatever_their_suffix(parts):
     estimate, capture = parts
     config = EvaluateConfig(views=("view_4.jpg", "view_1.png", "view_4.png"))
@@ -123,29 +114,6 @@ def test_maps_of_a_few_views_may_come_apart_from_the_rest(parts):
     found = evaluate(estimate, capture, EvaluateConfig(**FEW), maps=only)
     assert [view.name for view in found.views] == ["view_2.png"]
     assert found.cameras.views == 5
-
-
-def test_the_protocol_of_dtu_is_applied_where_it_is_given(make):
-    cloud = make.sphere(10.0, level=4)
-    protocol = DtuProtocol(
-        obs_mask=torch.ones(25, 25, 25) > 0,
-        bounding_box=torch.tensor([[-12.0] * 3, [12.0] * 3]).double(),
-        resolution=1.0,
-        plane=torch.tensor([0.0, 0, 1, 20]).double(),
-    )
-    capture = make.capture(Truth(points_world=cloud.vertices_world))
-    estimate = Estimate(mesh=cloud.replace(vertices_world=1.05 * cloud.vertices_world))
-    found = evaluate(estimate, capture, EvaluateConfig(**FEW), dtu=protocol)
-    assert found.dtu.mean_completeness == pytest.approx(0.5, rel=0.1)
-    assert found.surface.whole.completeness.mean == pytest.approx(0.5, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    "setting", [{"thresholds_percent": (0.5, 0.0)}, {"seen_from": 0}, {"samples": 0}]
-)
-def test_impossible_settings_are_refused(setting):
-    with pytest.raises(ConfigError, match=next(iter(setting))):
-        EvaluateConfig(**setting)
 
 
 def test_the_account_is_json_that_says_everything(parts):
@@ -179,3 +147,8 @@ def test_every_row_has_a_unit_and_a_meaning(parts):
     assert said["chamfer_sum"].meaning.startswith("sum of mean accuracy")
     assert said["missing"].value == "2 of 5"
     assert all(row.meaning for row in said.values())
+
+
+def test_evaluate_config_refuses_a_threshold_of_nothing():
+    with pytest.raises(ConfigError, match="thresholds_percent"):
+        EvaluateConfig(thresholds_percent=(0.5, 0.0))

@@ -6,7 +6,6 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere, join, potato, table
 from pimper_torch.evidence.scenes.render_in_memory import (
     Sphere,
-    potato_on_table,
     render_objects,
     render_shape,
 )
@@ -106,15 +105,6 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
     assert scene.lit[0, 27, 15]
     assert scene.foreground[0, 15, 15]
     assert not scene.foreground[0, 15, 30]  # the ball stands before the table there
-
-
-def test_a_point_light_below_the_horizon_gives_no_light_but_the_ambient():
-    lights = point_light([0.0, 1.0, -2.0], ambient=torch.tensor([0.25], dtype=torch.float64))
-    generator = torch.Generator().manual_seed(64)
-    scene = render_objects(
-        [SceneObject(mesh=table(3.0), texture=white)], above(), lights, generator, QUIET
-    )
-    assert_close(scene.views.images, torch.full_like(scene.views.images, 0.25))
 
 
 def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
@@ -243,16 +233,6 @@ def test_joined_meshes_keep_their_triangles():
     corners = both.vertices_world[both.faces]
     assert_close(corners[:2], one.vertices_world[one.faces])
     assert_close(corners[2:], two.vertices_world[two.faces])
-
-
-def test_the_potato_scene_has_shadows_and_texture_and_little_saturation():
-    scene = potato_on_table(3, num_views=2, width=80, height=60)
-    assert scene.views.images.shape == (2, 3, 60, 80)
-    fraction = scene.lit[scene.foreground].float().mean()
-    assert 0.5 < fraction < 0.98
-    assert (scene.views.images >= 1).float().mean() < 0.03
-    assert scene.albedo[scene.foreground].std() > 0.1
-    assert 0.2 < scene.foreground.float().mean() < 0.6
 
 
 def test_a_sensor_without_rays_is_refused():

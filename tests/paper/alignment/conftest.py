@@ -7,13 +7,12 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Convergence,
     DepthPatches,
     Depths,
     Mesh,
     PhotometricPatches,
-    Photometry,
 )
+from tests.paper.alignment.caps import CENTER, RADIUS, cap
 
 
 @pytest.fixture
@@ -63,12 +62,14 @@ def height_fields():
     """Give patches a height field, ``(points_patch, patch_from_world) -> depth``."""
 
     def build(patches, height_field):
-        buckets = []
+        buckets, facing = [], torch.tensor([0.0, 0, -1])
         for templates in patches.buckets:
             depth = height_field(templates.points_patch, templates.patch_from_world)
             identity = torch.tensor([0.0, 0, 1, 0], dtype=depth.dtype).expand(len(depth), 4)
             buckets.append(Depths(depth=depth, valid=templates.inside, transform=identity))
-        return DepthPatches(photometric=_blank(patches), buckets=tuple(buckets))
+        normals = [facing.expand(*one.depth.shape, 3) for one in patches.buckets]
+        photometric = PhotometricPatches.of(patches, normals=normals, lights=torch.ones(1, 4))
+        return DepthPatches(photometric=photometric, buckets=tuple(buckets))
 
     return build
 
@@ -88,23 +89,6 @@ def sphere_height_field():
     return build
 
 
-def _blank(patches):
-    buckets = []
-    for templates in patches.buckets:
-        count, height, width = templates.depth.shape
-        like = templates.depth
-        one = like.new_ones(count)
-        buckets.append(
-            Photometry(
-                normals_patch=like.new_tensor([0, 0, -1]).expand(count, height, width, 3),
-                albedo=like.new_ones(count, height, width, 1),
-                lights_patch=like.new_ones(count, 1, 4),
-                valid=templates.inside,
-                information=1e3 * templates.inside.to(like),
-                status=0 * one.long(),
-                convergence=Convergence(
-                    iterations=one.long(), residual=0 * one, cause=0 * one.long()
-                ),
-            )
-        )
-    return PhotometricPatches(patches=patches, buckets=tuple(buckets))
+@pytest.fixture
+def sphere(facets_over, height_fields, sphere_height_field):
+    return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))

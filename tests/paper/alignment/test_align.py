@@ -2,72 +2,21 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.paper.align import Align, AlignConfig
-from pimper_torch.records import Mesh
-
-RADIUS = 2.0
-CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
-
-
-def cap(x, y):
-    return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
-
-
-def random_transforms(count, generator):
-    draw = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    tilt, scale = 0.15 * draw[:, :2], (0.35 * draw[:, 2:]).exp()
-    return torch.cat([tilt, scale, torch.zeros_like(scale)], dim=1)
-
-
-def spoiled(depths, transforms):
-    buckets = []
-    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
-        x, y, _ = templates.points_patch.unbind(dim=-1)
-        hx, hy, hz, h0 = transforms[templates.facet][:, :, None, None].unbind(dim=1)
-        buckets.append(height_field.replace(depth=hx * x + hy * y + hz * height_field.depth + h0))
-    return depths.replace(buckets=tuple(buckets))
+from pimper_torch.records import AlignStatus, Mesh
+from tests.paper.alignment.caps import (
+    by_facet,
+    random_transforms,
+    spoiled,
+    waves,
+)
 
 
 def error(found, truth):
     pairs = zip(found.buckets, truth.buckets, strict=True)
     apart = torch.cat([(a.depth - b.depth)[b.valid] for a, b in pairs])
     return float(apart.square().mean().sqrt())
-
-
-def by_facet(depths):
-    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    return torch.cat([height_field.transform for height_field in depths.buckets])[
-        torch.argsort(facets)
-    ]
-
-
-@pytest.fixture
-def sphere(facets_over, height_fields, sphere_height_field):
-    return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
-
-
-@pytest.fixture
-def noise(generator):
-    """Waves of their own on every patch, of a quarter edge's length."""
-
-    def add(depths, amplitude):
-        buckets = []
-        for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
-            x, y, _ = templates.points_patch.unbind(dim=-1)
-            waves = torch.zeros_like(x)
-            for _ in range(6):
-                fx, fy, start = torch.randn(
-                    3, len(x), 1, 1, generator=generator, dtype=torch.float64
-                )
-                waves = waves + torch.cos(fx / 0.08 * x + fy / 0.08 * y + 9 * start)
-            buckets.append(
-                height_field.replace(depth=height_field.depth + amplitude * waves / 3**0.5)
-            )
-        return depths.replace(buckets=tuple(buckets))
-
-    return add
 
 
 @pytest.mark.parametrize(("prior", "left"), [(1e-6, 0.001), (3e-4, 0.03)])
@@ -92,17 +41,12 @@ def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
     assert error(spoiled(bad, by_facet(twice)), twice) < 1e-12
 
 
-def test_no_patch_collapses_with_default_settings(facets_over, height_fields, noise):
+def test_no_patch_collapses_with_default_settings(facets_over, height_fields, generator):
     flat = height_fields(facets_over(lambda x, y: 0 * x), lambda points, _: 0 * points[..., 0])
-    bad = noise(flat, 0.02)
+    bad = waves(flat, 0.02, generator)
     scales = by_facet(Align()(bad))[:, 2]
     assert scales.min() >= 0.25
     assert scales.max() <= 4
-
-
-def test_noise_on_a_curved_surface_hardly_shrinks_it(sphere, noise):
-    bad = noise(sphere, 0.01)  # half of the height field's own size
-    assert by_facet(Align(AlignConfig(prior=1e-5))(bad))[:, 2].mean() > 0.85
 
 
 def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
@@ -149,6 +93,8 @@ def test_a_patch_without_data_stays_as_it_is_and_drags_nobody(sphere, generator)
     depth[0] = torch.nan
     bad = bad.replace(buckets=(blind.replace(depth=depth, valid=valid), *rest))
     found = Align(AlignConfig(prior=1e-5))(bad)
+    status = torch.cat([bucket.status for bucket in found.buckets])
+    assert status.tolist() == [AlignStatus.ALONE] + [AlignStatus.ALIGNED] * (len(status) - 1)
     assert_close(found.buckets[0].transform[0], torch.tensor([0.0, 0, 1, 0], dtype=torch.float64))
     assert error(found.replace(buckets=_but_first(found)), _only_valid(sphere, valid)) < 0.002
 
@@ -159,68 +105,6 @@ def test_patches_that_meet_nobody_are_handed_back(sphere):
     )
     alone = sphere.replace(buckets=nothing)
     assert Align()(alone) is alone
-
-
-def test_a_single_facet_is_handed_back(facets_over, height_fields):
-    patches = facets_over(lambda x, y: 0 * x, side=2)
-    mesh = patches.coarse.mesh
-    first = patches.buckets[0]
-    lone = patches.replace(
-        coarse=patches.coarse.replace(mesh=mesh.replace(faces=mesh.faces[first.facet[:1]])),
-        buckets=(_one_template(first),),
-    )
-    depths = height_fields(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
-    assert Align()(depths) is depths
-
-
-def test_gradients_run_from_depths_to_aligned_depths(
-    facets_over, height_fields, sphere_height_field, generator
-):
-    patches = facets_over(cap, side=3, sample=0.06, overlap=4.0)
-    bad = spoiled(
-        height_fields(patches, sphere_height_field(CENTER, RADIUS)),
-        random_transforms(patches.num_patches, generator),
-    )
-    align = Align(AlignConfig(iterations=2))
-    probe = [torch.randn(b.depth.shape, generator=generator).double() for b in bad.buckets]
-    change = 0.1 * random_transforms(patches.num_patches, generator)
-
-    def outcome(step):
-        found = align(spoiled(bad, torch.tensor([0.0, 0, 1, 0]).double() + step * change))
-        return sum((b.depth * p)[b.valid].sum() for b, p in zip(found.buckets, probe, strict=True))
-
-    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(outcome(step), step)
-    tiny = 1e-6
-    numeric = (outcome(torch.tensor(tiny)) - outcome(torch.tensor(-tiny))) / (2 * tiny)
-    assert slope.abs() > 1e-3
-    assert_close(slope, numeric, rtol=1e-3, atol=1e-6)  # Newton's bilinear cells end in kinks
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        {"iterations": 0},
-        {"anchor": -1.0},
-        {"prior": 0.0},
-        {"scale_limit": 1.0},
-    ],
-)
-def test_impossible_settings_are_refused(setting):
-    with pytest.raises(ConfigError, match=next(iter(setting))):
-        AlignConfig(**setting)
-
-
-def _one_template(templates):
-    return templates.replace(
-        facet=torch.tensor([0]),
-        patch_from_world=templates.patch_from_world[:1],
-        origin=templates.origin[:1],
-        spacing=templates.spacing[:1],
-        depth=templates.depth[:1],
-        barycentric=templates.barycentric[:1],
-        inside=templates.inside[:1],
-    )
 
 
 def _but_first(depths):

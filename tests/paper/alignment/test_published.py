@@ -6,63 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.paper.seams import Pulls, solve_transforms
-
-RADIUS = 2.0
-CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
-
-
-def cap(x, y):
-    return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
-
-
-def random_transforms(count, generator):
-    draw = torch.randn(count, 4, generator=generator, dtype=torch.float64)
-    return torch.cat([0.15 * draw[:, :2], (0.35 * draw[:, 2:3]).exp(), 0 * draw[:, 3:]], dim=1)
-
-
-def changed(depths, change):
-    """Replace each depth by ``change(x, y, depth, facet)``."""
-    buckets = []
-    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
-        x, y, _ = templates.points_patch.unbind(dim=-1)
-        buckets.append(
-            height_field.replace(depth=change(x, y, height_field.depth, templates.facet))
-        )
-    return depths.replace(buckets=tuple(buckets))
-
-
-def spoiled(depths, transforms):
-    def change(x, y, depth, facet):
-        hx, hy, hz, h0 = transforms[facet][:, :, None, None].unbind(dim=1)
-        return hx * x + hy * y + hz * depth + h0
-
-    return changed(depths, change)
-
-
-def waves(depths, amplitude, generator):
-    """Add waves of its own, a quarter of an edge long, to every patch."""
-
-    def change(x, y, depth, facet):
-        for _ in range(6):
-            fx, fy, start = torch.randn(3, len(x), 1, 1, generator=generator, dtype=torch.float64)
-            depth = depth + amplitude / 3**0.5 * torch.cos(
-                fx / 0.08 * x + fy / 0.08 * y + 9 * start
-            )
-        return depth
-
-    return changed(depths, change)
-
-
-def by_facet(depths):
-    facets = torch.cat([templates.facet for templates in depths.patches.buckets])
-    return torch.cat([height_field.transform for height_field in depths.buckets])[
-        torch.argsort(facets)
-    ]
-
-
-@pytest.fixture
-def sphere(facets_over, height_fields, sphere_height_field):
-    return height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
+from tests.paper.alignment.caps import by_facet, random_transforms, spoiled, waves
 
 
 def test_three_numbers_a_patch_solve_the_dense_kronecker_equations(generator):

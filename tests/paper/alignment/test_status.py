@@ -1,17 +1,11 @@
 import torch
-from torch.testing import assert_close
 
 from pimper_torch.paper.align import Align, patch_status
 from pimper_torch.records import AlignStatus
 from pimper_torch.reporting import figures
+from tests.paper.alignment.caps import CENTER, RADIUS, cap
 
-RADIUS = 2.0
-CENTER = torch.tensor([0.0, 0.0, RADIUS], dtype=torch.float64)
 ALIGNED, ALONE = (int(status) for status in AlignStatus)
-
-
-def cap(x, y):
-    return RADIUS - (RADIUS**2 - x**2 - y**2).sqrt()
 
 
 def statuses(depths):
@@ -24,10 +18,7 @@ def with_first(depths, change):
     return depths.replace(buckets=(change(first), *rest))
 
 
-def test_before_alignment_nobody_is_aligned_and_after_it_all_are(
-    facets_over, height_fields, sphere_height_field
-):
-    sphere = height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
+def test_before_alignment_nobody_is_aligned_and_after_it_all_are(sphere):
     assert all(height_field.status is None for height_field in sphere.buckets)
     assert not any(height_field.aligned.any() for height_field in sphere.buckets)
     found = Align()(sphere)
@@ -36,23 +27,6 @@ def test_before_alignment_nobody_is_aligned_and_after_it_all_are(
     assert "aligned_patches" not in figures(sphere)
     assert figures(found)["aligned_patches"] == found.patches.num_patches
     assert figures(found)["mismatch"] == float(found.mismatch[-1])
-
-
-def test_a_patch_without_height_field_is_alone_and_stays_as_it_is(
-    facets_over, height_fields, sphere_height_field
-):
-    sphere = height_fields(facets_over(cap), sphere_height_field(CENTER, RADIUS))
-
-    def blind(height_field):
-        valid = height_field.valid.clone()
-        valid[0] = False
-        return height_field.replace(valid=valid)
-
-    found = Align()(with_first(sphere, blind))
-    assert statuses(found)[0] == ALONE
-    assert (statuses(found)[1:] == ALIGNED).all()
-    identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
-    assert_close(found.buckets[0].transform[0], identity)
 
 
 def test_a_patch_with_height_field_in_its_centre_only_is_alone(

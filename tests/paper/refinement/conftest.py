@@ -14,12 +14,10 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
-    Convergence,
     DepthPatches,
     Depths,
     Mesh,
     PhotometricPatches,
-    Photometry,
 )
 
 # Relief along z of the world as a function of x and y: closed forms seen from -z.
@@ -61,12 +59,13 @@ class Builder:
         cameras = cameras.replace(intrinsics=intrinsics.double())
         config = DecomposeConfig(overlap_samples=overlap, bucket_entries=20_000)
         patches = Decompose(config)(coarse, cameras)
-        photometric, depths = zip(
+        depths, normals, albedo = zip(
             *(_exact(templates, height) for templates in patches.buckets), strict=True
         )
-        return DepthPatches(
-            photometric=PhotometricPatches(patches=patches, buckets=photometric), buckets=depths
+        photometric = PhotometricPatches.of(
+            patches, normals=normals, albedo=albedo, lights=torch.zeros(1, 4), information=1e3
         )
+        return DepthPatches(photometric=photometric, buckets=depths)
 
 
 def _exact(templates, height):
@@ -92,26 +91,13 @@ def _exact(templates, height):
         (slope,) = torch.autograd.grad(
             (world[..., 2] - height(world[..., 0], world[..., 1])).sum(), world
         )
-    normals = torch.nn.functional.normalize(-slope, dim=-1)
     shape = templates.depth.shape
-    count = shape[0]
-    exact = (depth.isfinite()).reshape(shape) & templates.inside
-    photometry = Photometry(
-        normals_patch=rotate(templates.patch_from_world, normals).reshape(*shape, 3),
-        albedo=(0.5 + 0.25 * world.detach()).reshape(*shape, 3),
-        lights_patch=torch.zeros(count, 1, 4, dtype=torch.float64),
-        valid=exact,
-        information=1e3 * exact.double(),
-        status=torch.zeros(count, dtype=torch.long),
-        convergence=Convergence(
-            iterations=torch.ones(count, dtype=torch.long),
-            residual=torch.zeros(count, dtype=torch.float64),
-            cause=torch.zeros(count, dtype=torch.long),
-        ),
-    )
-    identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64).expand(count, 4)
+    exact = depth.isfinite().reshape(shape) & templates.inside
+    identity = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64).expand(shape[0], 4)
     depth = torch.where(exact, depth.reshape(shape), 0)
-    return photometry, Depths(depth=depth, valid=exact, transform=identity)
+    normals = rotate(templates.patch_from_world, -slope).reshape(*shape, 3)
+    albedo = (0.5 + 0.25 * world.detach()).reshape(*shape, 3)
+    return Depths(depth=depth, valid=exact, transform=identity), normals, albedo
 
 
 @pytest.fixture(scope="session")

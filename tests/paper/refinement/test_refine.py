@@ -1,8 +1,6 @@
-import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
 from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import unit_face_normals
@@ -126,31 +124,6 @@ def test_a_hole_in_the_height_field_is_filled_and_marked(cap):
     assert_close(surface.normals_world.norm(dim=-1), torch.ones(len(empty)).double())
 
 
-def test_gradients_reach_the_depth(builder):
-    depths = builder.patches(builder.coarse(plane, rings=1), plane, spacing=0.1, overlap=3.0)
-    generator = torch.Generator().manual_seed(71)
-    sizes = [bucket.depth.shape for bucket in depths.buckets]
-    noise = [0.02 * torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes]
-
-    def places(*height_field):
-        buckets = tuple(
-            bucket.replace(depth=bucket.depth + extra)
-            for bucket, extra in zip(depths.buckets, height_field, strict=True)
-        )
-        return Refine()(depths.replace(buckets=buckets)).vertices_world
-
-    probe = torch.randn(places(*noise).shape, generator=generator, dtype=torch.float64)
-    inputs = [one.clone().requires_grad_() for one in noise]
-    gradients = torch.autograd.grad((places(*inputs) * probe).sum(), inputs)
-    moves = [torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes]
-    analytic = sum((g * m).sum() for g, m in zip(gradients, moves, strict=True))
-    assert analytic.abs() > 1e-3
-    small = 1e-6
-    up = places(*(one + small * move for one, move in zip(noise, moves, strict=True)))
-    down = places(*(one - small * move for one, move in zip(noise, moves, strict=True)))
-    assert_close(analytic, ((up - down) * probe).sum() / (2 * small), rtol=1e-6, atol=1e-8)
-
-
 def test_height_field_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
     nowhere = changed(cap, lambda _, height_field: {"valid": torch.zeros_like(height_field.valid)})
     surface = Refine()(nowhere)
@@ -162,8 +135,3 @@ def test_height_field_that_is_valid_nowhere_leaves_the_facets_without_confidence
     off_facet = (away * unit_face_normals(mesh.vertices_world, mesh.faces)[flat.facet]).sum(dim=1)
     assert off_facet.abs().median() < 0.2 * SPACING
     assert (surface.confidence == 0).all()
-
-
-def test_settings_that_mean_nothing_are_refused():
-    with pytest.raises(ConfigError, match="smoothing_radius_samples"):
-        RefineConfig(smoothing_radius_samples=0.0)

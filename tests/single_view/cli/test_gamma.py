@@ -1,5 +1,3 @@
-from importlib.resources import files
-
 import numpy as np
 import pytest
 import torch
@@ -83,9 +81,10 @@ def test_the_curve_that_does_as_well_is_advised():
     assert advice(estimate(1.81, (0.005, 0.012, 0.009), determined=False)) == ""
 
 
-def test_a_moving_camera_is_the_reason_that_is_given(capsys):
-    photographs = files("pimper_torch") / "data" / "skull"
-    assert main(["gamma", str(photographs), "--max-size-px", "150"]) == 0
+def test_an_undetermined_gamma_advises_no_option(fixed, capsys, monkeypatch):
+    undetermined = estimate(1.81, (0.2, 0.3, 0.3), determined=False)
+    monkeypatch.setattr(gamma, "gamma_of_photographs", lambda *_, **__: undetermined)
+    assert main(["gamma", str(fixed / "photos")]) == 0
     told = capsys.readouterr()
     assert "a camera that moved" in told.out
     assert "--photographs.response" not in told.out

@@ -99,11 +99,6 @@ def method(request, monkeypatch):
     return request.param
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(6113)
-
-
 @pytest.fixture(params=["equal", "ragged", "terraced", "jumping", "strips", "empty"])
 def weighted(request, generator):
     height, width = 20, 23  # more than the dense coarsest level of a hierarchy holds
@@ -181,24 +176,6 @@ def test_equal_weights_on_rectangles_and_lines(method, shape, generator):
     found = system(scaled).solve(source)
     expected = torch.linalg.solve(scaled.dense(), source.flatten()).reshape(shape)
     assert_close(found, expected, rtol=1e-8, atol=1e-8)
-
-
-def test_the_operator_is_symmetric_and_so_is_its_inverse(weighted, method, generator):
-    one, other = random(generator, 2, *weighted.shape)
-    assert_close((one * applied(weighted, other)).sum(), (other * applied(weighted, one)).sum())
-    solver = system(weighted, tolerance=1e-13)
-    first, second = solver.solve(torch.stack([one, other]))
-    size = first.abs().max() * other.abs().max() * one.numel()
-    assert abs((first * other).sum() - (second * one).sum()) <= 1e-9 * size
-
-
-def test_a_quarter_turn_of_the_raster_turns_the_answer(method, generator):
-    weighted = masked(terraced(30, 22, drop=1e-4), ragged(30, 22))
-    source = random(generator, 30, 22)
-    found = system(weighted).solve(source)
-    # A turn by 90 degrees makes steps down of steps to the right and reverses the others.
-    rotated = RasterSystem(weighted.down.rot90(), weighted.right.rot90())
-    assert_close(rotated.solve(source.rot90()), found.rot90(), rtol=1e-6, atol=1e-6)
 
 
 def bumps(x, y):
