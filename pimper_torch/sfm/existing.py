@@ -15,13 +15,13 @@ from pimper_torch.sfm import colmap
 from pimper_torch.sfm.conventions.resized_pictures import (
     REACHES,
     Ways,
-    allowed_turns,
     changed_views,
-    find_turns,
+    choose_turned,
     points_tell,
     possible_crops,
     possible_turns,
     tell_crop,
+    tell_turned,
 )
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
@@ -64,29 +64,25 @@ def existing_ways(views: Views, path: Path) -> Ways:
     shown = taken(views, model)
     sizes = _whole_sizes(shown, model)
     changed = changed_views(model, sizes)
-    fits = bool(allowed_turns(model, shown).any(dim=1).all())
     plain, cropped = (
-        [
-            (one, follow_pictures(one, shown, way))
-            for one in some
-            for way in possible_turns(one, shown)
-        ]
-        for some in ([model] if fits else [], possible_crops(model, sizes))
+        [follow_pictures(one, shown, way) for one in models for way in possible_turns(one, shown)]
+        for models in ([model], possible_crops(model, sizes))
     )
     # That photographs were resized is the plain explanation: it may be told in larger steps.
     reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
-    told = model
-    if changed and not any(points_tell(one, shown, changed, reaches) for _, one in plain):
-        scores = [points_tell(one, shown, changed) for _, one in cropped]
+    if changed and not any(points_tell(one, shown, changed, reaches) for one in plain):
+        scores = [points_tell(one, shown, changed) for one in cropped]
         if not any(scores):
-            return Ways([one for _, one in plain], [one for _, one in cropped], changed)
-        told = cropped[scores.index(max(scores))][0]
+            return Ways(plain, cropped, changed)
+        crop = cropped[scores.index(max(scores))]
+        tell_crop(where, crop, changed, "what they show round its points")
+        return Ways([crop])
     if not len(model.points_world):
-        return Ways([one for _, one in plain])
-    placed = follow_pictures(told, shown, find_turns(told, shown, where))
-    if told is not model:
-        tell_crop(where, placed, changed, "what they show round its points")
-    return Ways([placed])
+        return Ways(plain)
+    chosen = choose_turned(plain, shown, where)
+    if not torch.equal(chosen.cam_from_world, model.cam_from_world):
+        tell_turned(where, "what they show round its points")
+    return Ways([chosen])
 
 
 def _largest(views: Views, folder: Path) -> Path:

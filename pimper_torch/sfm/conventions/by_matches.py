@@ -30,6 +30,7 @@ from pimper_torch.sfm.conventions.pictures import (
     of_another_size,
     tell_crop,
     tell_open_turns,
+    tell_turned,
 )
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
@@ -107,12 +108,7 @@ def _choose_turns(
     if sum(pair.num_matches for pair in verified) < MIN_MATCHES:
         tell_open_turns(where, "matches")
     elif best:
-        caution(
-            f"{where}: its cameras are of pictures that stand otherwise than the photographs, such "
-            "as the pixels that files store before EXIF turns them. They are turned with these, as "
-            "matches between photographs tell.",
-            stacklevel=5,
-        )
+        tell_turned(where, "what their matches show")
     return models[best]
 
 

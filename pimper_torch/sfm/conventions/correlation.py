@@ -1,13 +1,12 @@
 """Squares of the photographs round the points of a model: what views of a point show alike.
 
-A square lies on the plane across a point's mean viewing direction. It is correlated with the mean
-of those of the point's other views.
+A square lies on the plane across a point's mean viewing direction.
 """
 
-from collections.abc import Callable
+from collections.abc import Collection
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, one_hot
 
@@ -18,56 +17,47 @@ from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
 
-# Samples to either side of a point, and pixels from one to the next: choices.
+# Samples to either side of a point, and pixels from one to the next.
 _REACH, _STEP_PX = 3, 1.5
-SAMPLES = (2 * _REACH + 1) ** 2
-"""Of a square."""
 
 
-def others_of(
-    own: Float[Tensor, "*way observation sample"], point: Int[Tensor, " observation"]
-) -> tuple[Float[Tensor, "*way observation sample"], Float[Tensor, "*way observation sample"]]:
-    """Average the squares of each observation's point without its own, and those of another point.
-
-    Returns:
-        Of unit length, or zero.
-    """
-    count = int(point.max()) + 1 if len(point) else 0
-    sums = own.new_zeros(*own.shape[:-2], count, own.shape[-1]).index_add(-2, point, own)
-    others = normalize(sums[..., point, :] - own, dim=-1)
-    return others, normalize(sums, dim=-1)[..., point - 1, :]
-
-
-def sampled(
+def correlations(
     model: SparseModel,
     views: Views,
-    ways: Callable[
-        [int, Float[Tensor, "own 2"], Float[Tensor, "own 2 2"]],
-        tuple[Float[Tensor, "way own 2"], Float[Tensor, "#way own 2 2"]],
-    ],
-    count: int,
-) -> Float[Tensor, "{count} observation sample"]:
-    """Sample the square round each observation in several ways, see :func:`squares_in`.
+    shifts: Float[Tensor, "way 2"] | None = None,
+    moved: Collection[int] = (),
+) -> tuple[Float[Tensor, "way observation"], Float[Tensor, "way observation"]]:
+    """Correlate each observation's square with the mean of its point's others.
 
     Args:
-        views: The model's, in its order; resized, or turned by quarters.
-        ways: Centres and sides of a view's squares, by its number, its observations as the model
-            has them, and their sides in pixels of the photograph.
+        model: In the pixels of the views, in their order.
+        shifts: Of some views, the way their squares are moved.
+        moved: Numbers of these views.
+
+    Returns:
+        With the others of its own point, and of another point, as chance has it; 0 where a square
+        tells nothing.
     """
-    sides = _sides(model, views)
-    squares = torch.zeros(count, len(sides), SAMPLES)
+    shifts = torch.zeros(1, 2) if shifts is None else shifts
+    sides = _sides(model)
+    squares = torch.zeros(len(shifts), len(sides), (2 * _REACH + 1) ** 2)
     for view, (width, height) in enumerate(views.sizes_px.tolist()):
         here = (model.observation_view == view).nonzero()[:, 0]
         picture = views.images[view, :, :height, :width]
-        places = ways(view, model.observation_pixels[here], sides[here])
-        squares[:, here] = squares_in(picture, *places)
+        centers = model.observation_pixels[here] + (view in moved) * shifts[:, None]
+        squares[:, here] = squares_in(picture, centers, sides[here][None])
         drop_pages()
-    return squares
+    point = model.observation_point
+    count = int(point.max()) + 1 if len(point) else 0
+    sums = squares.new_zeros(len(shifts), count, squares.shape[-1]).index_add(-2, point, squares)
+    others = normalize(sums[..., point, :] - squares, dim=-1)
+    strangers = normalize(sums, dim=-1)[..., point - 1, :]
+    return (squares * others).sum(dim=-1), (squares * strangers).sum(dim=-1)
 
 
-def _sides(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2"]:
-    """Compute the sides of each observation's square, a step long, in pixels of the photographs."""
-    axes = _axes(model, views)
+def _sides(model: SparseModel) -> Float[Tensor, "observation 2 2"]:
+    """Compute the sides of each observation's square, a step long, in pixels."""
+    axes = _axes(model)
     sides = model.points_world.new_empty(len(model.observation_view), 2, 2)
     for view, lens in enumerate(model.lenses):
         here = model.observation_view == view
@@ -75,8 +65,7 @@ def _sides(model: SparseModel, views: Views) -> Float[Tensor, "observation 2 2"]
         ends = torch.cat([model.points_world[points, None], axes[points]], dim=1)
         rays = transform(model.cam_from_world[view], ends.reshape(-1, 3))
         pixels = colmap.distort(lens, rays).reshape(-1, 3, 2)
-        scale = max(views.sizes_px[view].tolist()) / max(lens.width, lens.height)
-        sides[here] = (pixels[:, 1:] - pixels[:, :1]) * scale
+        sides[here] = pixels[:, 1:] - pixels[:, :1]
     return sides
 
 
@@ -88,8 +77,8 @@ def squares_in(
     """Sample squares along two sides, without their mean and with unit length.
 
     Args:
-        centers: Pixels of it.
-        sides: In pixels of it, turned as it is.
+        centers: Pixels of the picture.
+        sides: In its pixels.
 
     Returns:
         Float32; zero where a square reaches beyond the picture or shows nothing.
@@ -108,7 +97,7 @@ def squares_in(
     return torch.where(told, normalize(patterns, dim=-1), 0).float()
 
 
-def _axes(model: SparseModel, views: Views) -> Float[Tensor, "point 2 3"]:
+def _axes(model: SparseModel) -> Float[Tensor, "point 2 3"]:
     """Return, of each point, the ends of two steps across its mean viewing direction.
 
     On average over its views a step is as long as samples are apart in the photographs.
@@ -121,12 +110,7 @@ def _axes(model: SparseModel, views: Views) -> Float[Tensor, "point 2 3"]:
     towards = normalize(points - centers, dim=1)
     count = len(model.points_world)
     mean = towards.new_zeros(count, 3).index_add(0, point, towards)
-    focal = torch.stack(
-        [
-            colmap.pinhole_of(lens)[0, 0] * max(size) / max(lens.width, lens.height)
-            for lens, size in zip(model.lenses, views.sizes_px.tolist(), strict=True)
-        ]
-    )
+    focal = torch.stack([colmap.pinhole_of(lens)[0, 0] for lens in model.lenses])
     length = towards.new_zeros(count).index_add(0, point, depth.abs() / focal[view])
     length = length / torch.bincount(point, minlength=count).clamp_min(1)
     mean = normalize(mean, dim=1)
