@@ -12,12 +12,12 @@ from pimper_torch.sfm.bundling import bundle
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.tangent_planes import tangents
+from pimper_torch.sfm.settings import MIN_POINTS
 from pimper_torch.sfm.track_observations import (
-    SightingSettings,
     TrackObservations,
     log_pictures,
     sight,
+    tangents,
 )
 from pimper_torch.sfm.undistort import pinholes_for, undistorted
 
@@ -93,7 +93,7 @@ def _sighted(views: Views, model: SparseModel) -> tuple[TrackObservations, Camer
         sizes_px=views.sizes_px.cpu(),
     )
     planes = tangents(model.points_world, model.observed, cameras)
-    return sight(pictures, cameras, planes, SightingSettings()), cameras
+    return sight(pictures, cameras, planes), cameras
 
 
 def _renewed(
