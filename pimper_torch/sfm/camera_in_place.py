@@ -21,7 +21,7 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.sfm.static_background import Keypoints, Pair
+from pimper_torch.sfm.matching import Keypoints, Pair
 
 # References tried, evenly over the sequence; the one to which most photographs can be tied is
 # taken. One alone may have been blurred or covered.

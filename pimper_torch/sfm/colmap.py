@@ -1,5 +1,11 @@
 """COLMAP's models: of cameras, and of what they see."""
 
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +14,53 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.errors import OutputError
+from pimper_torch.errors import OutputError, caution
+from pimper_torch.geometry.frames import transform
 from pimper_torch.records import Cameras, Lens
-from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.model_files import read_files
-from pimper_torch.sfm.sound_model import sound_model
+from pimper_torch.sfm.model_files import read_files, sound_model
+
+
+def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace.
+
+    Pillow is loaded before it: both carry zlib, and where pycolmap's comes first, Pillow damages
+    its memory as soon as it writes a PNG.
+    """
+    fresh = "pycolmap" not in sys.modules
+    import PIL.Image  # noqa: F401 - see above
+    import pycolmap
+
+    if fresh and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    _tell_order()
+    return pycolmap
+
+
+@cache
+def _tell_order() -> None:
+    """Warn, once, where a script has loaded pycolmap before Pillow."""
+    names = list(sys.modules)  # in the order of loading
+    if names.index("pycolmap") < names.index("PIL._imaging"):
+        caution(
+            "pycolmap was imported before Pillow: both carry zlib, and writing a PNG will end this "
+            "process. Put `import PIL.Image` before `import pycolmap`."
+        )
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep COLMAP's log off stderr; what matters comes back as results or exceptions."""
+    pycolmap = loaded()
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -218,3 +265,26 @@ def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
             Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
         )
     return tuple(lenses)
+
+
+def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
+    """Return the distance between where a point is seen and where it should be, in pixels.
+
+    Infinite for a point that a camera sees from behind.
+    """
+    residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
+    for index, lens in enumerate(model.lenses):
+        here = torch.nonzero(model.observation_view == index)[:, 0]
+        points = model.points_world[model.observation_point[here]]
+        expected = colmap.distort(lens, transform(model.cam_from_world[index], points))
+        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
+        residual[here] = distance.nan_to_num(nan=torch.inf)
+    return residual
+
+
+def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
+    """Average :func:`observation_errors` over each point's track."""
+    total = torch.zeros_like(model.points_world[:, 0])
+    total = total.index_add(0, model.observation_point, observation_errors(model))
+    count = torch.bincount(model.observation_point, minlength=len(total))
+    return total / count.clamp_min(1)

@@ -23,15 +23,15 @@ from pimper_torch.sfm.conventions.resized_pictures import (
     tell_crop,
     tell_turned,
 )
-from pimper_torch.sfm.model import SparseModel, match_names
-from pimper_torch.sfm.model_files import names_by_folder
-from pimper_torch.sfm.quarter_turns import (
+from pimper_torch.sfm.lenses import (
     turned_lens,
     turned_pixels,
     turned_pose,
     turned_size,
     turning,
 )
+from pimper_torch.sfm.model import SparseModel, match_names
+from pimper_torch.sfm.model_files import names_by_folder
 
 # Of the corners of a photograph by a skew, up to which it is rounding: a choice.
 _MAX_SKEW_PX = 0.1

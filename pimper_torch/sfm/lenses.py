@@ -3,9 +3,137 @@
 import math
 from collections.abc import Sequence
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from pimper_torch.errors import InputError, some
-from pimper_torch.records import Views
-from pimper_torch.sfm.quarter_turns import QUARTERS
+from pimper_torch.mapped import zeros
+from pimper_torch.records import Lens, Views
+
+QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Clockwise quarters by which EXIF's orientations turn a file's pixels; the others mirror, too."""
+
+# Where a model's focal lengths are two, its principal point stands behind them, else behind one.
+_ONE_FOCAL = ("SIMPLE_", "RADIAL")
+# Positions of pairs of parameters that turn as vectors: decentering and thin prisms.
+_VECTORS = {
+    "OPENCV": ((7, 6),),
+    "FULL_OPENCV": ((7, 6),),
+    "THIN_PRISM_FISHEYE": ((7, 6), (10, 11)),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((10, 11), (12, 14), (13, 15)),
+}
+
+
+def turned_size(width: int, height: int, quarters: int) -> tuple[int, int]:
+    """Exchange width and height where a picture is turned by an odd number of quarters."""
+    return (height, width) if quarters % 2 else (width, height)
+
+
+def turned_pixels(
+    pixels: Float[Tensor, "*batch 2"], width: int, height: int, quarters: int
+) -> Float[Tensor, "*batch 2"]:
+    """Return where pixels are after clockwise quarter turns of their picture.
+
+    >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
+    tensor([5., 3.])
+    """
+    for _ in range(quarters % 4):
+        pixels = torch.stack([height - pixels[..., 1], pixels[..., 0]], dim=-1)
+        width, height = height, width
+    return pixels
+
+
+def turned_vectors(vectors: Float[Tensor, "*batch 2"], quarters: int) -> Float[Tensor, "*batch 2"]:
+    """Return what differences of pixels are after clockwise quarter turns."""
+    return turned_pixels(vectors, 0, 0, quarters)
+
+
+def turned_pose(
+    cam_from_world: Float[Tensor, "*batch 4 4"], quarters: int
+) -> Float[Tensor, "*batch 4 4"]:
+    """Turn a camera with its picture; exact."""
+    x, y, *rest = cam_from_world.unbind(dim=-2)
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return torch.stack([x, y, *rest], dim=-2)
+
+
+def turned_lens(lens: Lens, quarters: int) -> Lens:
+    """Turn a lens with its picture, of whatever model of COLMAP's: it images turned directions so.
+
+    Focal lengths are exchanged by a quarter, the principal point moves, and parameters that are
+    vectors in the picture are turned: ``p2, p1`` and ``sx1, sy1``.
+    """
+    size = lens.width, lens.height
+    values, focals = list(lens.params), _focals(lens)
+    if focals == 2 and quarters % 2:
+        values[0], values[1] = values[1], values[0]
+    center = torch.tensor(values[focals : focals + 2], dtype=torch.float64)
+    values[focals : focals + 2] = turned_pixels(center, *size, quarters).tolist()
+    for first, second in _VECTORS.get(lens.model, ()):
+        vector = torch.tensor([values[first], values[second]], dtype=torch.float64)
+        values[first], values[second] = turned_vectors(vector, quarters).tolist()
+    width, height = turned_size(*size, quarters)
+    return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]) -> Lens:
+    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
+
+    Args:
+        corner: Its pixel in the whole picture.
+    """
+    values, focals = list(lens.params), _focals(lens)
+    values[focals] -= float(corner[0])
+    values[focals + 1] -= float(corner[1])
+    return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def _focals(lens: Lens) -> int:
+    """Count the focal lengths, behind which the principal point stands."""
+    return 1 if lens.model.startswith(_ONE_FOCAL) else 2
+
+
+def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:
+    """Return :func:`turned_pixels` as a matrix on homogeneous pixels; float64."""
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    origin, right, down = turned_pixels(corners, width, height, quarters)
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[:2] = torch.stack([right - origin, down - origin, origin], dim=1)
+    return matrix
+
+
+def turned_views(views: Views, quarters: Sequence[int]) -> Views:
+    """Turn photographs clockwise by quarters, each by its own number; none are not copied.
+
+    The raster is as large as the turned photographs need. Priors do not turn along: they are left
+    out.
+    """
+    if not any(turns % 4 for turns in quarters):
+        return views
+    sizes = [
+        turned_size(width, height, turns)
+        for (width, height), turns in zip(views.sizes_px.tolist(), quarters, strict=True)
+    ]
+    wide, high = (max(sides) for sides in zip(*sizes, strict=True))
+    images = zeros((*views.images.shape[:2], high, wide), views.images.dtype, views.images.device)
+    masks = None if views.masks is None else views.masks.new_zeros(len(sizes), high, wide)
+    for view, ((width, height), turns) in enumerate(zip(sizes, quarters, strict=True)):
+        before = turned_size(width, height, turns)
+        picture = views.images[view, :, : before[1], : before[0]]
+        images[view, :, :height, :width] = torch.rot90(picture, -turns, dims=(1, 2))
+        if views.masks is not None and masks is not None:
+            mask = views.masks[view, : before[1], : before[0]]
+            masks[view, :height, :width] = torch.rot90(mask, -turns)
+    return views.replace(
+        images=images,
+        masks=masks,
+        sizes_px=torch.tensor(sizes).to(views.sizes_px),
+        orientations=None,
+        priors=(),
+    )
+
 
 SAME_FOCAL = 0.02
 """Relative difference of focal lengths that EXIF rounds; a choice."""

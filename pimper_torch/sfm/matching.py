@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.parallel import side_by_side
 from pimper_torch.progress import track
 from pimper_torch.records import Record
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
-from pimper_torch.sfm.workspace import Workspace
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.features import Workspace
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 
 # Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;
 # tiles tell how far matching has come. Of 66 photographs, tiles of 16 prepare 400 searches where
@@ -143,3 +144,259 @@ def photograph_numbers(
     """Return the number of the photograph behind each image of the database."""
     number = {file: index for index, file in enumerate(space.files)}
     return {image.image_id: number[image.name] for image in stored.read_all_images()}
+
+
+# Length of COLMAP's SIFT descriptors, in units of their bytes.
+_DESCRIPTOR_LENGTH = 512.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Features(Record):
+    """Features of one photograph.
+
+    Attributes:
+        descriptors: Of length 1, but for rounding.
+    """
+
+    pixels: Float[Tensor, "feature 2"]
+    descriptors: Float[Tensor, "feature length"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Alike(Record):
+    """Best matches of one photograph's features among the near ones of another.
+
+    Attributes:
+        products: Of the descriptors, the largest and the second largest; -1 where there is none.
+        best: Which feature of the other photograph the largest is with, or -1.
+    """
+
+    products: Float[Tensor, "feature 2"]
+    best: Int[Tensor, " feature"]
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """Which pixels of two photographs can show the same point.
+
+    Attributes:
+        matrix: Fundamental matrix, or homography from the first photograph to the second.
+        max_error_px: Largest distance: Sampson's from the epipolar line, or from the mapped point.
+    """
+
+    matrix: Float[Tensor, "3 3"]
+    max_error_px: float
+    planar: bool
+
+
+def match_guided(
+    space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
+) -> None:
+    """Replace the matches of verified pairs by those near their epipolar lines.
+
+    Args:
+        space: With pairs matched and verified.
+        pairs: Which; those that are not verified stay as they are.
+    """
+    features: dict[int, Features] = {}
+    with quiet(), loaded().Database.open(space.database) as stored:
+        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        geometries, nears = {}, {}
+        for pair in pairs:
+            ends = (image_of[pair[0]], image_of[pair[1]])
+            geometry = stored.read_two_view_geometry(*ends)
+            near = _near(geometry, settings.max_error_px)
+            if near is not None:
+                geometries[ends], nears[ends] = geometry, near
+                features |= {
+                    image: read_features(stored, image) for image in ends if image not in features
+                }
+
+        def matches(ends: tuple[int, int]) -> Int[Tensor, "match 2"]:
+            first, second = (features[image] for image in ends)
+            return guided_matches(first, second, nears[ends], settings.max_ratio)
+
+        for ends, found in zip(geometries, side_by_side(matches, list(geometries)), strict=True):
+            if len(found) >= MIN_MATCHES:
+                geometries[ends].inlier_matches = found.numpy().astype(np.uint32)
+                stored.update_two_view_geometry(*ends, geometries[ends])
+
+
+def guided_matches(
+    first: Features, second: Features, near: Near, max_ratio: float
+) -> Int[Tensor, "match 2"]:
+    """Match features among those that can show the same point.
+
+    Args:
+        max_ratio: Of the angles between a descriptor and the two most like it.
+    """
+    one, other = likeness(first, second, near)
+    (some,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)
+    theirs = one.best[some]
+    mutual = _clearly_best(other, max_ratio)[theirs] & (other.best[theirs] == some)
+    return torch.stack([some, theirs], dim=1)[mutual]
+
+
+def _near(geometry: Any, max_error_px: float) -> Near | None:  # noqa: ANN401 - pycolmap is untyped
+    """Choose by what verified a pair; nothing for a pair that was not."""
+    kinds = loaded().TwoViewGeometryConfiguration
+    if geometry.config in (kinds.CALIBRATED, kinds.UNCALIBRATED):
+        return Near(torch.from_numpy(np.array(geometry.F)), max_error_px, planar=False)
+    if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+        return Near(torch.from_numpy(np.array(geometry.H)), max_error_px, planar=True)
+    return None
+
+
+def likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alike]:
+    """Find the most similar features of two photographs, among those that can show one point."""
+    from pimper_torch.kernels.line_matches import most_alike
+
+    one, other = (
+        Alike(
+            products=torch.full((len(each.pixels), 2), -1.0),
+            best=torch.full((len(each.pixels),), -1),
+        )
+        for each in (first, second)
+    )
+    most_alike(
+        first.pixels.contiguous().numpy(),
+        second.pixels.contiguous().numpy(),
+        first.descriptors.contiguous().numpy(),
+        second.descriptors.contiguous().numpy(),
+        near.matrix.contiguous().numpy(),
+        near.planar,
+        near.max_error_px,
+        one.products.numpy(),
+        other.products.numpy(),
+        one.best.numpy(),
+        other.best.numpy(),
+    )
+    return one, other
+
+
+def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:
+    """Find whose smallest angle is small, and the second smallest enough larger."""
+    best, rival = alike.products.clamp(0, 1).acos().unbind(dim=1)  # without one, a right angle
+    return (best < max_ratio * rival) & (
+        best <= loaded().FeatureMatchingOptions().sift.max_distance
+    )
+
+
+def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolmap is untyped
+    """Read the features of an image of the database."""
+    pixels = np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
+    descriptors = np.array(stored.read_descriptors(image).data).astype(np.float32)
+    return Features(
+        pixels=torch.from_numpy(pixels),
+        descriptors=torch.from_numpy(descriptors / _DESCRIPTOR_LENGTH),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pair(Record):
+    """Matched features of two photographs.
+
+    Attributes:
+        matches: A feature of the first and one of the second in each row.
+    """
+
+    first: int
+    second: int
+    matches: Int[Tensor, "match 2"]
+
+
+Keypoints = Sequence[Float[Tensor, "_ 2"]]  # one length a photograph
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matched:
+    """Photographs and matches of COLMAP's database before verification.
+
+    Attributes:
+        ids: Of the photographs in the database, in the order of their names.
+    """
+
+    ids: tuple[int, ...]
+    cameras: tuple[Any, ...]
+    keypoints: Keypoints
+    pairs: tuple[Pair, ...]
+
+
+def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Read features and matches."""
+    pycolmap = loaded()
+
+    images = sorted(stored.read_all_images(), key=lambda image: image.name)
+    number = {image.image_id: index for index, image in enumerate(images)}
+    cameras = {camera.camera_id: camera for camera in stored.read_all_cameras()}
+    pairs = []
+    for pair_id, rows in zip(*stored.read_all_matches(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        pairs.append(Pair(first=number[first], second=number[second], matches=indices(rows)))
+    return Matched(
+        ids=tuple(image.image_id for image in images),
+        cameras=tuple(cameras[image.camera_id] for image in images),
+        keypoints=[
+            torch.from_numpy(np.array(stored.read_keypoints(image.image_id))[:, :2].copy())
+            for image in images
+        ],
+        pairs=tuple(pairs),
+    )
+
+
+def verified_again(
+    matched: Matched, pairs: Sequence[Pair], settings: ReconstructConfig
+) -> list[Any]:
+    """Find COLMAP's geometries of some of the matches of pairs, side by side.
+
+    In a database of their own: COLMAP's function for one pair would hold Python's lock.
+    """
+    pycolmap = loaded()
+
+    ids = [(matched.ids[pair.first], matched.ids[pair.second]) for pair in pairs]
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = MIN_MATCHES
+    options.ransac.max_error = settings.max_error_px
+    options.ransac.random_seed = settings.seed
+    # Enough where half of the matches are right. COLMAP's own 10,000 take 0.1 s in each pair whose
+    # moving matches are wrong, and on a turntable those are most.
+    options.ransac.max_num_trials = 1000
+    verifying = pycolmap.GeometricVerifierOptions()
+    verifying.num_threads = settings.num_threads
+    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+        path = Path(folder) / "pairs.db"
+        with pycolmap.Database.open(path) as stored:
+            for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
+                stored.write_camera(camera, use_camera_id=True)
+            views = zip(matched.ids, matched.cameras, matched.keypoints, strict=True)
+            for image, camera, pixels in views:
+                known = pycolmap.Image(name=str(image), camera_id=camera.camera_id, image_id=image)
+                stored.write_image(known, use_image_id=True)
+                stored.write_keypoints(image, pixels.numpy())
+            for ends, pair in zip(ids, pairs, strict=True):
+                stored.write_matches(*ends, pair.matches.numpy().astype(np.uint32))
+        pycolmap.geometric_verification(path, verifying, two_view_geometry_options=options)
+        with pycolmap.Database.open(path) as stored:
+            return [stored.read_two_view_geometry(*ends) for ends in ids]
+
+
+def read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see read_matched
+    """Read the geometries of verified pairs, by the numbers of their images."""
+    pycolmap = loaded()
+
+    return {
+        tuple(pycolmap.pair_id_to_image_pair(pair_id)): geometry
+        for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True)
+    }
+
+
+def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_matched
+    """Turn COLMAP's matches into rows of a tensor."""
+    return torch.from_numpy(np.array(rows).astype(np.int64)).reshape(-1, 2)
+
+
+def among(matches: Int[Tensor, "match 2"], some: Int[Tensor, "some 2"]) -> Bool[Tensor, " match"]:
+    """Find the matches that are among some of them."""
+    width = 1 + int(matches.max()) if len(matches) else 1
+    keys, chosen = (rows[:, 0] * width + rows[:, 1] for rows in (matches, some))
+    return torch.isin(keys, chosen)

@@ -14,27 +14,30 @@ from torch import Tensor
 
 from pimper_torch.errors import caution
 from pimper_torch.ledger import leave_out
-from pimper_torch.sfm.agreement import judged
-from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
-from pimper_torch.sfm.doubt import count_views_with_depth, doubt
-from pimper_torch.sfm.guided import match_guided
-from pimper_torch.sfm.leave_out import enter_room, leave_out_room
+from pimper_torch.sfm.doubt import (
+    FEWEST_VIEWS,
+    count_views_with_depth,
+    doubt,
+    judged,
+    require_motion,
+)
+from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.mapping import map_views
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,
     PhotographPair,
     VerifiedPair,
     all_pairs,
+    match_guided,
     match_pairs,
     strongest,
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
-from pimper_torch.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
+from pimper_torch.sfm.moved_object import tie_series
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.static_background import StaticBackground
-from pimper_torch.sfm.tie_series import tie_series
-from pimper_torch.sfm.workspace import Workspace
+from pimper_torch.sfm.settings import MIN_POINTS, ReconstructConfig
+from pimper_torch.sfm.static_background import StaticBackground, enter_room, leave_out_room
 
 # Distances that verify a match, at which it still agrees with a model: the lens is the model's.
 _AGREEING = 2.0
@@ -116,7 +119,7 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     if plain.sound:
         return plain
     rest, background = _leave_out_room(other, settings)
-    around = () if background else tie_series(other.database, settings)[1]
+    around = () if background else tie_series(other.database, settings)
     if not background and not around:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)

@@ -18,10 +18,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.parallel import on_one_thread
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.guided import read_features
-from pimper_torch.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, photograph_numbers
-from pimper_torch.sfm.workspace import Workspace
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.features import Workspace
+from pimper_torch.sfm.matching import (
+    MOST_PAIRED,
+    PhotographPair,
+    all_pairs,
+    photograph_numbers,
+    read_features,
+)
 
 # Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
 _WORDS, _NEIGHBOURS = 128, 20

@@ -14,10 +14,9 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Lens, SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.camera_in_place import least_squares_map, mapped
+from pimper_torch.sfm.colmap import reprojection_errors
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.reprojection import reprojection_errors
-from pimper_torch.sfm.undistort import undistort
-from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+from pimper_torch.sfm.undistort import undistort, with_undistorted_priors
 
 _RASTER = 9  # pixels each way that a map is fitted to
 

@@ -13,33 +13,34 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.agreement import (
+from pimper_torch.sfm.colmap import loaded, model_of, observation_errors, quiet, reconstruction_of
+from pimper_torch.sfm.conventions.by_matches import choose_way
+from pimper_torch.sfm.conventions.pictures import Ways
+from pimper_torch.sfm.epipolar import (
     epipolar_geometry,
+    explained,
     pinholes_of,
     undistorted_pairs,
     undistorted_pixels,
 )
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.colmap import model_of, reconstruction_of
-from pimper_torch.sfm.conventions.by_matches import choose_way, explained
-from pimper_torch.sfm.conventions.resized_pictures import Ways
-from pimper_torch.sfm.features import find_features, too_small
-from pimper_torch.sfm.guided import Near, guided_matches, read_features
-from pimper_torch.sfm.leave_out import enter_room, leave_out_room
+from pimper_torch.sfm.features import Workspace, find_features, too_small, workspace
 from pimper_torch.sfm.matching import (
+    Near,
     PhotographPair,
     VerifiedPair,
+    guided_matches,
     match_pairs,
     photograph_numbers,
+    read_features,
     strongest,
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
-from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.workspace import Workspace, workspace
+from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.static_background import enter_room, leave_out_room
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
 # help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.

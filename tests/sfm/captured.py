@@ -7,7 +7,8 @@ from pimper_torch.evidence.scenes.scene_cameras import FRONT, UP, arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.camera_in_place import mapped
-from pimper_torch.sfm.static_background import Pair, StaticBackground, find_static_background
+from pimper_torch.sfm.matching import Pair
+from pimper_torch.sfm.static_background import StaticBackground, find_static_background
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 

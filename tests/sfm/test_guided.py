@@ -8,18 +8,17 @@ import torch
 from torch.nn.functional import pad
 
 from pimper_torch.io.photographs import load_views
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.features import find_features
-from pimper_torch.sfm.guided import (
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.features import find_features, workspace
+from pimper_torch.sfm.matching import (
     Features,
     Near,
     guided_matches,
     likeness,
     match_guided,
+    match_pairs,
 )
-from pimper_torch.sfm.matching import match_pairs
-from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
-from pimper_torch.sfm.workspace import workspace
+from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
 
 CONFIG = ReconstructConfig(threads=1)
 

@@ -6,10 +6,16 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.records import Views
-from pimper_torch.sfm.bundling import bundle
-from pimper_torch.sfm.lenses import choose_lenses, group_lenses, sensor_turns
-from pimper_torch.sfm.one_lens import doubt_one_lens
-from pimper_torch.sfm.quarter_turns import turned_pixels, turned_views, turning
+from pimper_torch.sfm.doubt import doubt_one_lens
+from pimper_torch.sfm.lenses import (
+    choose_lenses,
+    group_lenses,
+    sensor_turns,
+    turned_pixels,
+    turned_views,
+    turning,
+)
+from pimper_torch.sfm.mapping import bundle
 from pimper_torch.sfm.reconstruct import structure_from_motion
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.ball import (

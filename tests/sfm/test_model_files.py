@@ -11,8 +11,8 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.binding import loaded
 from pimper_torch.sfm.colmap import (
+    loaded,
     model_of,
     pinhole_lenses,
     read_model,

@@ -16,11 +16,11 @@ from pimper_torch.errors import (
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.progress import listening
 from pimper_torch.records import Views
-from pimper_torch.sfm import mapping, registration, retrieval, tangent_planes
+from pimper_torch.sfm import mapping, registration, retrieval, tangents
+from pimper_torch.sfm.features import workspace
 from pimper_torch.sfm.reconstruct import Reconstruct, structure_from_motion
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.sparse_scene import write_model
-from pimper_torch.sfm.workspace import workspace
+from pimper_torch.sfm.scene import write_model
+from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.store import digest
 
 

@@ -13,9 +13,8 @@ from pimper_torch.records import (
     NormalPrior,
     SilhouettePrior,
 )
-from pimper_torch.sfm.quarter_turns import turned_views
-from pimper_torch.sfm.undistort import photograph_pixels
-from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+from pimper_torch.sfm.lenses import turned_views
+from pimper_torch.sfm.undistort import photograph_pixels, with_undistorted_priors
 
 SIZE = 60, 40
 BARREL = Lens(camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40)

@@ -9,18 +9,11 @@ photographs that were cropped.
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
-from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.agreement import (
-    epipolar_geometry,
-    match_errors,
-    pinholes_of,
-    undistorted_pairs,
-)
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.sfm.conventions.pictures import (
@@ -32,10 +25,15 @@ from pimper_torch.sfm.conventions.pictures import (
     tell_open_turns,
     tell_turned,
 )
+from pimper_torch.sfm.epipolar import (
+    explained,
+    match_errors,
+    pinholes_of,
+    undistorted_pairs,
+)
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.reconstruct_config import MIN_MATCHES
-from pimper_torch.sfm.static_background import sampson_errors
+from pimper_torch.sfm.settings import MIN_MATCHES
 
 # Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the
 # skull, three rendered ones of 240 to 400 px, a ball in closed form). Below the first, cameras are
@@ -48,29 +46,6 @@ _FEWEST = 30
 _BESIDE_PX, _STEP_PX, _MOST_STEPS = 8.0, 0.5, 12
 # Pairs that are looked at, those with most matches. A choice: enough, and a second.
 _PAIRS = 200
-
-
-def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
-    """Find the matches on each other's epipolar lines whose point is before both cameras.
-
-    Args:
-        cameras: Pinholes; axes may be mirrored.
-        pair: Its numbers are those of views; pixels of pinholes.
-        max_error_px: Sampson's distance.
-    """
-    one, other = pair.views
-    K, poses = cameras.intrinsics, cameras.cam_from_world
-    geometry = epipolar_geometry(cameras, pair.views)
-    near = sampson_errors(geometry, pair.first, pair.second) <= max_error_px
-    between = poses[other] @ torch.linalg.inv(poses[one])
-    rays = homogeneous(pair.first) @ torch.linalg.inv(K[one]).mT @ between[:3, :3].mT
-    back = homogeneous(pair.second) @ torch.linalg.inv(K[other]).mT
-    # Where x rays + t meets y back, as well as they do: signs of x and y tell.
-    shift = between[:3, 3].expand_as(rays)
-    normal = torch.linalg.cross(rays, back)
-    ahead = (torch.linalg.cross(back, shift) * normal).sum(dim=1) > 0
-    ahead_there = (torch.linalg.cross(rays, shift) * normal).sum(dim=1) > 0
-    return near & ahead & ahead_there
 
 
 def choose_way(

@@ -19,8 +19,8 @@ from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.choice import ERRORS, standard_errors, surely_better
 from pimper_torch.sfm.conventions.correlation import correlations
+from pimper_torch.sfm.lenses import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.model import SparseModel, longest_tracks
-from pimper_torch.sfm.quarter_turns import QUARTERS, cropped_lens, turned_size
 
 Size = tuple[int, int]
 
