@@ -5,6 +5,12 @@ cropped round an object that turns show the room as a camera would that shifts b
 Points that move as before a camera that stays in its place are explained by any translation of the
 camera, or by none: they determine neither depth nor baseline. Those of a plane that is seen from
 round it move by homographies that shear, and do.
+
+Where two sides of an object look alike, COLMAP can register every photograph with small
+reprojection errors, and put a part of them on the wrong side: a mapper leaves out what contradicts
+it. The pairs with most matches are those of neighbouring photographs, and nearly all their matches
+agree with a right model; those of a misplaced view do not. Pairs with few matches do not tell: a
+third of a carton's disagree with the right model, too, for its sides look alike.
 """
 
 from collections import Counter
@@ -12,19 +18,18 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pimper_torch.errors import ReconstructionError, some
 from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import triangulation_angles
-from pimper_torch.sfm.camera_in_place import both_ways, picture_centre, references, tied_to
+from pimper_torch.sfm.camera_in_place import picture_centre, references, tied_to
 from pimper_torch.sfm.colmap import observation_errors
 from pimper_torch.sfm.epipolar import match_errors
 from pimper_torch.sfm.mapping import bundle
-from pimper_torch.sfm.matching import MOST_PAIRED, Pair, VerifiedPair
+from pimper_torch.sfm.matching import MOST_PAIRED, VerifiedPair
 from pimper_torch.sfm.model import SparseModel, longest_tracks, select_views
-from pimper_torch.sfm.static_background import StaticBackground
 
 FEWEST_VIEWS = 3
 # Points seen under less are of no use to the coarse surface (coarse/surface.py).
@@ -63,16 +68,6 @@ def wide_points(model: SparseModel) -> Bool[Tensor, " point"]:
     return torch.rad2deg(angles) >= MIN_ANGLE_DEG
 
 
-def require_motion(rest: StaticBackground, num_views: int) -> None:
-    """Refuse photographs in which nothing moves."""
-    if rest.nothing_moves:
-        raise ReconstructionError(
-            f"Nothing moves in {num_views} photographs: {rest.still_fraction:.0%} of the matches "
-            "lie at the same pixel, and in no pair do enough others agree on a motion. Camera and "
-            f"background were at rest, and an object that turned has too little texture. {MOVE}"
-        )
-
-
 def choose_component(
     components: Sequence[tuple[str, ...]],
     spread: Sequence[int],
@@ -83,8 +78,7 @@ def choose_component(
 
     Args:
         components: Names of the views in each component; they may overlap.
-        spread: How many views of each see enough points under real triangulation angles, see
-            :func:`count_spread_views`.
+        spread: Views of each that see depth, see :func:`count_spread_views`.
         min_fraction: Of the photographs that the chosen component must have when another one
             holds at least 3 views that it lacks.
 
@@ -97,16 +91,16 @@ def choose_component(
     """
     order = range(len(components))
     largest = max(order, key=lambda index: (spread[index], len(components[index])), default=-1)
-    kept = components[largest] if components else ()
-    if len(kept) < FEWEST_VIEWS:
-        missing = [name for name in names if name not in kept]
+    chosen = components[largest] if components else ()
+    if len(chosen) < FEWEST_VIEWS:
+        missing = [name for name in names if name not in chosen]
         raise ReconstructionError(
-            f"Structure from motion registered {len(kept)} of {len(names)} photographs; at least "
+            f"Structure from motion registered {len(chosen)} of {len(names)} photographs; at least "
             f"{FEWEST_VIEWS} are needed. Not registered: {some(missing, most=20)}. {ADVICE}"
         )
     if spread[largest] < FEWEST_VIEWS:
         raise ReconstructionError(
-            f"Structure from motion registered {len(kept)} of {len(names)} photographs, but only "
+            f"Structure from motion registered {len(chosen)} of {len(names)} photographs, but only "
             f"{spread[largest]} of them see enough points under triangulation angles of "
             f"{MIN_ANGLE_DEG:.0f} degrees or more; at least {FEWEST_VIEWS} are needed. The "
             "cameras were found in nearly one place: they stood still, or they were registered on "
@@ -115,11 +109,11 @@ def choose_component(
     rivals = [
         part
         for part, depth in zip(components, spread, strict=True)
-        if depth >= FEWEST_VIEWS and len(set(part) - set(kept)) >= 3
+        if depth >= FEWEST_VIEWS and len(set(part) - set(chosen)) >= 3
     ]
-    if rivals and len(kept) < min_fraction * len(names):
+    if rivals and len(chosen) < min_fraction * len(names):
         parts = "; ".join(
-            f"{len(part)} photographs ({some(part, most=12)})" for part in (kept, *rivals)
+            f"{len(part)} photographs ({some(part, most=12)})" for part in (chosen, *rivals)
         )
         raise ReconstructionError(
             f"Structure from motion split {len(names)} photographs into {1 + len(rivals)} models "
@@ -131,16 +125,10 @@ def choose_component(
     return largest
 
 
-# Distance from where such a camera's map takes a point, up to which it follows, in longer sides of
-# the photograph: 2 px of 800, or 0.09 degrees of parallax with a normal lens.
-_MAX_ERROR = 0.0025
 # Median over views of the points that follow, above which a model is not believed: 0.93 to 0.98 in
 # wrong models of 3 turntables whose room shifts, 0.00 to 0.32 in right ones (the skull's 24, 5
 # rendered arcs, one of points on a table alone, and 4 turntables).
 _MOST_FOLLOWING = 0.5
-# Fraction of the photographs that must see most of their points under real angles for a model to be
-# believed, and fraction of the points: most.
-_MOST = 0.5
 
 
 def doubt(model: SparseModel, num_photographs: int) -> str:
@@ -153,20 +141,15 @@ def doubt(model: SparseModel, num_photographs: int) -> str:
             "depth. Either all is flat, or a background that shifts was registered in the place "
             f"of the object. {MOVE}"
         )
-    seeing = count_deep_views(model)
-    if seeing < _MOST * num_photographs:
+    wide = model.observed[wide_points(model)].sum(dim=0)
+    seeing = int((wide > model.observed.sum(dim=0) / 2).sum())
+    if seeing < num_photographs / 2:
         return (
             f"The cameras are doubtful: {seeing} of {num_photographs} photographs are registered "
             f"and see most of their points under triangulation angles of {MIN_ANGLE_DEG:.0f} "
             f"degrees or more. {ADVICE} {MOVE}"
         )
     return ""
-
-
-def count_deep_views(model: SparseModel) -> int:
-    """Count the views that see most of their points under triangulation angles that tell depth."""
-    wide = model.observed[wide_points(model)].sum(dim=0)
-    return int((wide > _MOST * model.observed.sum(dim=0)).sum())
 
 
 def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[int]:
@@ -191,18 +174,22 @@ def following_fraction(model: SparseModel) -> float:
 
     Of those that a view shares with a reference, for the reference of which it is the largest.
     """
-    numbers, pixels = _by_view(model)
+    seen = [model.observation_view == view for view in range(model.num_views)]
+    points, pixels = (
+        [values[mine] for mine in seen]
+        for values in (model.observation_point, model.observation_pixels)
+    )
     centre = picture_centre(pixels)
-    max_error_px = _MAX_ERROR * max(max(lens.width, lens.height) for lens in model.lenses)
+    # 2 px of 800, or 0.09 degrees of parallax with a normal lens.
+    max_error_px = 0.0025 * max(max(lens.width, lens.height) for lens in model.lenses)
     generator = torch.Generator().manual_seed(0)
     best = 0.0
     for reference in references(model.num_views):
-        pairs = [
-            _shared(numbers, reference, view)
-            for view in range(model.num_views)
-            if view != reference
-        ]
-        matched = both_ways(pixels, pairs)[reference]
+        matched = {}
+        for view in range(model.num_views):
+            here, there = _same(points[reference], points[view])
+            if view != reference and len(here):
+                matched[view] = pixels[reference][here], pixels[view][there]
         tied = tied_to(matched, centre, max_error_px, 15, generator, any_homography=False)
         fractions = torch.zeros(max(model.num_views - 1, 1))
         for slot, (_, follows) in enumerate(tied.values()):
@@ -211,48 +198,31 @@ def following_fraction(model: SparseModel) -> float:
     return best
 
 
-def _by_view(model: SparseModel) -> tuple[list[Tensor], list[Float[Tensor, "_ 2"]]]:
-    """Return the points that each view observes, and where."""
-    own = [model.observation_view == view for view in range(model.num_views)]
-    return (
-        [model.observation_point[one] for one in own],
-        [model.observation_pixels[one] for one in own],
-    )
-
-
-def _shared(points: list[Tensor], first: int, second: int) -> Pair:
-    same = torch.isin(points[first], points[second])
-    rows = torch.nonzero(same)[:, 0]
-    order = points[second].argsort()
-    place = torch.searchsorted(points[second][order], points[first][rows])
-    return Pair(first=first, second=second, matches=torch.stack([rows, order[place]], dim=1))
-
-
-# Points a view that tell, of up to 66 views; fewest views of a lens; choices.
-_POINTS, _FEWEST = 100, 4
-# Part of the errors with one lens that a lens each must leave to be believed, and spread of its
-# focal lengths: choices. On 8 simulated views of a ball with 0.2 px of noise it leaves 1.00 of one
-# lens, 0.93 of two whose focal lengths are as 1 to 1.1, 0.76 as 1 to 1.25, 0.60 as 1 to 1.5.
-_MUCH_BETTER, _SPREAD = 0.8, 0.05
-_SCALE_PX, _TOLERANCE = 1.0, 1e-5
+def _same(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the places of the points that are in both lists."""
+    here = torch.nonzero(torch.isin(points, others))[:, 0]
+    order = others.argsort()
+    return here, order[torch.searchsorted(others[order], points[here])]
 
 
 def doubt_one_lens(model: SparseModel) -> str:
-    """State why photographs were taken with several lenses, if a lens each fits much better."""
+    """State why photographs were taken with several lenses, if a lens each fits much better.
+
+    On 8 simulated views of a ball with 0.2 px of noise, a lens each leaves 1.00 of the errors with
+    one lens where it is one, 0.93 of two whose focal lengths are as 1 to 1.1, 0.76 as 1 to 1.25,
+    0.60 as 1 to 1.5.
+    """
     shared = Counter(lens.camera for lens in model.lenses)
-    if not shared or max(shared.values()) < _FEWEST or not len(model.points_world):
+    if not shared or max(shared.values()) < 4 or not len(model.points_world):
         return ""
     step = -(-model.num_views // MOST_PAIRED)
-    some = longest_tracks(select_views(model, range(0, model.num_views, step)), _POINTS)
-    each = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(some.lenses))
-    one, freed = (
-        bundle(start, _SCALE_PX, tolerance=_TOLERANCE)
-        for start in (some, some.replace(lenses=each))
-    )
-    before, after = (float(observation_errors(found).median()) for found in (one, freed))
+    one = longest_tracks(select_views(model, range(0, model.num_views, step)), 100)
+    own = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(one.lenses))
+    one, freed = (bundle(start, 1.0, tolerance=1e-5) for start in (one, one.replace(lenses=own)))
+    before, after = (float(observation_errors(each).median()) for each in (one, freed))
     focals = torch.tensor([lens.params[0] for lens in freed.lenses])
     low, high = torch.quantile(focals, torch.tensor([0.1, 0.9])).tolist()
-    if after > _MUCH_BETTER * before or high < (1 + _SPREAD) * low:
+    if after > 0.8 * before or high < 1.05 * low:
         return ""
     return (
         f"Points reproject {before:.2f} px off with one lens for {max(shared.values())} "
@@ -262,13 +232,9 @@ def doubt_one_lens(model: SparseModel) -> str:
     )
 
 
-# Pairs that judge a view. Of the matches in its 3 strongest pairs, 91 to 100 % agree for the worst
-# view of 4 right models of a carton, 4 to 31 % in 3 wrong models; in its strongest pair alone 77 to
-# 100 %, in its 6 strongest 85 to 90 %.
-_JUDGES = 3
-
-
-# Fraction of those matches that must agree.
+# Fraction of the matches in a view's 3 strongest pairs that must agree with the model: 91 to 100 %
+# do for the worst view of 4 right models of a carton, 4 to 31 % in 3 wrong models; in its strongest
+# pair alone 77 to 100 %, in its 6 strongest 85 to 90 %.
 _MIN_AGREEMENT = 0.5
 
 
@@ -311,7 +277,7 @@ def judged(
     misplaced = {}
     for view, name in enumerate(model.names):
         mine = [agreeing[pair] for pair in agreeing if view in pair]
-        fraction = _agreeing_fraction(sorted(mine, reverse=True)[:_JUDGES])
+        fraction = _agreeing_fraction(sorted(mine, reverse=True)[:3])
         if fraction < _MIN_AGREEMENT:
             misplaced[name] = fraction
     total = sum(pair.num_matches for pair in pairs)

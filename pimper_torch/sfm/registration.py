@@ -12,20 +12,19 @@ from dataclasses import dataclass, field, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import caution
+from pimper_torch.errors import ReconstructionError, caution
 from pimper_torch.ledger import leave_out
 from pimper_torch.sfm.doubt import (
     FEWEST_VIEWS,
+    MOVE,
     count_views_with_depth,
     doubt,
     judged,
-    require_motion,
 )
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.mapping import map_views
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,
-    PhotographPair,
     VerifiedPair,
     all_pairs,
     match_guided,
@@ -39,8 +38,6 @@ from pimper_torch.sfm.retrieval import pairs_to_match
 from pimper_torch.sfm.settings import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground, enter_room, leave_out_room
 
-# Distances that verify a match, at which it still agrees with a model: the lens is the model's.
-_AGREEING = 2.0
 # Fraction of the verified matches that a plain model must explain. Right models of 12 potatoes on a
 # patterned table explain 0.99 to 1.00, with a time stamp in the corner or a zoom in EXIF, too, and
 # 0.95 where zoomed photographs share a lens; of a mug that was turned over, at most 0.73.
@@ -56,8 +53,7 @@ class Registration:
 
     Attributes:
         models: One a component, the one with most views that see depth first.
-        spread: How many views of each see depth, see
-            :func:`~pimper_torch.sfm.doubt.count_views_with_depth`.
+        spread: Views of each that see depth.
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
             the matches in those that agrees.
@@ -141,8 +137,8 @@ def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}
-        some = strongest(counts, len(space.files), settings.guided_pairs)
-        verified = _guided(space, some, settings)
+        match_guided(space, strongest(counts, len(space.files), settings.guided_pairs), settings)
+        verified = verified_pairs(space)
     return _mapped(space, verified, settings, settings.seed)
 
 
@@ -157,7 +153,8 @@ def _thorough(space: Workspace, best: Registration, settings: ReconstructConfig)
         again = [pair for pair in again if apart & set(pair)]
     if not small:
         match_pairs(space, again, settings)
-    verified = _guided(space, again, settings)
+    match_guided(space, again, settings)
+    verified = verified_pairs(space)
     seeds = [settings.seed + start for start in range(settings.starts)]
     for seed, pairs_count in [*((seed, False) for seed in seeds), (settings.seed, True)]:
         rival = _mapped(space, verified, settings, seed, pairs_count=pairs_count)
@@ -172,7 +169,13 @@ def _leave_out_room(
 ) -> tuple[StaticBackground, Mapping[str, Float[Tensor, "3 3"]]]:
     """Leave out the features of a room at rest; return it with each file's map to where it is."""
     rest = leave_out_room(space.database, settings)
-    require_motion(rest, len(space.files))
+    if rest.nothing_moves:
+        raise ReconstructionError(
+            f"Nothing moves in {len(space.files)} photographs: {rest.still_fraction:.0%} of the "
+            "matches lie at the same pixel, and in no pair do enough others agree on a motion. "
+            "Camera and background were at rest, and an object that turned has too little "
+            f"texture. {MOVE}"
+        )
     return rest, dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}
 
 
@@ -192,14 +195,6 @@ def _tell_room(rest: StaticBackground) -> None:
     )
 
 
-def _guided(
-    space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
-) -> list[VerifiedPair]:
-    """Match some pairs along their epipolar lines; give all that are verified then."""
-    match_guided(space, pairs, settings)
-    return verified_pairs(space)
-
-
 def _mapped(
     space: Workspace,
     verified: Sequence[VerifiedPair],
@@ -215,21 +210,23 @@ def _mapped(
             without them (median error 0.19 in place of 0.13 degrees on 24 photographs of a skull):
             they come last.
     """
-    grown = map_views(space, seed, pairs_count=pairs_count)
-    whole = [drop_weak_views(model, MIN_POINTS) for model in grown]
-    found = [model for model in whole if model.num_views]
-    counts = count_views_with_depth(found, MIN_POINTS)
-    counted = list(zip(counts, found, strict=True))
+    grown = [
+        drop_weak_views(model, MIN_POINTS)
+        for model in map_views(space, seed, pairs_count=pairs_count)
+    ]
+    found = [model for model in grown if model.num_views]
+    counted = list(zip(count_views_with_depth(found, MIN_POINTS), found, strict=True))
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
     models = tuple(model for _, model in counted)
-    registered = models[0].names if models else ()
-    limit = _AGREEING * settings.max_error_px
-    judgement = judged(models[0], space.files, verified, limit) if models else None
-    doubtful = judgement is None or bool(doubt(models[0], len(space.files)))
+    if not models:
+        return Registration(models=(), spread=(), missing=space.files, misplaced={}, explained=0.0)
+    # At twice the distance that verifies a match it still agrees: the lens is the model's.
+    judgement = judged(models[0], space.files, verified, 2 * settings.max_error_px)
+    doubtful = bool(doubt(models[0], len(space.files)))
     return Registration(
         models=models,
         spread=tuple(spread for spread, _ in counted),
-        missing=tuple(file for file in space.files if file not in registered),
-        misplaced=judgement.misplaced if judgement else {},
-        explained=0.0 if doubtful or judgement is None else judgement.explained,
+        missing=tuple(file for file in space.files if file not in models[0].names),
+        misplaced=judgement.misplaced,
+        explained=0.0 if doubtful else judgement.explained,
     )

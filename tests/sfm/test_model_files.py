@@ -127,14 +127,14 @@ def test_camera_models_are_colmaps():
 def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(folder, name):
     for content in (b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"):
         (folder / name).write_bytes(content)
-        with pytest.raises(InputError, match=rf"{name} (says that it holds \d+|is cut short)"):
+        with pytest.raises(InputError, match=f"{name} is cut short"):
             read_model(folder)
 
 
 @pytest.mark.parametrize("count", [2**64 - 1, 10**9])
 def test_a_track_longer_than_the_file_is_refused(folder, count):
     change(folder / "points3D.bin", "<Q", 8 + 43, count)
-    with pytest.raises(InputError, match=rf"points3D.bin says that {count} features see a point"):
+    with pytest.raises(InputError, match=r"points3D\.bin is cut short"):
         read_model(folder)
 
 
