@@ -14,14 +14,6 @@ from pimper_torch.mapped import each
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Failure, SparseScene
 
-# A view must have this fraction of the points that it observed in front of it, and within its
-# frame enlarged by the margin on every side (a fraction of it): choices, far below what any camera
-# of a model has, whose points reproject within pixels.
-_MIN_IN_FRAME, _MARGIN = 0.5, 0.1
-
-# As many as a surface needs: the least that a sweep compares.
-_MIN_VIEWS = 3
-
 
 @torch.no_grad()
 def sound(scene: SparseScene) -> SparseScene:
@@ -41,18 +33,16 @@ def sound(scene: SparseScene) -> SparseScene:
     leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
     if not reasons:
         return scene
-    names = scene.views.names
-    if scene.views.num_views - len(reasons) < _MIN_VIEWS:
+    names, left = scene.views.names, scene.views.num_views - len(reasons)
+    if left < 3:  # the least that a sweep compares
         listed = "; ".join(f"{names[view]}: {reason}" for view, reason in reasons.items())
         raise ReconstructionError(
-            f"{scene.views.num_views - len(reasons)} of {scene.views.num_views} views can be used; "
-            f"needed: {_MIN_VIEWS}. {listed}. Look at these photographs, masks and cameras."
+            f"{left} of {scene.views.num_views} views can be used; needed: 3. {listed}. Look at "
+            "these photographs, masks and cameras."
         )
     done = "These views are left out, as if they had not been taken"
     skipped(*(_failure("view", names[view], reason, done) for view, reason in reasons.items()))
-    kept = torch.ones(scene.views.num_views, dtype=torch.bool)
-    kept[list(reasons)] = False
-    return with_views(scene, kept)
+    return with_views(scene, torch.tensor([view not in reasons for view in range(len(names))]))
 
 
 def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
@@ -94,32 +84,16 @@ def _failure(what: str, name: str, reason: str, done: str) -> Failure:
 
 def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
     """List the views that cannot be used, each with the reason."""
-    inside, masks = scene.views.inside, scene.views.masks
-    for view, (image, shown) in enumerate(each(scene.views.images, inside)):
-        if masks is not None:
-            shown = shown & masks[view]
+    masks = scene.views.masks
+    for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
+        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN
         reason = _nowhere(scene, view)
-        if not reason and not bool(shown.any()):
-            reason = "its mask is empty"
-        reason = reason or _blank(image, shown)
+        if not reason and not bool(lit.any()):
+            reason = "it is black, saturated or not finite all over"
+        elif not reason and masks is not None and not bool((lit & masks[view]).any()):
+            reason = "its mask is empty, or shows nothing that is lit"
         if reason:
             yield view, reason
-
-
-def _blank(image: Tensor, shown: Bool[Tensor, "height width"]) -> str:
-    """State why a photograph shows nothing, if so."""
-    low, high = image.aminmax()
-    if bool((low >= 0) & (low < SATURATED) & (high > 0) & (high < torch.inf)) and bool(shown.all()):
-        return ""
-    radiance = image[:, shown]
-    finite = radiance.isfinite()
-    if not bool(finite.any()):
-        return "no radiance is finite"
-    if not bool((radiance[finite] > 0).any()):
-        return "it is black all over"
-    if bool((radiance[finite] >= SATURATED).all()):
-        return "it is saturated all over"
-    return ""
 
 
 def _nowhere(scene: SparseScene, view: int) -> str:
@@ -132,8 +106,8 @@ def _nowhere(scene: SparseScene, view: int) -> str:
         return ""
     pixels, depth = project(points, pose, intrinsics)
     size = scene.cameras.sizes_px[view]
-    within = (pixels > -_MARGIN * size) & (pixels < (1 + _MARGIN) * size)
+    within = (pixels > -0.1 * size) & (pixels < 1.1 * size)
     share = float((within.all(dim=1) & (depth > 0)).float().mean())
-    if share >= _MIN_IN_FRAME:
+    if share >= 0.5:  # far below any camera of a model, whose points reproject within pixels
         return ""
     return f"its camera has {share:.0%} of the points that it observed in its frame"
