@@ -102,7 +102,9 @@ def bundle(
         reconstruction = reconstruction_of(model, _no_colors(model))
         config = _everything(reconstruction) if cameras else _points_alone(reconstruction)
         pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
-    return model_of(reconstruction)
+    return model_of(reconstruction).replace(
+        background_from_view=model.background_from_view, series=model.series
+    )
 
 
 def _everything(reconstruction: Any) -> Any:  # noqa: ANN401 - pycolmap has no types

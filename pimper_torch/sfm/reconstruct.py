@@ -25,7 +25,7 @@ from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.moved_object import series_in, with_series
 from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
 from pimper_torch.sfm.refine_tracks import refine_tracks
-from pimper_torch.sfm.registration import Registration, register
+from pimper_torch.sfm.registration import register
 from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
 from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.triangulation import lacks_points, triangulate
@@ -33,9 +33,6 @@ from pimper_torch.sfm.upright import upright
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, kept, opened
 from pimper_torch.store.code import code
-
-# Fraction of the photographs that the largest component must hold when the model splits.
-_MIN_FRACTION = 0.6
 
 
 class Reconstruct(Stage):
@@ -178,19 +175,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
     leave_out("sfm.quarter_turns", sum(map(bool, turns)), total=len(turns))
     lying = turned_views(views, [-quarters for quarters in turns])
-    lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
-    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
-    with workspace(lying, config.num_threads) as space:
-        counts = find_features(space, config, _known_focals(views), lenses)
-        _require_features(counts, views.names)
-        release_memory()
-        found = register(space, config)
-    release_memory()
-    names = dict(zip(space.files, views.names, strict=True))
-    model = _chosen(found, names, 0.0 if found.around else _MIN_FRACTION)
-    if found.around:
-        model = with_series(model, series_in(model, views.names, found.around), views.names)
-    series = dict(zip(model.names, model.series.tolist(), strict=False))
+    model = _registered_model(lying, config)
     numbers = [views.names.index(name) for name in model.names]
     model = refine_tracks(lying.take(numbers), model, config.track_iterations)
     release_memory()
@@ -198,27 +183,37 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     leave_out("sfm.one_lens", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
-    model = with_background(model, found, names)
-    if series:
-        model = model.replace(series=torch.tensor([series[name] for name in model.names]))
     if any(turns):
         turned = [turns[number] for number in numbers]
         model = follow_pictures(model, views.take(numbers), turned)
     return upright(model)
 
 
-def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:
-    """Choose among the models and put its views in the photographs' order."""
-    models = [
-        model.replace(names=tuple(names[file] for file in model.names)) for model in found.models
-    ]
-    photographs = tuple(names.values())
-    parts = [model.names for model in models]
-    model = models[choose_component(parts, found.spread, photographs, min_fraction)]
+def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
+    """Grow models of photographs that lie as their sensors do, and choose one.
+
+    Its views are in the photographs' order, with maps to a room at rest and numbers of series.
+    """
+    lenses = choose_lenses(views, shared=config.shared_camera, own=config.own_cameras)
+    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
+    with workspace(views, config.num_threads) as space:
+        counts = find_features(space, config, _known_focals(views), lenses)
+        _require_features(counts, views.names)
+        release_memory()
+        found = register(space, config)
+    release_memory()
+    # The largest of several models must hold most photographs, if they are not of several series.
+    min_fraction = 0.0 if found.around else 0.6
+    parts = [[space.files.index(file) for file in model.names] for model in found.models]
+    names = [tuple(views.names[number] for number in part) for part in parts]
+    chosen = choose_component(names, found.spread, views.names, min_fraction)
+    order = sorted(range(len(parts[chosen])), key=parts[chosen].__getitem__)
+    model = select_views(found.models[chosen].replace(names=names[chosen]), order)
+    name_of = dict(zip(space.files, views.names, strict=True))
     misplaced = [
-        f"{names[file]} ({fraction:.0%} agree)"
+        f"{name_of[file]} ({fraction:.0%} agree)"
         for file, fraction in found.misplaced.items()
-        if names[file] in model.names
+        if name_of[file] in model.names
     ]
     leave_out("sfm.misplaced", len(misplaced), total=model.num_views)
     if misplaced:
@@ -228,17 +223,13 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
             "for sides that look alike; add photographs between these and their neighbours.",
             stacklevel=4,
         )
-    return select_views(
-        model, [model.names.index(name) for name in photographs if name in model.names]
-    )
-
-
-def with_background(model: SparseModel, found: Registration, names: dict[str, str]) -> SparseModel:
-    """Add the maps to a static background, if there is one."""
-    maps = {names[file]: one for file, one in found.background.items()}
-    if not maps:
-        return model
-    return model.replace(background_from_view=torch.stack([maps[name] for name in model.names]))
+    if found.background:
+        maps = {name_of[file]: rest for file, rest in found.background.items()}
+        rests = torch.stack([maps[name] for name in model.names])
+        model = model.replace(background_from_view=rests)
+    if found.around:
+        model = with_series(model, series_in(model, views.names, found.around), views.names)
+    return model
 
 
 def _known_focals(views: Views) -> list[float | None]:

@@ -82,7 +82,7 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
         monkeypatch.setattr(registration, "leave_out_room", leave_out)
         monkeypatch.setattr(registration, "pairs_to_match", lambda space: all_pairs(5))
-        monkeypatch.setattr(registration, "tie_series", lambda *_: (None, around))
+        monkeypatch.setattr(registration, "tie_series", lambda *_: around)
         monkeypatch.setattr(
             registration,
             "count_views_with_depth",

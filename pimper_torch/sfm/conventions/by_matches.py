@@ -39,13 +39,6 @@ from pimper_torch.sfm.settings import MIN_MATCHES
 # skull, three rendered ones of 240 to 400 px, a ball in closed form). Below the first, cameras are
 # refused; from the second on, they are believed, and so is a crop.
 _MIN_AGREEMENT, _RIGHT = 0.5, 0.95
-# Matches below which nothing is said: a choice.
-_FEWEST = 30
-# Photographs that a crop places beside by so much must explain the matches worse; the last steps of
-# the search, and how many in a row: choices.
-_BESIDE_PX, _STEP_PX, _MOST_STEPS = 8.0, 0.5, 12
-# Pairs that are looked at, those with most matches. A choice: enough, and a second.
-_PAIRS = 200
 
 
 def choose_way(
@@ -61,7 +54,9 @@ def choose_way(
     Raises:
         InputError: None explains enough, or nothing tells which crop does.
     """
-    given = _choose_turns(ways.plain, verified, max_error_px, where) if ways.plain else None
+    given = ways.plain[0] if ways.plain else None
+    if len(ways.plain) > 1:
+        given = _choose_turns(ways.plain, verified, max_error_px, where)
     if ways.cropped:
         given = _find_crop(given, ways, verified, max_error_px, where) or given
     assert given is not None, "a crop is found, or refused, where no resize is possible"
@@ -76,8 +71,6 @@ def _choose_turns(
     where: str,
 ) -> SparseModel:
     """Choose between cameras of photographs as they stand, and as their files store them."""
-    if len(models) == 1:
-        return models[0]
     scores = [_explained_fraction(model, verified, max_error_px) for model in models]
     best = scores.index(max(scores))
     if sum(pair.num_matches for pair in verified) < MIN_MATCHES:
@@ -106,7 +99,7 @@ def _find_crop(
         ``None`` where a resize explains the matches as well.
     """
     crops, changed = ways.cropped, ways.changed
-    strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:_PAIRS]
+    strongest = sorted(verified, key=lambda pair: -pair.num_matches)[:200]  # a second
 
     def errors(model: SparseModel) -> Float[Tensor, " match"]:
         return match_errors(model, strongest).clamp_max(max_error_px)
@@ -118,8 +111,8 @@ def _find_crop(
     middle, corner = (pinhole_of(one.lenses[changed[0]])[:2, 2] for one in (crops[0], crops[-1]))
     room = 2 * (middle - corner).abs()
     shift, step = torch.zeros_like(room), float(room.max()) / 4
-    while step >= _STEP_PX:
-        for _ in range(_MOST_STEPS):
+    while step >= 0.5:
+        for _ in range(12):
             ring = torch.cat([torch.zeros(1, 2).to(shift), step * around(shift)])
             shifts = torch.minimum(torch.maximum(shift + ring, -room), room)
             means = torch.stack([errors(shifted(one)).mean() for one in shifts])
@@ -134,7 +127,7 @@ def _find_crop(
     best = errors(crop)
     if plain is not None and not surely_better(errors(plain), best):
         return None
-    beside = [errors(shifted(shift + _BESIDE_PX * one)) for one in around(shift)]
+    beside = [errors(shifted(shift + 8 * one)) for one in around(shift)]
     sharp = all(surely_better(one, best) for one in beside)
     if _explained_fraction(crop, verified, max_error_px) <= _RIGHT or not sharp:
         raise InputError(
@@ -153,7 +146,7 @@ def _require_agreement(
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     total = sum(pair.num_matches for pair in pairs)
     given = _fraction(pairs, cameras, max_error_px)
-    if total < _FEWEST or given > _RIGHT:
+    if total < 30 or given > _RIGHT:
         return
     found = (
         f"{given:.0%} of {total} matches in {len(pairs)} pairs of photographs lie within "
@@ -176,7 +169,6 @@ def _require_agreement(
 def _explained_fraction(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
 ) -> float:
-    """Return the fraction of matches that the cameras of a model explain."""
     return _fraction(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
 
 
