@@ -18,7 +18,7 @@ from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Views
 from pimper_torch.sfm.features import SMALLEST_PX, find_features, workspace
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs, match_pairs, verified_pairs
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 _MAX_PAIRS = 800  # of 40 photographs all; of more those next in the order of their names
 # Verified matches of a pair: fewer come about by chance.

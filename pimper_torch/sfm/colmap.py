@@ -15,9 +15,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.errors import OutputError, caution
-from pimper_torch.geometry.frames import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras, Lens
-from pimper_torch.sfm import colmap
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.model_files import read_files, sound_model
 
@@ -276,7 +275,7 @@ def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
     for index, lens in enumerate(model.lenses):
         here = torch.nonzero(model.observation_view == index)[:, 0]
         points = model.points_world[model.observation_point[here]]
-        expected = colmap.distort(lens, transform(model.cam_from_world[index], points))
+        expected = distort(lens, transform(model.cam_from_world[index], points))
         distance = (expected - model.observation_pixels[here]).norm(dim=-1)
         residual[here] = distance.nan_to_num(nan=torch.inf)
     return residual

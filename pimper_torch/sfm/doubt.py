@@ -22,8 +22,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from pimper_torch.errors import ReconstructionError, some
-from pimper_torch.geometry.frames import invert_rigid
 from pimper_torch.geometry.projection import triangulation_angles
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.sfm.camera_in_place import picture_centre, references, tied_to
 from pimper_torch.sfm.colmap import observation_errors
 from pimper_torch.sfm.epipolar import match_errors

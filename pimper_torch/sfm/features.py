@@ -20,7 +20,7 @@ from pimper_torch.progress import track
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import loaded, quiet
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ from pimper_torch.sfm.colmap import loaded, model_of, quiet, reconstruction_of
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import MOST_PAIRED
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.settings import MIN_POINTS
+from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 
 # Growth of a model between two adjustments of all of it. COLMAP's own 1.1 suits models that are
 # final, and takes 29 in place of 25 CPU s on 66 photographs; here tracks are found again, and

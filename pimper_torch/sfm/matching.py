@@ -18,7 +18,7 @@ from pimper_torch.progress import track
 from pimper_torch.records import Record
 from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import Workspace
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 # Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;
 # tiles tell how far matching has come. Of 66 photographs, tiles of 16 prepare 400 searches where

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution, some
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Lens
 from pimper_torch.sfm.model import SparseModel

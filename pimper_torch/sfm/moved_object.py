@@ -34,7 +34,7 @@ from pimper_torch.sfm.matching import (
     verified_again,
 )
 from pimper_torch.sfm.model import SparseModel, select_views
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 # Matches of the second body below which a pair does not show two bodies, and the fraction of the
 # matches outside the first geometry that they must be. In rigid scenes up to 25 matches and 0.85

@@ -16,7 +16,7 @@ from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.conventions.pictures import Ways
+from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.doubt import choose_component, doubt, doubt_one_lens
 from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
 from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small, workspace
@@ -24,10 +24,10 @@ from pimper_torch.sfm.lenses import choose_lenses, sensor_turns, turned_views
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.moved_object import series_in, with_series
 from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.registration import register
-from pimper_torch.sfm.scene import assemble_scene, model_of_scene, with_model_points
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.sparse_scene import assemble_scene, model_of_scene, with_model_points
 from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
 from pimper_torch.stage import Stage

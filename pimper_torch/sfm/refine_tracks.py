@@ -11,7 +11,7 @@ from pimper_torch.sfm import colmap
 from pimper_torch.sfm.colmap import observation_errors
 from pimper_torch.sfm.mapping import bundle
 from pimper_torch.sfm.model import SparseModel, longest_tracks
-from pimper_torch.sfm.settings import MIN_POINTS
+from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 from pimper_torch.sfm.track_observations import (
     TrackObservations,
     log_pictures,

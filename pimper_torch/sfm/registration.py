@@ -34,8 +34,8 @@ from pimper_torch.sfm.matching import (
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
 from pimper_torch.sfm.moved_object import tie_series
+from pimper_torch.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.settings import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.static_background import StaticBackground, enter_room, leave_out_room
 
 # Fraction of the verified matches that a plain model must explain. Right models of 12 potatoes on a

@@ -41,7 +41,7 @@ from pimper_torch.sfm.matching import (
     read_matched,
     verified_again,
 )
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 # Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, pad
 
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
@@ -198,7 +198,7 @@ def log_pictures(
     lit = log[:, ::4, ::4]
     lit = lit[lit > 0]
     floor = 0.02 * lit.median() if len(lit) else torch.ones(())  # darker is noise
-    return Pictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
+    return LogPictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -249,7 +249,7 @@ class _Window:
 
 
 def sight(
-    pictures: Pictures,
+    pictures: LogPictures,
     cameras: Cameras,
     tangents: Tangents,
     max_shift_px: float = 3.0,
@@ -276,7 +276,7 @@ def sight(
 
 
 def _sight(
-    pictures: Pictures, cameras: Cameras, tangents: Tangents, max_shift_px: float
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, max_shift_px: float
 ) -> TrackObservations:
     with torch.no_grad():
         window = _Window(like=pictures.log)

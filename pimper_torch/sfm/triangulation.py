@@ -15,7 +15,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.colmap import loaded, model_of, observation_errors, quiet, reconstruction_of
 from pimper_torch.sfm.conventions.by_matches import choose_way
-from pimper_torch.sfm.conventions.pictures import Ways
+from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.epipolar import (
     epipolar_geometry,
     explained,
@@ -39,7 +39,6 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.settings import ReconstructConfig
 from pimper_torch.sfm.static_background import enter_room, leave_out_room
 
 # Observed points of the median view below which points are triangulated, and below which depth maps

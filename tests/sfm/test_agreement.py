@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.doubt import agreement, judged
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.frames import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.sfm.doubt import choose_component, count_spread_views
 
 NAMES = tuple(f"{index:02d}.jpg" for index in range(20))

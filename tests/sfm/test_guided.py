@@ -18,7 +18,7 @@ from pimper_torch.sfm.matching import (
     match_guided,
     match_pairs,
 )
-from pimper_torch.sfm.settings import MIN_MATCHES, ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 CONFIG = ReconstructConfig(threads=1)
 

@@ -4,7 +4,7 @@ import torch
 
 from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.colmap import loaded
-from pimper_torch.sfm.settings import ReconstructConfig
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.static_background import leave_out_room
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 

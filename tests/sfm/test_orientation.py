@@ -12,7 +12,7 @@ from pimper_torch.records import Views
 from pimper_torch.sfm.colmap import write_binary
 from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.lenses import QUARTERS
-from pimper_torch.sfm.scene import assemble_scene
+from pimper_torch.sfm.sparse_scene import assemble_scene
 from tests.sfm.ball import (
     HEIGHT,
     WIDTH,

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.sfm.epipolar import fundamental_matrix, sampson_errors, shared_geometry
 from pimper_torch.sfm.static_background import is_still, moving_matches
 from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable

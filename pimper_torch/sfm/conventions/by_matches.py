@@ -16,7 +16,7 @@ from pimper_torch.errors import InputError, caution
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.choice import surely_better
-from pimper_torch.sfm.conventions.pictures import (
+from pimper_torch.sfm.conventions.resized_pictures import (
     Ways,
     around,
     cut,
@@ -33,7 +33,7 @@ from pimper_torch.sfm.epipolar import (
 )
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.settings import MIN_MATCHES
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES
 
 # Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the
 # skull, three rendered ones of 240 to 400 px, a ball in closed form). Below the first, cameras are

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, one_hot
 
 from pimper_torch.errors import InputError, caution, some
-from pimper_torch.geometry.frames import transform
 from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
