@@ -71,9 +71,6 @@ def _write(path: Path, header: str, body: bytes) -> None:
 # for: a call with less would change the surfaces of all calls after it.
 _DENSE_DEPTH = 5
 
-# Weight of a mesh's border against its area when vertices are merged. A choice.
-_BORDER_WEIGHT = 10.0
-
 
 def poisson_surface(
     points: Float[Tensor, "point 3"],
@@ -134,7 +131,7 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     pycolmap = loaded()
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio = num_faces / len(mesh.faces)
-    options.boundary_weight, options.num_threads = _BORDER_WEIGHT, 1
+    options.boundary_weight, options.num_threads = 10.0, 1
     options.interpolate_colors = False
     # COLMAP works in single precision: a mesh far from the origin is brought there.
     places = mesh.vertices_world.detach().cpu().double()

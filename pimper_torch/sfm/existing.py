@@ -33,9 +33,6 @@ from pimper_torch.sfm.lenses import (
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
 
-# Of the corners of a photograph by a skew, up to which it is rounding: a choice.
-_MAX_SKEW_PX = 0.1
-
 
 def existing_ways(views: Views, path: Path) -> Ways:
     """Read cameras and put them in the photographs' order, sizes and orientations.
@@ -126,7 +123,8 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
     skewed = [
         camera.name
         for camera in cameras
-        if abs(camera.skew_px) * camera.lens.height > 2 * _MAX_SKEW_PX * camera.lens.params[1]
+        if abs(camera.skew_px) * camera.lens.height
+        > 0.2 * camera.lens.params[1]  # of 0.1 px in the corners
     ]
     twice = sorted({name for name in names if names.count(name) > 1})
     if skewed or twice:

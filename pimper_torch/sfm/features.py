@@ -92,10 +92,6 @@ def _write(views: Views, index: int, space: Workspace) -> None:
     drop_pages()
 
 
-# Photographs in which a thread finds features between two reports of progress.
-_PER_THREAD = 2
-
-
 # The side of photographs below which COLMAP 4.2's covariant detector reads past their end.
 SMALLEST_PX = 16
 
@@ -141,7 +137,7 @@ def find_features(
         _import(space, reader, lenses)
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
-        step = _PER_THREAD * settings.num_threads
+        step = 2 * settings.num_threads  # photographs between two reports of progress
         starts = range(0, len(space.files), step)
         for start in track(starts):
             pycolmap.extract_features(

@@ -18,9 +18,6 @@ from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 # final, and takes 29 in place of 25 CPU s on 66 photographs; here tracks are found again, and
 # everything is adjusted to them.
 _GROWTH = 1.2
-# The same for many photographs, and the relative fall of the cost that ends an adjustment: half of
-# the CPU seconds, with the same cameras after tracks are found again; see docs/decisions.md.
-_MANY_GROWTH, _MANY_TOLERANCE = 1.4, 1e-4
 
 
 def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list[SparseModel]:
@@ -46,15 +43,15 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
     options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
     options.triangulation.ignore_two_view_tracks = not pairs_count
     if len(space.files) > MOST_PAIRED:
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = _MANY_GROWTH
+        # Half of the CPU seconds, with the same cameras after tracks are found again.
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
-        options.ba_global_function_tolerance = _MANY_TOLERANCE
-        options.ba_local_function_tolerance = _MANY_TOLERANCE
-    registered = count(3)  # the first call follows a model of two views
+        options.ba_global_function_tolerance = 1e-4
+        options.ba_local_function_tolerance = 1e-4
+    registered, total = count(3), len(space.files)  # the first call follows a model of two views
 
     def tell() -> None:
-        # Of a model that begins anew, more views than there are can have been added.
-        report(min(next(registered), len(space.files)), len(space.files))
+        report(min(next(registered), total), total)  # models that begin anew add views again
 
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
         found = pycolmap.incremental_mapping(
@@ -62,9 +59,6 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
         )
     models = [model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
-
-
-_ITERATIONS = 100
 
 
 def bundle(
@@ -80,7 +74,6 @@ def bundle(
     thread, so that the same observations give the same bits.
 
     Args:
-        model: Every point with two observations at least.
         scale_px: Residual at which Cauchy's weight is a half.
         cameras: Whether poses and lenses are adjusted, or points alone.
         tolerance: Relative fall of the cost that ends the iterations.
@@ -95,7 +88,7 @@ def bundle(
     options.refine_principal_point = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = scale_px
-    options.ceres.solver_options.max_num_iterations = _ITERATIONS
+    options.ceres.solver_options.max_num_iterations = 100
     options.ceres.solver_options.function_tolerance = tolerance
     options.ceres.solver_options.num_threads = 1
     with quiet():

@@ -20,11 +20,6 @@ from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
-# Photographs a side of a tile of pairs. COLMAP prepares the search in a photograph once a tile;
-# tiles tell how far matching has come. Of 66 photographs, tiles of 16 prepare 400 searches where
-# tiles of 8 prepare 648.
-_TILE = 16
-
 # Photographs up to which a set is small: every pair is matched, and every point is looked for in
 # every view. Beyond, work grows with their number, not its square; see docs/decisions.md.
 MOST_PAIRED = 66
@@ -92,7 +87,9 @@ def tiles(pairs: Sequence[PhotographPair]) -> Iterator[list[PhotographPair]]:
     """
     groups: dict[PhotographPair, list[PhotographPair]] = {}
     count = 1 + max((second for _, second in pairs), default=0)
-    side = int(_TILE * max(1.0, math.comb(count, 2) / max(len(pairs), 1)) ** 0.5)
+    # COLMAP prepares the search in a photograph once a tile: of 66, tiles of 16 prepare 400
+    # searches where tiles of 8 prepare 648.
+    side = int(16 * max(1.0, math.comb(count, 2) / max(len(pairs), 1)) ** 0.5)
     for first, second in pairs:
         groups.setdefault((first // side, second // side), []).append((first, second))
     yield from (groups[key] for key in sorted(groups))
@@ -144,10 +141,6 @@ def photograph_numbers(
     """Return the number of the photograph behind each image of the database."""
     number = {file: index for index, file in enumerate(space.files)}
     return {image.image_id: number[image.name] for image in stored.read_all_images()}
-
-
-# Length of COLMAP's SIFT descriptors, in units of their bytes.
-_DESCRIPTOR_LENGTH = 512.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -288,7 +281,7 @@ def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolm
     descriptors = np.array(stored.read_descriptors(image).data).astype(np.float32)
     return Features(
         pixels=torch.from_numpy(pixels),
-        descriptors=torch.from_numpy(descriptors / _DESCRIPTOR_LENGTH),
+        descriptors=torch.from_numpy(descriptors / 512),
     )
 
 

@@ -18,10 +18,6 @@ from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.sound_views import with_views
 
-# Distance in pixels, at the object, up to which two cameras are one pose. A choice: bundle
-# adjustment leaves such photographs 0.1 px apart, and between neighbours of a set lie tens.
-_SAME_PX = 0.5
-
 
 def pictures_of_poses(views: Views) -> Views:
     """Average the radiance of the photographs of each pose; without poses, return the views.
@@ -105,7 +101,8 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
     extent = (centers - centers.mean(dim=0)).norm(dim=1).mean()
     turned = (pose[:, None, :3, :3] - pose[None, :, :3, :3]).flatten(2).norm(dim=2) / 2**0.5
     moved = (centers[:, None] - centers).norm(dim=2)
-    same = focal[:, None] * (turned + moved / extent) < _SAME_PX
+    # Bundle adjustment leaves photographs of one pose 0.1 px apart; between neighbours lie tens.
+    same = focal[:, None] * (turned + moved / extent) < 0.5
     return same.long().argmax(dim=1)  # the first of each pose
 
 

@@ -30,8 +30,6 @@ from pimper_torch.sfm.matching import (
 
 # Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
 _WORDS, _NEIGHBOURS = 128, 20
-# Features that the vocabulary is learned from, and rounds: choices.
-_LEARNED, _ROUNDS = 40_000, 10
 
 Descriptors = Float[Tensor, "feature length"]
 
@@ -62,7 +60,7 @@ def global_descriptors(
     Args:
         descriptors: Of the features of a photograph, by its number.
     """
-    each = -(-_LEARNED // count)
+    each = -(-40_000 // count)
     learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
     words = vocabulary(learned, _WORDS)
     return torch.stack([_aggregated(descriptors(number), words) for number in range(count)])
@@ -71,7 +69,7 @@ def global_descriptors(
 def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word length"]:
     """Return the centres of clusters (k-means), first evenly spread among the descriptors."""
     words = _some(descriptors, count)
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         word = _nearest(descriptors, words)
         sums = torch.zeros_like(words).index_add(0, word, descriptors)
         sizes = torch.bincount(word, minlength=len(words))[:, None]

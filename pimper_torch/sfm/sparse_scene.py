@@ -18,8 +18,6 @@ from pimper_torch.sfm.colmap import reprojection_errors
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.undistort import undistort, with_undistorted_priors
 
-_RASTER = 9  # pixels each way that a map is fitted to
-
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
     """Undistort the registered photographs and priors, and put them beside cameras and cloud.
@@ -43,6 +41,8 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         views.take([number[name] for name in model.names]), model.lenses
     )
     like = views.images
+    lensed = zip(model.background_from_view, model.lenses, intrinsics, strict=False)
+    maps = [_undistorted_map(one, lens, to_pinhole.to(one)) for one, lens, to_pinhole in lensed]
     scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
         cameras=Cameras(
@@ -57,39 +57,23 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         observation_pixels=model.observation_pixels.to(like),
         lenses=model.lenses,
         unregistered=tuple(name for name in views.names if name not in model.names),
-        background_from_view=_undistorted_maps(model, intrinsics).to(like),
+        background_from_view=torch.stack([torch.eye(3).double(), *maps])[1:].to(like),
         offset_world=offset,
         series=model.series.to(like.device),
     )
     return with_undistorted_priors(scene)
 
 
-def _undistorted_maps(
-    model: SparseModel, intrinsics: Float[Tensor, "view 3 3"]
-) -> Float[Tensor, "mapped 3 3"]:
-    """Return the maps to a static background between undistorted pictures, as one lens has them.
-
-    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
-    """
-    maps = model.background_from_view
-    return (
-        torch.stack(
-            [
-                _undistorted_map(one, lens, to_pinhole.to(one))
-                for one, lens, to_pinhole in zip(maps, model.lenses, intrinsics, strict=False)
-            ]
-        )
-        if len(maps)
-        else maps
-    )
-
-
 def _undistorted_map(
     one: Float[Tensor, "3 3"], lens: Lens, intrinsics: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "3 3"]:
+    """Return a map to a static background between undistorted pictures, as one lens has them.
+
+    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
+    """
     if not bool(one.isfinite().all()):
         return one
-    across = torch.linspace(0, 1, _RASTER, dtype=one.dtype)
+    across = torch.linspace(0, 1, 9, dtype=one.dtype)
     raster = torch.cartesian_prod(lens.width * across, lens.height * across)
     ends = raster, mapped(one, raster)
     first, second = (mapped(intrinsics, colmap.undistort_pixels(lens, pixels)) for pixels in ends)
@@ -152,16 +136,7 @@ def write_model(scene: SparseScene, folder: Path) -> None:
         folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
             installed COLMAP writes; made if it does not exist.
     """
-    model = SparseModel(
-        names=scene.views.names,
-        lenses=scene.lenses,
-        cam_from_world=from_local(scene.cameras.cam_from_world.detach().cpu(), scene.offset_world),
-        points_world=scene.points_world.detach().cpu().double()
-        + torch.tensor(scene.offset_world, dtype=torch.float64),
-        observation_point=scene.observation_point.cpu(),
-        observation_view=scene.observation_view.cpu(),
-        observation_pixels=scene.observation_pixels.detach().cpu().double(),
-    )
+    model = model_of_scene(scene).replace(lenses=scene.lenses)
     colmap.write_binary(model, point_colors(scene), folder)
 
 
@@ -171,7 +146,7 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
     height, width = images.shape[-2:]
     total = images.new_zeros(len(scene.points_world), images.shape[1])
     for index in range(scene.views.num_views):
-        seen = _points_in(scene, index)
+        seen = scene.observation_point[scene.observation_view == index]
         pixels, _ = project(
             scene.points_world[seen],
             scene.cameras.cam_from_world[index],
@@ -182,7 +157,3 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
         total = total.index_add(0, seen, colors[0, :, 0].T)
     count = torch.bincount(scene.observation_point, minlength=len(total)).clamp_min(1)
     return to_bytes((total / count[:, None]).expand(-1, 3))
-
-
-def _points_in(scene: SparseScene, view: int) -> Int[Tensor, " seen"]:
-    return scene.observation_point[scene.observation_view == view]

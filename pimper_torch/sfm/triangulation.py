@@ -44,8 +44,6 @@ from pimper_torch.sfm.static_background import enter_room, leave_out_room
 # Observed points of the median view below which points are triangulated, and below which depth maps
 # help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
 FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
-# Angle between optical axes from which on photographs have nothing to match. A choice.
-_MAX_ANGLE_DEG = 60.0
 
 
 def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
@@ -148,9 +146,9 @@ def _pairs(
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
     cameras, limit = pinholes_of(model), settings.max_error_px
     weights = {
-        (first, second): 1 - float(angles[first, second]) / _MAX_ANGLE_DEG
+        (first, second): 1 - float(angles[first, second]) / 60
         for first, second in combinations(range(model.num_views), 2)
-        if float(angles[first, second]) < _MAX_ANGLE_DEG
+        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
     }
     for pair in undistorted_pairs(model, verified):
         count = int(explained(cameras, pair, limit).sum())

@@ -28,10 +28,6 @@ from pimper_torch.records import (
 )
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
-_MAX_ZOOM = 1.25
-_AT_ONCE = 2**17  # pixels that are distorted at a time: rays and powers of radii take memory
-_TOUCHED = 1e-3  # fraction of saturated light in a pixel; below is the rounding of its weights
-
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
@@ -126,7 +122,7 @@ def _undistort_image(
     radiance = _sampled(image, places).masked_fill_(~inside, 0)
     saturated = image >= SATURATED
     if bool(saturated.any()):
-        touched = _sampled(saturated.to(image), places) > _TOUCHED
+        touched = _sampled(saturated.to(image), places) > 1e-3  # the rounding of weights
         radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
     if mask is not None:
         inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
@@ -160,7 +156,7 @@ def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
             reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
             needed = (end - K[axis, 2]).abs() / K[axis, axis]
             zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
-    zoom = zoom.clamp_max(_MAX_ZOOM)
+    zoom = zoom.clamp_max(1.25)
     return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
 
 
@@ -177,7 +173,7 @@ def photograph_pixels(
     scale = K.new_tensor([lens.width / width, lens.height / height])
     pixels = pixel_centers(width, height, like=K).reshape(-1, 2)
     found = torch.empty_like(pixels)
-    parts = torch.split(pixels, _AT_ONCE), torch.split(found, _AT_ONCE)
+    parts = torch.split(pixels, 2**17), torch.split(found, 2**17)  # rays take memory
     for some, into in zip(*parts, strict=True):
         plane = (some * scale - K[:2, 2]) / K.diagonal()[:2]
         rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
