@@ -84,9 +84,6 @@ class DataSetPath(NamedTuple):
 
         Links that lie in the folder are followed wherever they lead: who put them there wants that.
 
-        Returns:
-            Without ``..``, which would leave the folder behind a link.
-
         Raises:
             InputError: The path is absolute, leads out by ``..``, or is no path.
         """

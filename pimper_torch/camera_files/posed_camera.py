@@ -25,7 +25,6 @@ class PosedCamera(Record):
         name: Of its photograph, or path, as the file has it.
         cam_from_world: Rigid, in float64; camera axes x right, y down, z forward.
         lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own.
-        skew_px: ``K[0, 1]``.
     """
 
     name: str
@@ -77,9 +76,6 @@ def decompose_projections(
     triangular matrix times an orthogonal one (RQ); that ``K`` has a positive diagonal and
     ``R`` is a rotation makes the split unique. What the cameras project stays exactly the
     same, also where a file's ``R`` was not orthogonal: the rest goes into ``K``.
-
-    Args:
-        projections: World to pixels.
 
     Returns:
         ``K`` with ``K[2, 2] = 1``, its skew kept, and rigid transforms; float64.

@@ -29,9 +29,6 @@ def examine_folder(
 ) -> list[Finding]:
     """Examine the photographs of a folder, in seconds.
 
-    Args:
-        encoding: As of :func:`pimper_torch.io.photographs.load_views`.
-
     Returns:
         Of files, samples, number, blur, saturation, exposure, lenses, overlap, light and cost.
 

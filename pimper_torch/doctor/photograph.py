@@ -34,9 +34,6 @@ def edge_blur_px(grey: Float[Tensor, "height width"]) -> float:
     Edges are taken by orientation and the most blurred orientation counts, as motion blurs edges
     across it alone.
 
-    Args:
-        grey: Radiance, or any monotone function of it; the centre is looked at.
-
     Returns:
         NaN where there are no edges to tell it.
 
@@ -92,11 +89,9 @@ class Photograph(Record):
     Attributes:
         width: As a run would take it, in pixels.
         focal_px: By EXIF; NaN where it does not say.
-        saturated: Fraction of pixels with a colour that is saturated.
         bright: Radiance that a hundredth of the pixels exceed; 1 is saturation.
         blur_px: Standard deviation of the blur at the strongest edges; NaN where there are none.
         small: Mean of the colours in a small copy.
-        small_saturated: The highest colour in it.
     """
 
     name: str

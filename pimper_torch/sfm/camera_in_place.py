@@ -45,9 +45,6 @@ def reference_from_photographs(
     follow. That may be part of the object's in some: each is then tied again, to all others
     together, of which only the room's agree.
 
-    Args:
-        max_error_px: Distance up to which a match follows a map.
-
     Returns:
         ``A`` of each photograph, the identity where one cannot be tied; ``None`` where most
         cannot, or where nothing shifts by a pixel.
@@ -155,8 +152,6 @@ def fit_map(
 
     Args:
         first: Pixels, also of matches that are wrong or of what turns.
-        centre: Of the picture, where the camera's axis meets it.
-        max_error_px: Distance up to which a match follows.
         any_homography: Whether the last fits are of all homographies, which large turns need: a
             plane seen from round it follows them, too, and no similarity with a perspective row.
 

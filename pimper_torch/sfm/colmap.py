@@ -82,9 +82,6 @@ _SAME = 1e-9  # of a pixel's coordinate: rounding in double precision
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, text or binary.
 
-    Args:
-        folder: Holds ``cameras``, ``images`` and ``points3D``, each ``.txt`` or ``.bin``.
-
     Raises:
         InputError: The folder holds no model, one that is cut short or of another format, or one of
             which more than half is broken. A :class:`~pimper_torch.errors.PimperWarning` counts
@@ -97,7 +94,6 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
     """Write a model as COLMAP's binary files.
 
     Args:
-        colors: 8-bit RGB, one a point.
         folder: Made if it does not exist; files of those names in it are replaced.
 
     Raises:
@@ -139,7 +135,6 @@ def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 
     """Find where the lens images directions, in pixels of the photograph.
 
     Args:
-        lens: Any of COLMAP's perspective or fisheye models.
         rays_cam: Camera frame, any length.
 
     Returns:

@@ -115,7 +115,6 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     autograd.
 
     Args:
-        mesh: Any; one that is small enough comes back as it is.
         num_faces: Of the result at most; a few more are left where nothing else can be merged.
 
     Raises:

@@ -52,11 +52,7 @@ MOVE = (
 
 
 def count_spread_views(model: SparseModel, fewest: int) -> int:
-    """Count the views that see enough points under a triangulation angle that tells depth.
-
-    Args:
-        fewest: Points that a view must see whose widest angle between rays is 4 degrees or more.
-    """
+    """Count the views that see enough points under a triangulation angle that tells depth."""
     seen = model.observed[wide_points(model)].sum(dim=0)
     return int((seen >= fewest).sum())
 
@@ -77,7 +73,6 @@ def choose_component(
     """Choose the component to keep: the one with most views that see depth.
 
     Args:
-        components: Names of the views in each component; they may overlap.
         spread: Views of each that see depth, see :func:`count_spread_views`.
         min_fraction: Of the photographs that the chosen component must have when another one
             holds at least 3 views that it lacks.
@@ -154,10 +149,6 @@ def doubt(model: SparseModel, num_photographs: int) -> str:
 
 def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[int]:
     """Count, model by model, the views that see depth.
-
-    Args:
-        models: Components of one sequence.
-        fewest: Points that a view must see under a triangulation angle of 4 degrees or more.
 
     Returns:
         As :func:`~pimper_torch.sfm.doubt.count_spread_views`, but 0 for a model whose points
@@ -256,12 +247,7 @@ class Judgement:
 def judged(
     model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
 ) -> Judgement:
-    """Compare a model with verified matches.
-
-    Args:
-        model: Its names are among ``files``.
-        max_error_px: Distance from the model's epipolar geometry up to which a match agrees.
-    """
+    """Compare a model with verified matches."""
     view_of = {files.index(name): view for view, name in enumerate(model.names)}
     inside = [
         pair.replace(views=(view_of[pair.views[0]], view_of[pair.views[1]]))

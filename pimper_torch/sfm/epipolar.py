@@ -43,9 +43,6 @@ def fundamental_matrix(
     moving matches that contradict one another then violate the fit as little as 2 %, here 26 % at
     least (30 turntables of two photographs).
 
-    Args:
-        first: Pixels, 8 or more.
-
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """
     x, from_first = (part[0] for part in normalize_points(first.double()[None]))
@@ -63,9 +60,6 @@ def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Ten
     The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
     the same. Every translation explains the still ones, so that it is mostly the moving ones that
     violate the result where no geometry explains both.
-
-    Args:
-        still: Pixels in the first and in the second photograph.
     """
     first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
     count = torch.tensor([len(still[0]), len(moving[0])])
@@ -138,7 +132,6 @@ def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool
     Args:
         cameras: Pinholes; axes may be mirrored.
         pair: Its numbers are those of views; pixels of pinholes.
-        max_error_px: Sampson's distance.
     """
     one, other = pair.views
     K, poses = cameras.intrinsics, cameras.cam_from_world

@@ -79,11 +79,7 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
 
 
 def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]) -> Lens:
-    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves.
-
-    Args:
-        corner: Its pixel in the whole picture.
-    """
+    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves."""
     values, focals = list(lens.params), _focals(lens)
     values[focals] -= float(corner[0])
     values[focals + 1] -= float(corner[1])
@@ -174,11 +170,7 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
 
 
 def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> list[int]:
-    """Number the lenses of photographs that lie as their sensors do.
-
-    Args:
-        views: Photographs, see :func:`sensor_turns`.
-    """
+    """Number the lenses of photographs that lie as their sensors do."""
     if own:
         return list(range(views.num_views))
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]

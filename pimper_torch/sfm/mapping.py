@@ -75,8 +75,6 @@ def bundle(
 
     Args:
         scale_px: Residual at which Cauchy's weight is a half.
-        cameras: Whether poses and lenses are adjusted, or points alone.
-        tolerance: Relative fall of the cost that ends the iterations.
 
     Returns:
         Views, points and observations in their old order.

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -48,11 +48,7 @@ def match_pairs(
     settings: ReconstructConfig,
     fewest: int = MIN_MATCHES,
 ) -> None:
-    """Match pairs of photographs that are not matched yet, and verify the matches.
-
-    Args:
-        fewest: Verified matches below which a pair does not count.
-    """
+    """Match pairs of photographs that are not matched yet, and verify the matches."""
     pycolmap = loaded()
 
     options = pycolmap.FeatureMatchingOptions()
@@ -98,11 +94,7 @@ def tiles(pairs: Sequence[PhotographPair]) -> Iterator[list[PhotographPair]]:
 def strongest(
     counts: Mapping[PhotographPair, float], num_views: int, most: int
 ) -> list[PhotographPair]:
-    """List, without repetition, the pairs with most matches of each photograph.
-
-    Args:
-        counts: Verified matches of each pair, or another weight.
-    """
+    """List, without repetition, the pairs with most matches of each photograph."""
     chosen: set[PhotographPair] = set()
     for view in range(num_views):
         mine = [pair for pair in counts if view in pair]
@@ -145,52 +137,34 @@ def photograph_numbers(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Features(Record):
-    """Features of one photograph.
-
-    Attributes:
-        descriptors: Of length 1, but for rounding.
-    """
+    """Features of one photograph."""
 
     pixels: Float[Tensor, "feature 2"]
     descriptors: Float[Tensor, "feature length"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Alike(Record):
-    """Best matches of one photograph's features among the near ones of another.
-
-    Attributes:
-        products: Of the descriptors, the largest and the second largest; -1 where there is none.
-        best: Which feature of the other photograph the largest is with, or -1.
-    """
-
-    products: Float[Tensor, "feature 2"]
-    best: Int[Tensor, " feature"]
-
-
-@dataclass(frozen=True, slots=True)
-class Near:
+class Near(NamedTuple):
     """Which pixels of two photographs can show the same point.
 
     Attributes:
         matrix: Fundamental matrix, or homography from the first photograph to the second.
-        max_error_px: Largest distance: Sampson's from the epipolar line, or from the mapped point.
+        max_error_px: Sampson's distance from the epipolar line, or that from the mapped point.
     """
 
     matrix: Float[Tensor, "3 3"]
     max_error_px: float
-    planar: bool
+    planar: bool = False
+
+
+# Of each feature, the two largest products with near ones of the other photograph, -1 without; and
+# which the largest is with.
+Alike = tuple[Float[Tensor, "feature 2"], Int[Tensor, " feature"]]
 
 
 def match_guided(
     space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
 ) -> None:
-    """Replace the matches of verified pairs by those near their epipolar lines.
-
-    Args:
-        space: With pairs matched and verified.
-        pairs: Which; those that are not verified stay as they are.
-    """
+    """Replace the matches of verified pairs by those near their epipolar lines."""
     features: dict[int, Features] = {}
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
@@ -201,9 +175,8 @@ def match_guided(
             near = _near(geometry, settings.max_error_px)
             if near is not None:
                 geometries[ends], nears[ends] = geometry, near
-                features |= {
-                    image: read_features(stored, image) for image in ends if image not in features
-                }
+                for image in set(ends) - set(features):
+                    features[image] = read_features(stored, image)
 
         def matches(ends: tuple[int, int]) -> Int[Tensor, "match 2"]:
             first, second = (features[image] for image in ends)
@@ -218,23 +191,19 @@ def match_guided(
 def guided_matches(
     first: Features, second: Features, near: Near, max_ratio: float
 ) -> Int[Tensor, "match 2"]:
-    """Match features among those that can show the same point.
-
-    Args:
-        max_ratio: Of the angles between a descriptor and the two most like it.
-    """
+    """Match features among those that can show the same point."""
     one, other = likeness(first, second, near)
-    (some,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)
-    theirs = one.best[some]
-    mutual = _clearly_best(other, max_ratio)[theirs] & (other.best[theirs] == some)
-    return torch.stack([some, theirs], dim=1)[mutual]
+    (mine,) = torch.nonzero(_clearly_best(one, max_ratio), as_tuple=True)
+    theirs = one[1][mine]
+    mutual = _clearly_best(other, max_ratio)[theirs] & (other[1][theirs] == mine)
+    return torch.stack([mine, theirs], dim=1)[mutual]
 
 
 def _near(geometry: Any, max_error_px: float) -> Near | None:  # noqa: ANN401 - pycolmap is untyped
     """Choose by what verified a pair; nothing for a pair that was not."""
     kinds = loaded().TwoViewGeometryConfiguration
     if geometry.config in (kinds.CALIBRATED, kinds.UNCALIBRATED):
-        return Near(torch.from_numpy(np.array(geometry.F)), max_error_px, planar=False)
+        return Near(torch.from_numpy(np.array(geometry.F)), max_error_px)
     if geometry.config in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
         return Near(torch.from_numpy(np.array(geometry.H)), max_error_px, planar=True)
     return None
@@ -244,13 +213,9 @@ def likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alik
     """Find the most similar features of two photographs, among those that can show one point."""
     from pimper_torch.kernels.line_matches import most_alike
 
-    one, other = (
-        Alike(
-            products=torch.full((len(each.pixels), 2), -1.0),
-            best=torch.full((len(each.pixels),), -1),
-        )
-        for each in (first, second)
-    )
+    counts = len(first.pixels), len(second.pixels)
+    products = [torch.full((count, 2), -1.0) for count in counts]
+    best = [torch.full((count,), -1) for count in counts]
     most_alike(
         first.pixels.contiguous().numpy(),
         second.pixels.contiguous().numpy(),
@@ -259,20 +224,16 @@ def likeness(first: Features, second: Features, near: Near) -> tuple[Alike, Alik
         near.matrix.contiguous().numpy(),
         near.planar,
         near.max_error_px,
-        one.products.numpy(),
-        other.products.numpy(),
-        one.best.numpy(),
-        other.best.numpy(),
+        *(each.numpy() for each in (*products, *best)),
     )
-    return one, other
+    return (products[0], best[0]), (products[1], best[1])
 
 
 def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:
     """Find whose smallest angle is small, and the second smallest enough larger."""
-    best, rival = alike.products.clamp(0, 1).acos().unbind(dim=1)  # without one, a right angle
-    return (best < max_ratio * rival) & (
-        best <= loaded().FeatureMatchingOptions().sift.max_distance
-    )
+    best, rival = alike[0].clamp(0, 1).acos().unbind(dim=1)  # without one, a right angle
+    farthest = loaded().FeatureMatchingOptions().sift.max_distance
+    return (best < max_ratio * rival) & (best <= farthest)
 
 
 def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolmap is untyped
@@ -303,11 +264,7 @@ Keypoints = Sequence[Float[Tensor, "_ 2"]]  # one length a photograph
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
-    """Photographs and matches of COLMAP's database before verification.
-
-    Attributes:
-        ids: Of the photographs in the database, in the order of their names.
-    """
+    """Photographs and matches of COLMAP's database before verification."""
 
     ids: tuple[int, ...]
     cameras: tuple[Any, ...]

@@ -49,6 +49,15 @@ class SparseModel(Record):
         shape = len(self.points_world), self.num_views
         return pairs_table(self.observation_point, self.observation_view, shape)
 
+    def with_points(self, other: "SparseModel") -> "SparseModel":
+        """Take points and observations from a model of the same views."""
+        return self.replace(
+            points_world=other.points_world,
+            observation_point=other.observation_point,
+            observation_view=other.observation_view,
+            observation_pixels=other.observation_pixels,
+        )
+
     def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
         """Leave observations out, and points that fewer than two views see then."""
         kept = self.replace(
@@ -61,9 +70,6 @@ class SparseModel(Record):
 
 def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     """Keep some views of a model, in the order given, and the points that two of them see.
-
-    Args:
-        chosen: Indices into the model's views, without repetition.
 
     Returns:
         Points in their old order. Observations are sorted by point, then view.
@@ -94,11 +100,7 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
 
 
 def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
-    """Drop views that see too few points for their pose to be trusted, until none is left.
-
-    Args:
-        fewest: Points that a view must see.
-    """
+    """Drop views that see too few points for their pose to be trusted, until none is left."""
     while model.num_views:
         seen = torch.bincount(model.observation_view, minlength=model.num_views)
         strong = torch.nonzero(seen >= fewest)[:, 0].tolist()

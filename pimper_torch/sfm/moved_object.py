@@ -92,8 +92,6 @@ def find_moved_object(
     Args:
         verified: Matches of each pair that its geometry explains.
         outside: Matches of the same pairs that it does not.
-        max_error_px: Distance from the epipolar line up to which a match is verified.
-        fewest: Matches below which a pair does not count.
     """
     whole = MovedObject(series=torch.zeros(len(keypoints), dtype=torch.long))
     many = {pair: rows for pair, rows in outside.items() if len(rows) >= _MIN_SECOND}
@@ -307,7 +305,6 @@ def series_in(
     share; a view or two of which nothing is known are a group of their own.
 
     Args:
-        model: In the object's frame; of all photographs or some.
         around: Matches of the surroundings, with numbers of photographs.
     """
     view_of = {names.index(name): view for view, name in enumerate(model.names)}

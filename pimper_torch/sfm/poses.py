@@ -53,11 +53,7 @@ def pictures_of_poses(views: Views) -> Views:
 
 
 def of_photographs(model: SparseModel, views: Views) -> SparseModel:
-    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses.
-
-    Returns:
-        In the order of the photographs; each observes what the picture of its pose does.
-    """
+    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses."""
     if views.poses is None:
         return model
     place = {name: index for index, name in enumerate(model.names)}

@@ -35,11 +35,7 @@ Descriptors = Float[Tensor, "feature length"]
 
 
 def pairs_to_match(space: Workspace) -> list[PhotographPair]:
-    """List all pairs of a small set; of a larger, those of each photograph with those most like it.
-
-    Args:
-        space: With features. Those of one photograph are in memory at a time.
-    """
+    """List all pairs of a small set; of a larger, each photograph with those most like it."""
     if len(space.files) <= MOST_PAIRED:
         return all_pairs(len(space.files))
     with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
@@ -55,11 +51,7 @@ def pairs_to_match(space: Workspace) -> list[PhotographPair]:
 def global_descriptors(
     descriptors: Callable[[int], Descriptors], count: int
 ) -> Float[Tensor, "photograph word_length"]:
-    """Return a vector of length 1 for each photograph; 0 for one without features.
-
-    Args:
-        descriptors: Of the features of a photograph, by its number.
-    """
+    """Return a vector of length 1 for each photograph; 0 for one without features."""
     each = -(-40_000 // count)
     learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
     words = vocabulary(learned, _WORDS)

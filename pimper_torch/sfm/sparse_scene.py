@@ -22,10 +22,6 @@ from pimper_torch.sfm.undistort import undistort, with_undistorted_priors
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
     """Undistort the registered photographs and priors, and put them beside cameras and cloud.
 
-    Args:
-        views: All photographs, in any order.
-        model: Its names are among theirs, and its lenses have their sizes.
-
     Returns:
         Views in the model's order. Device and dtype are those of the photographs. A model far from
         its origin, such as a georeferenced one, is shifted, see ``SparseScene.offset_world``.
@@ -131,10 +127,6 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     The cameras are the photographs' own lenses, not the pinholes, and the observations are
     where they were made: the model belongs to the photographs as they were loaded, and
     reading it back with them gives the same scene.
-
-    Args:
-        folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
-            installed COLMAP writes; made if it does not exist.
     """
     model = model_of_scene(scene).replace(lenses=scene.lenses)
     colmap.write_binary(model, point_colors(scene), folder)

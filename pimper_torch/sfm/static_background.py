@@ -98,9 +98,6 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
     Args:
         database: With features, matches and verified pairs. Where nothing is at rest it stays
             as it is.
-
-    Returns:
-        What was found, with the former features in the order of the photographs' names.
     """
     verified: dict[tuple[int, int], Any] = {}
     with quiet(), loaded().Database.open(database) as stored:
@@ -176,12 +173,6 @@ def find_static_background(
     where more says so, unless one geometry explains still and moving matches together: then
     the scene is rigid and all its features stay. Pairs of identical photographs have no moving
     matches and do not vote.
-
-    Args:
-        verify: Called for moving matches only.
-        still_px: Distance between the features of a still match, less than.
-        max_error_px: Sampson error above which a match violates a geometry.
-        fewest: Matches below which a pair does not vote.
     """
     votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
     num_moving = num_violating = moving_pairs = 0

@@ -60,12 +60,7 @@ class Tangents(Record):
 def tangents(
     points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
 ) -> Tangents:
-    """Lay a plane through every point and choose the views to look for it in.
-
-    Args:
-        observed: Which views see which points, every point in one at least.
-        cameras: In float64, like the points.
-    """
+    """Lay a plane through every point and choose the views to look for it in."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
     points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
     towards = [_towards(some, by, cameras) for some, by in zip(points, seen, strict=True)]
@@ -180,7 +175,6 @@ def log_pictures(
     """Take logarithms of photographs one by one, so that no others are held.
 
     Args:
-        photographs: Radiance, channels first, and where it is valid; of any sizes.
         raster: How many there are, and the height and width that they are padded to.
 
     Returns:
@@ -203,11 +197,7 @@ def log_pictures(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class TrackObservations(Record):
-    """Where views show points.
-
-    Attributes:
-        pixels: Where, in the undistorted photograph.
-    """
+    """Where views show points."""
 
     point: Int[Tensor, " sighting"]
     view: Int[Tensor, " sighting"]
@@ -259,10 +249,6 @@ def sight(
 
     A point's place in its reference view is where the cameras put it: there the template is
     taken. In the other views it is where the same patch is found.
-
-    Args:
-        max_shift_px: From where the cameras put a point.
-        at_once: Points whose templates are in memory together.
 
     Returns:
         Sorted by point, then view; the reference's own is there where another view found

@@ -68,9 +68,6 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
         found, which a :class:`~pimper_torch.errors.PimperWarning` says.
-
-    Raises:
-        InputError: Cameras and photographs do not belong together.
     """
     if too_small(views) and ways.plain:
         _tell_nothing(0, where)
@@ -89,16 +86,22 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
-        found = _triangulated(space, local, settings.seed)
+        found = local.with_points(_triangulated(space, local, settings.seed))
     release_memory()
     if len(found.points_world):
         found = refine_tracks(views, found, settings.track_iterations, cameras=False)
     points = found.points_world + found.points_world.new_tensor(offset)
-    found = _with_cameras_of(given, found.replace(points_world=points))
+    found = given.with_points(found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
         _tell_nothing(len(found.points_world), where)
         return given
-    _tell(found, where)
+    caution(
+        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
+        "were triangulated from the photographs with the cameras held fixed, observed "
+        f"{len(found.observation_point):,} times; median reprojection error "
+        f"{float(observation_errors(found).median()):.2f} px.",
+        stacklevel=3,
+    )
     return found
 
 
@@ -122,7 +125,7 @@ def _match_along_lines(
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px, planar=False)
+            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px)
             found = guided_matches(first, second, near, settings.max_ratio)
             ends = VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
@@ -158,7 +161,7 @@ def _pairs(
 
 
 def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
-    """Let COLMAP triangulate the matches in the database; names and cameras are the model's."""
+    """Let COLMAP triangulate the matches in the database."""
     pycolmap = loaded()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -185,26 +188,7 @@ def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseMode
         found = pycolmap.triangulate_points(
             cameras, space.database, space.images, output, True, options
         )
-    return _with_cameras_of(model, model_of(found))
-
-
-def _with_cameras_of(given: SparseModel, found: SparseModel) -> SparseModel:
-    return found.replace(
-        names=given.names,
-        lenses=given.lenses,
-        cam_from_world=given.cam_from_world,
-        background_from_view=given.background_from_view,
-    )
-
-
-def _tell(found: SparseModel, where: str) -> None:
-    caution(
-        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
-        "were triangulated from the photographs with the cameras held fixed, observed "
-        f"{len(found.observation_point):,} times; median reprojection error "
-        f"{float(observation_errors(found).median()):.2f} px.",
-        stacklevel=4,
-    )
+    return model_of(found)
 
 
 def _tell_nothing(count: int, where: str) -> None:

@@ -34,9 +34,6 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 
     The pinholes are those of :func:`pinhole_for`, of the photographs' sizes.
 
-    Args:
-        views: Any; padding stays zero.
-
     Returns:
         The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
         and false in the masks, which come to be for that; where there are none and nothing
@@ -62,11 +59,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 def undistorted(
     views: Views, lenses: tuple[Lens, ...]
 ) -> Iterator[tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]]:
-    """Undistort photographs one by one, as :func:`undistort` does, without padding.
-
-    Yields:
-        Radiance, and where it is valid.
-    """
+    """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     alike = len(set(lenses)) == 1
     shared = source_grid(lenses[0], like=views.images) if alike else None
 

@@ -49,7 +49,6 @@ def choose_way(
     Args:
         verified: Matches that an epipolar geometry of their own explains.
         max_error_px: Distance from epipolar lines that is not told from a larger one.
-        where: The cameras are, for messages.
 
     Raises:
         InputError: None explains enough, or nothing tells which crop does.

@@ -50,9 +50,6 @@ def compare_with_scene(
     Returns:
         Figures, as far as they are known: median distance of points whose rays meet the mesh in per
         cent of its diagonal, the fraction of these on it, overlap with masks, number of such rays.
-
-    Raises:
-        InputError: Next to nothing fits.
     """
     fit = _fit(mesh, _rays(scene, silhouettes))
     frame = "in the frame of the cameras, with their axes and their unit"
@@ -81,7 +78,6 @@ class _Fit(NamedTuple):
     """Agreement of a mesh with photographs; NaN for what nothing tells.
 
     Attributes:
-        rays: To observed points.
         hits: Of these, the ones that meet the mesh.
         on_mesh: Fraction of the hits whose point is on it.
         overlap: Of its silhouettes with the masks, intersection over union.

@@ -63,9 +63,6 @@ def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
     Pictures are the photographs as they stand, then as their files store them; without repetition,
     and none where no resize leads to a photograph's shape.
 
-    Args:
-        model: Its views are the photographs, in their order.
-
     Raises:
         InputError: A shape tells a quarter turn, and EXIF does not tell which.
     """
@@ -101,7 +98,6 @@ def choose_turned(ways: Sequence[SparseModel], views: Views, where: str) -> Spar
 
     Args:
         ways: One or two models in the pixels of the photographs, which differ in turns alone.
-        where: The model is, for messages, as a sentence starts.
     """
     scores = [correlations(longest_tracks(model, 40), views) for model in ways]
     best = len(ways) - 1 if surely_better(scores[-1][0][0], scores[0][0][0]) else 0
@@ -146,7 +142,6 @@ def points_tell(
     """Return how well photographs agree round the points; 0 where they agree as well beside them.
 
     Args:
-        model: In the pixels of the photographs.
         changed: Numbers of those whose place is in question.
         reaches_px: How far they are shifted for comparison, one distance after the other.
     """
@@ -306,10 +301,6 @@ def squares_in(
     sides: Float[Tensor, "*#way observation 2 2"],
 ) -> Float[Tensor, "*way observation sample"]:
     """Sample squares along two sides, without their mean and with unit length.
-
-    Args:
-        centers: Pixels of the picture.
-        sides: In its pixels.
 
     Returns:
         Float32; zero where a square reaches beyond the picture or shows nothing.
