@@ -74,10 +74,6 @@ CAMERA_MODELS = (
 )
 """COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
 
-# A ray 40 degrees off the axis, where every fisheye is a tenth or more off a pinhole.
-_OBLIQUE = np.array([[0.7, 0.5, 1.0]])
-_SAME = 1e-9  # of a pixel's coordinate: rounding in double precision
-
 
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, text or binary.
@@ -120,15 +116,10 @@ def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
 def is_pinhole(lens: Lens) -> bool:
     """Return whether the lens images straight lines as straight lines.
 
-    COLMAP calls a lens undistorted whose coefficients are all zero. Of a fisheye that is the
-    equidistant one, ``r = f theta``: an oblique ray tells it from a pinhole.
+    COLMAP calls a lens undistorted whose coefficients are all zero; of a fisheye that is the
+    equidistant one, ``r = f theta``.
     """
-    camera = _camera_of(lens)
-    if not bool(camera.is_undistorted()):
-        return False
-    pixel = np.asarray(camera.img_from_cam(_OBLIQUE), dtype=np.float64).reshape(2)
-    straight = (camera.calibration_matrix() @ _OBLIQUE[0])[:2]
-    return bool(np.abs(pixel - straight).max() <= _SAME * np.abs(straight).max())
+    return "FISHEYE" not in lens.model and bool(_camera_of(lens).is_undistorted())
 
 
 def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 2"]:
@@ -146,7 +137,7 @@ def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 
 
 
 def undistort_pixels(lens: Lens, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
-    """Undo :func:`distort`: give ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel."""
+    """Return ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel, as :func:`distort`."""
     columns = np.ascontiguousarray(pixels.detach().cpu().double().numpy())
     found = np.array(_camera_of(lens).cam_from_img(columns), dtype=np.float64).reshape(-1, 2)
     return torch.from_numpy(found).to(pixels)
@@ -156,13 +147,7 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
     """Follow a resize of the photograph."""
     camera = _camera_of(lens)
     camera.rescale(width, height)
-    return Lens(
-        camera=lens.camera,
-        model=lens.model,
-        params=tuple(float(value) for value in camera.params),
-        width=width,
-        height=height,
-    )
+    return _lens_of(camera)
 
 
 def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded

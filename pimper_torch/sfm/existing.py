@@ -1,6 +1,7 @@
 """A COLMAP model, or a file of cameras, that the photographs come with."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -59,7 +60,10 @@ def existing_ways(views: Views, path: Path) -> Ways:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    sizes = _whole_sizes(shown, model)
+    sizes = []  # before photographs were shrunk on reading, as the pictures lie
+    for view, lens in enumerate(model.lenses):
+        wide, high = _stored_size(shown, view)
+        sizes.append(turned_size(wide, high, int((wide > high) != (lens.width > lens.height))))
     changed = changed_views(model, sizes)
     plain, cropped = (
         [follow_pictures(one, shown, way) for one in models for way in possible_turns(one, shown)]
@@ -145,11 +149,8 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
 
 
 def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
-    """Return the sizes of photographs in their files, which others' programs count pixels of.
-
-    Where there is no such file, those that they were read at.
-    """
-    where = f"The file of cameras {path}"
+    """Return the sizes of photographs in their files, which others' programs count pixels of."""
+    where = place(path)
     found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
     sizes: list[tuple[int, int] | None] = [None] * len(names)
     for view, camera in enumerate(found):
@@ -159,25 +160,14 @@ def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[
 
 
 def _stored_size(views: Views, view: int) -> tuple[int, int]:
+    """Return a photograph's size in its file; that which it was read at where there is none."""
     width, height = (int(side) for side in views.sizes_px[view])
-    if not views.folder:
-        return width, height
-    try:
-        with Image.open(Path(views.folder) / views.names[view]) as picture:
-            # In camera raw it may be the preview.
-            return picture.size if max(picture.size) >= max(width, height) else (width, height)
-    except (OSError, ValueError, Image.DecompressionBombError):
-        return width, height
-
-
-def _whole_sizes(views: Views, model: SparseModel) -> list[tuple[int, int]]:
-    """Return the sizes of photographs before they were shrunk on reading, as the pictures lie."""
-    sizes = []
-    for view, lens in enumerate(model.lenses):
-        whole = _stored_size(views, view)
-        across = (whole[0] > whole[1]) != (lens.width > lens.height)
-        sizes.append(turned_size(*whole, int(across)))
-    return sizes
+    with suppress(OSError, ValueError, Image.DecompressionBombError):
+        if views.folder:
+            with Image.open(Path(views.folder) / views.names[view]) as picture:
+                if max(picture.size) >= max(width, height):  # in camera raw it may be the preview
+                    return picture.size
+    return width, height
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:

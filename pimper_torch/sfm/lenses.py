@@ -131,10 +131,6 @@ def turned_views(views: Views, quarters: Sequence[int]) -> Views:
     )
 
 
-SAME_FOCAL = 0.02
-"""Relative difference of focal lengths that EXIF rounds; a choice."""
-
-
 def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -> list[int]:
     """Group photographs by size and focal length; either side up is one size.
 
@@ -154,8 +150,8 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
     known: dict[tuple[int, int], list[float]] = {}
     told = [one for one in zip(focals_px, shapes, strict=True) if not math.isnan(one[0])]
     for focal, shape in sorted(told):
-        starts = known.setdefault(shape, [])
-        if not (starts and focal <= (1 + SAME_FOCAL) * starts[-1]):
+        starts = known.setdefault(shape, [])  # EXIF rounds by less than 2 %
+        if not (starts and focal <= 1.02 * starts[-1]):
             starts.append(focal)
     numbers: dict[tuple[object, ...], int] = {}
     groups = []
