@@ -32,7 +32,7 @@ from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry import factorize as factorization
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
-from pimper_torch.sfm.sound_views import sound
+from pimper_torch.sfm.sparse_scene import sound
 from pimper_torch.silhouettes.find import FindSilhouettes
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.stage import Given

@@ -6,7 +6,7 @@ import torch
 
 from pimper_torch.config import require
 from pimper_torch.records import SparseScene
-from pimper_torch.sfm.sound_views import with_views
+from pimper_torch.sfm.sparse_scene import with_views
 
 # As many as a surface needs, as everywhere.
 _MIN_VIEWS = 3

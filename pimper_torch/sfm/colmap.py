@@ -200,7 +200,7 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
     )
 
 
-def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
+def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see _camera_of
     """Make COLMAP's own model; its ids keep the order of views and points."""
     pycolmap = loaded()
 
@@ -221,7 +221,8 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> A
     starts = np.searchsorted(
         model.observation_point.numpy()[order], np.arange(len(model.points_world) + 1)
     )
-    rgb = colors.cpu().numpy()
+    black = torch.zeros(len(model.points_world), 3, dtype=torch.uint8)
+    rgb = (black if colors is None else colors.cpu()).numpy()
     for index, xyz in enumerate(model.points_world.numpy()):
         track = pycolmap.Track()
         for observation in order[starts[index] : starts[index + 1]]:
@@ -267,3 +268,48 @@ def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
     total = total.index_add(0, model.observation_point, observation_errors(model))
     count = torch.bincount(model.observation_point, minlength=len(total))
     return total / count.clamp_min(1)
+
+
+def bundle(
+    model: SparseModel,
+    scale_px: float,
+    *,
+    cameras: bool = True,
+    tolerance: float = 1e-6,
+) -> SparseModel:
+    """Adjust poses, lenses and points to the observations, robustly.
+
+    Principal points stay; focal lengths and distortions are adjusted, one set a lens. On one
+    thread, so that the same observations give the same bits.
+
+    Args:
+        scale_px: Residual at which Cauchy's weight is a half.
+
+    Returns:
+        Views, points and observations in their old order.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale_px
+    options.ceres.solver_options.max_num_iterations = 100
+    options.ceres.solver_options.function_tolerance = tolerance
+    options.ceres.solver_options.num_threads = 1
+    with quiet():
+        reconstruction = reconstruction_of(model)
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            config.add_image(image_id)
+            if not cameras:
+                image = reconstruction.image(image_id)
+                config.set_constant_rig_from_world_pose(image.frame_id)
+                config.set_constant_cam_intrinsics(image.camera_id)
+        if cameras:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    return model_of(reconstruction).replace(
+        background_from_view=model.background_from_view, series=model.series
+    )

@@ -25,9 +25,8 @@ from pimper_torch.errors import ReconstructionError, some
 from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.sfm.camera_in_place import picture_centre, references, tied_to
-from pimper_torch.sfm.colmap import observation_errors
+from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.epipolar import match_errors
-from pimper_torch.sfm.mapping import bundle
 from pimper_torch.sfm.matching import MOST_PAIRED, VerifiedPair
 from pimper_torch.sfm.model import SparseModel, longest_tracks, select_views
 

@@ -16,7 +16,7 @@ from pimper_torch.errors import InputError, some
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.sound_views import with_views
+from pimper_torch.sfm.sparse_scene import with_views
 
 
 def pictures_of_poses(views: Views) -> Views:

@@ -8,8 +8,7 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.colmap import observation_errors
-from pimper_torch.sfm.mapping import bundle
+from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS
 from pimper_torch.sfm.track_observations import (

@@ -181,7 +181,7 @@ def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseMode
         observation_pixels=model.observation_pixels[:0],
     )
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
-        cameras = reconstruction_of(bare, torch.zeros(0, 3, dtype=torch.uint8))
+        cameras = reconstruction_of(bare)
         with pycolmap.Database.open(space.database) as stored:
             for camera in cameras.cameras.values():
                 stored.update_camera(camera)

@@ -6,6 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.records import Views
+from pimper_torch.sfm.colmap import bundle
 from pimper_torch.sfm.doubt import doubt_one_lens
 from pimper_torch.sfm.lenses import (
     choose_lenses,
@@ -15,7 +16,6 @@ from pimper_torch.sfm.lenses import (
     turned_views,
     turning,
 )
-from pimper_torch.sfm.mapping import bundle
 from pimper_torch.sfm.reconstruct import structure_from_motion
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.ball import (

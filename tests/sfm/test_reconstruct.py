@@ -16,7 +16,7 @@ from pimper_torch.errors import (
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.progress import listening
 from pimper_torch.records import Views
-from pimper_torch.sfm import mapping, registration, retrieval, track_observations
+from pimper_torch.sfm import registration, retrieval, track_observations
 from pimper_torch.sfm.features import workspace
 from pimper_torch.sfm.reconstruct import Reconstruct, structure_from_motion
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
@@ -215,7 +215,7 @@ def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
 def test_the_same_photographs_give_the_same_bits_on_any_number_of_threads(small, monkeypatch):
     from pimper_torch.io.photographs import load_views
 
-    for module in (retrieval, mapping, track_observations, registration):
+    for module in (retrieval, track_observations, registration):
         monkeypatch.setattr(module, "MOST_PAIRED", small)
     monkeypatch.setattr(retrieval, "_NEIGHBOURS", 3)
     views = load_views(str(files("pimper_torch").joinpath("data/skull")), max_size_px=600)
