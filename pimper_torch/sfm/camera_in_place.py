@@ -21,7 +21,7 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.sfm.matching import Keypoints, Pair
+from pimper_torch.sfm.matching import Keypoints, Matches, pixels_of
 
 # Fraction of the photographs that must be tied to the reference. Before rooms that shift all of 20
 # are (6 rendered turntables); of the skull's 24, round which a camera moves, 8 at most.
@@ -33,7 +33,7 @@ Ends = tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]
 
 def reference_from_photographs(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Matches,
     *,
     max_error_px: float,
     fewest: int,
@@ -75,7 +75,7 @@ def reference_from_photographs(
     return tuple(best.get(view, identity) for view in range(count))
 
 
-def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float) -> float:
+def still_length_px(keypoints: Keypoints, pairs: Matches, least_px: float) -> float:
     """Return the length up to which a match is still, between photographs mapped to one of them.
 
     A tripod that was touched has moved by a little, too, and things at other depths than most of
@@ -85,11 +85,7 @@ def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float
     found; with 2 px 69 %.
     """
     lengths = torch.cat(
-        [
-            (keypoints[pair.first][first] - keypoints[pair.second][second]).norm(dim=1)
-            for pair in pairs
-            for first, second in [pair.matches.unbind(dim=1)]
-        ]
+        [torch.sub(*pixels_of(keypoints, pair, rows)).norm(dim=1) for pair, rows in pairs.items()]
     )
     short = lengths[lengths < 10]
     if len(short) == 0:
@@ -232,13 +228,11 @@ def _similarity(scale: Complex[Tensor, ""], shift: Complex[Tensor, ""]) -> Float
     return torch.stack([a, -b, right, b, a, down, none, none, none + 1]).reshape(3, 3)
 
 
-def both_ways(keypoints: Keypoints, pairs: Sequence[Pair]) -> list[dict[int, Ends]]:
+def both_ways(keypoints: Keypoints, pairs: Matches) -> list[dict[int, Ends]]:
     """List, for each photograph, the matches with each other one: pixels here and there."""
     found: list[dict[int, Ends]] = [{} for _ in keypoints]
-    for pair in pairs:
-        if len(pair.matches):
-            first, second = pair.matches.unbind(dim=1)
-            ends = keypoints[pair.first][first], keypoints[pair.second][second]
-            found[pair.first][pair.second] = ends
-            found[pair.second][pair.first] = ends[1], ends[0]
+    for (first, second), rows in pairs.items():
+        if len(rows):
+            ends = pixels_of(keypoints, (first, second), rows)
+            found[first][second], found[second][first] = ends, ends[::-1]
     return found

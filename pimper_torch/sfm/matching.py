@@ -2,8 +2,8 @@
 
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +26,13 @@ MOST_PAIRED = 66
 
 PhotographPair = tuple[int, int]
 """Numbers of two photographs, the lower one first."""
+Keypoints = Sequence[Float[Tensor, "_ 2"]]
+"""Pixels of features, photograph by photograph."""
+Rows = Int[Tensor, "match 2"]
+"""A feature of the first photograph and one of the second in each row."""
+Matches = Mapping[PhotographPair, Rows]
+Verify = Callable[[Matches], Matches]
+"""Those of each pair's matches that one epipolar geometry explains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -246,22 +253,6 @@ def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolm
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pair(Record):
-    """Matched features of two photographs.
-
-    Attributes:
-        matches: A feature of the first and one of the second in each row.
-    """
-
-    first: int
-    second: int
-    matches: Int[Tensor, "match 2"]
-
-
-Keypoints = Sequence[Float[Tensor, "_ 2"]]  # one length a photograph
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
     """Photographs and matches of COLMAP's database before verification."""
@@ -269,7 +260,7 @@ class Matched:
     ids: tuple[int, ...]
     cameras: tuple[Any, ...]
     keypoints: Keypoints
-    pairs: tuple[Pair, ...]
+    pairs: Matches
 
 
 def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
@@ -279,10 +270,10 @@ def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no type
     images = sorted(stored.read_all_images(), key=lambda image: image.name)
     number = {image.image_id: index for index, image in enumerate(images)}
     cameras = {camera.camera_id: camera for camera in stored.read_all_cameras()}
-    pairs = []
+    pairs = {}
     for pair_id, rows in zip(*stored.read_all_matches(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        pairs.append(Pair(first=number[first], second=number[second], matches=indices(rows)))
+        pairs[number[first], number[second]] = indices(rows)
     return Matched(
         ids=tuple(image.image_id for image in images),
         cameras=tuple(cameras[image.camera_id] for image in images),
@@ -290,54 +281,81 @@ def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no type
             torch.from_numpy(np.array(stored.read_keypoints(image.image_id))[:, :2].copy())
             for image in images
         ],
-        pairs=tuple(pairs),
+        pairs=pairs,
     )
 
 
-def verified_again(
-    matched: Matched, pairs: Sequence[Pair], settings: ReconstructConfig
-) -> list[Any]:
-    """Find COLMAP's geometries of some of the matches of pairs, side by side.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verifier:
+    """COLMAP's verification of some of the matches of pairs, side by side.
 
-    In a database of their own: COLMAP's function for one pair would hold Python's lock.
+    In a database of its own: COLMAP's function for one pair would hold Python's lock.
+
+    Attributes:
+        geometries: Those that were found.
     """
-    pycolmap = loaded()
 
-    ids = [(matched.ids[pair.first], matched.ids[pair.second]) for pair in pairs]
-    options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = MIN_MATCHES
-    options.ransac.max_error = settings.max_error_px
-    options.ransac.random_seed = settings.seed
-    # Enough where half of the matches are right. COLMAP's own 10,000 take 0.1 s in each pair whose
-    # moving matches are wrong, and on a turntable those are most.
-    options.ransac.max_num_trials = 1000
-    verifying = pycolmap.GeometricVerifierOptions()
-    verifying.num_threads = settings.num_threads
-    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
-        path = Path(folder) / "pairs.db"
-        with pycolmap.Database.open(path) as stored:
-            for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
-                stored.write_camera(camera, use_camera_id=True)
-            views = zip(matched.ids, matched.cameras, matched.keypoints, strict=True)
-            for image, camera, pixels in views:
-                known = pycolmap.Image(name=str(image), camera_id=camera.camera_id, image_id=image)
-                stored.write_image(known, use_image_id=True)
-                stored.write_keypoints(image, pixels.numpy())
-            for ends, pair in zip(ids, pairs, strict=True):
-                stored.write_matches(*ends, pair.matches.numpy().astype(np.uint32))
-        pycolmap.geometric_verification(path, verifying, two_view_geometry_options=options)
-        with pycolmap.Database.open(path) as stored:
-            return [stored.read_two_view_geometry(*ends) for ends in ids]
+    matched: Matched
+    settings: ReconstructConfig
+    geometries: dict[PhotographPair, Any] = field(default_factory=dict)
+
+    def __call__(self, pairs: Matches) -> dict[PhotographPair, Rows]:
+        """Return the matches that are verified."""
+        pycolmap, matched, settings = loaded(), self.matched, self.settings
+        options = pycolmap.TwoViewGeometryOptions()
+        options.min_num_inliers = MIN_MATCHES
+        options.ransac.max_error = settings.max_error_px
+        options.ransac.random_seed = settings.seed
+        # Enough where half of the matches are right. COLMAP's own 10,000 take 0.1 s in each pair
+        # whose moving matches are wrong, and on a turntable those are most.
+        options.ransac.max_num_trials = 1000
+        verifying = pycolmap.GeometricVerifierOptions()
+        verifying.num_threads = settings.num_threads
+        ids = {pair: tuple(matched.ids[view] for view in pair) for pair in pairs}
+        with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+            path = Path(folder) / "pairs.db"
+            with pycolmap.Database.open(path) as stored:
+                for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
+                    stored.write_camera(camera, use_camera_id=True)
+                views = zip(matched.ids, matched.cameras, matched.keypoints, strict=True)
+                for image, camera, pixels in views:
+                    known = pycolmap.Image(
+                        name=str(image), camera_id=camera.camera_id, image_id=image
+                    )
+                    stored.write_image(known, use_image_id=True)
+                    stored.write_keypoints(image, pixels.numpy())
+                for pair, rows in pairs.items():
+                    stored.write_matches(*ids[pair], rows.numpy().astype(np.uint32))
+            pycolmap.geometric_verification(path, verifying, two_view_geometry_options=options)
+            with pycolmap.Database.open(path) as stored:
+                found = {pair: stored.read_two_view_geometry(*ids[pair]) for pair in pairs}
+        self.geometries.update(found)
+        return {pair: indices(geometry.inlier_matches) for pair, geometry in found.items()}
 
 
-def read_geometries(stored: Any) -> dict[tuple[int, int], Any]:  # noqa: ANN401 - see read_matched
-    """Read the geometries of verified pairs, by the numbers of their images."""
-    pycolmap = loaded()
+def read_geometries(stored: Any, matched: Matched) -> dict[PhotographPair, Any]:  # noqa: ANN401
+    """Read the geometries of verified pairs."""
+    number = {image: index for index, image in enumerate(matched.ids)}
+    found = {}
+    for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True):
+        first, second = loaded().pair_id_to_image_pair(pair_id)
+        found[number[first], number[second]] = geometry
+    return found
 
-    return {
-        tuple(pycolmap.pair_id_to_image_pair(pair_id)): geometry
-        for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True)
-    }
+
+def pixels_of(
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows
+) -> tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]:
+    """Return the pixels of a pair's matches in both photographs."""
+    return keypoints[pair[0]][rows[:, 0]], keypoints[pair[1]][rows[:, 1]]
+
+
+def add_votes(
+    votes: Sequence[Tensor], pair: PhotographPair, rows: Rows, cast: Float[Tensor, "match 2"]
+) -> None:
+    """Add to the votes of both ends of matches, in place."""
+    for side, view in enumerate(pair):
+        votes[view].index_add_(0, rows[:, side], cast[:, side].to(votes[view]))
 
 
 def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_matched

@@ -245,7 +245,7 @@ def _text_images(data: bytes) -> tuple[FileImage, ...]:
 
 
 def _text_points(data: bytes) -> FilePoints:
-    def point(line: str, _: Lines) -> tuple[int, list[float], np.ndarray]:
+    def point(line: str, _lines: Lines) -> tuple[int, list[float], np.ndarray]:
         number, x, y, z, _, _, _, _, *track = line.split()
         ends = np.array([int(word) for word in track], dtype=np.int64).reshape(-1, 2)
         return int(number), [float(x), float(y), float(z)], ends

@@ -7,10 +7,9 @@ of the surroundings, and which photographs cannot be of one series; between seri
 object's ties photographs together.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -21,17 +20,21 @@ from pimper_torch.ledger import leave_out
 from pimper_torch.records import Record
 from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.doubt import FEWEST_VIEWS, JOINING, agreement
-from pimper_torch.sfm.epipolar import Ends, sampson_errors, shared_geometry
+from pimper_torch.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.sfm.matching import (
     Keypoints,
-    Pair,
+    Matches,
     PhotographPair,
+    Rows,
     VerifiedPair,
+    Verifier,
+    Verify,
+    add_votes,
     among,
     indices,
+    pixels_of,
     read_geometries,
     read_matched,
-    verified_again,
 )
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
@@ -43,13 +46,6 @@ from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 _MIN_SECOND, _MIN_FRACTION = 30, 0.7
 # Matches beyond which a pair tells no more.
 _ENOUGH = 50
-
-
-Rows = Int[Tensor, "match 2"]
-
-
-Verify = Callable[[Mapping[PhotographPair, Rows]], Mapping[PhotographPair, Rows]]
-"""Those of each pair's matches that one epipolar geometry explains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -65,9 +61,9 @@ class MovedObject(Record):
     """
 
     series: Int[Tensor, " view"]
-    tying: Mapping[PhotographPair, Rows] = field(default_factory=dict)
+    tying: Matches = field(default_factory=dict)
     dropped: tuple[PhotographPair, ...] = ()
-    around: Mapping[PhotographPair, Rows] = field(default_factory=dict)
+    around: Matches = field(default_factory=dict)
 
     @property
     def moved(self) -> bool:
@@ -78,8 +74,8 @@ class MovedObject(Record):
 def find_moved_object(
     keypoints: Keypoints,
     sizes_px: Float[Tensor, "view 2"],
-    verified: Mapping[PhotographPair, Rows],
-    outside: Mapping[PhotographPair, Rows],
+    verified: Matches,
+    outside: Matches,
     verify: Verify,
     *,
     max_error_px: float,
@@ -130,8 +126,8 @@ def find_moved_object(
 def object_votes(
     keypoints: Keypoints,
     sizes_px: Float[Tensor, "view 2"],
-    verified: Mapping[PhotographPair, Rows],
-    seconds: Mapping[PhotographPair, Rows],
+    verified: Matches,
+    seconds: Matches,
 ) -> list[Float[Tensor, " _"]]:
     """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
@@ -149,21 +145,21 @@ def object_votes(
             means = [_total(votes, pair, rows).mean() for rows in sets]
             first = 1.0 if means[0] > means[1] else -1.0
             for rows, sign in zip(sets, (first, -first), strict=True):
-                _add(cast, pair, rows, torch.full((len(rows), 2), sign))
+                add_votes(cast, pair, rows, torch.full((len(rows), 2), sign))
         votes = [one.sign() for one in cast]
     for _ in range(4):
         handed = [one.clone() for one in votes]
         for pair, rows in (*verified.items(), *seconds.items()):
             ends = [votes[view][rows[:, side]] for side, view in enumerate(pair)]
-            _add(handed, pair, rows, torch.stack(ends[::-1], dim=1))
+            add_votes(handed, pair, rows, torch.stack(ends[::-1], dim=1))
         votes = [one.sign() for one in handed]
     return votes
 
 
 def series_of(
     num_views: int,
-    verified: Mapping[PhotographPair, Rows],
-    seconds: Mapping[PhotographPair, Rows],
+    verified: Matches,
+    seconds: Matches,
     votes: Sequence[Float[Tensor, " _"]],
 ) -> Int[Tensor, " view"]:
     """Number the series of every photograph.
@@ -207,15 +203,9 @@ def _contradict(
     keypoints: Keypoints, pair: PhotographPair, first: Rows, second: Rows, max_error_px: float
 ) -> bool:
     """Return whether no geometry explains both sets of matches."""
-
-    def ends(rows: Rows) -> Ends:
-        return keypoints[pair[0]][rows[:, 0]], keypoints[pair[1]][rows[:, 1]]
-
-    shared = shared_geometry(ends(first), ends(second), max_error_px)
-    far = [
-        (sampson_errors(shared, *ends(rows)) > max_error_px).double().mean()
-        for rows in (first, second)
-    ]
+    ends = [pixels_of(keypoints, pair, rows) for rows in (first, second)]
+    shared = shared_geometry(*ends, max_error_px)
+    far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
     return float(torch.stack(far).amax()) > 0.2
 
 
@@ -230,13 +220,6 @@ def _counts(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> tuple[
     return int((total > 0).sum()), int((total < 0).sum())
 
 
-def _add(
-    votes: Sequence[Tensor], pair: PhotographPair, rows: Rows, cast: Float[Tensor, "match 2"]
-) -> None:
-    for side, view in enumerate(pair):
-        votes[view].index_add_(0, rows[:, side], cast[:, side].to(votes[view]))
-
-
 def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPair, ...]:
     """Find series between which the object was moved, and keep between them what is the object's.
 
@@ -249,49 +232,38 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPai
     """
     with quiet(), loaded().Database.open(database) as stored:
         matched = read_matched(stored)
-        number = {image: index for index, image in enumerate(matched.ids)}
         geometries = {
-            (number[first], number[second]): geometry
-            for (first, second), geometry in read_geometries(stored).items()
+            pair: geometry
+            for pair, geometry in read_geometries(stored, matched).items()
             if len(geometry.inlier_matches) >= MIN_MATCHES
         }
         verified = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
         outside = {
-            (pair.first, pair.second): pair.matches[
-                ~among(pair.matches, verified[pair.first, pair.second])
-            ]
-            for pair in matched.pairs
-            if (pair.first, pair.second) in verified
+            pair: rows[~among(rows, verified[pair])]
+            for pair, rows in matched.pairs.items()
+            if pair in verified
         }
-        seconds: dict[PhotographPair, Any] = {}
-
-        def verify(rows_of: Mapping[PhotographPair, Rows]) -> dict[PhotographPair, Rows]:
-            pairs = [Pair(first=a, second=b, matches=rows) for (a, b), rows in rows_of.items()]
-            seconds.update(zip(rows_of, verified_again(matched, pairs, settings), strict=True))
-            return {pair: indices(seconds[pair].inlier_matches) for pair in rows_of}
-
+        verifier = Verifier(matched=matched, settings=settings)
         found = find_moved_object(
             matched.keypoints,
             torch.tensor([(one.width, one.height) for one in matched.cameras]).float(),
             verified,
             outside,
-            verify,
+            verifier,
             max_error_px=settings.max_error_px,
             fewest=MIN_MATCHES,
         )
         for pair, rows in found.tying.items():
             if not torch.equal(rows, verified[pair]):
                 ids = matched.ids[pair[0]], matched.ids[pair[1]]
-                stored.update_two_view_geometry(*ids, seconds[pair])
+                stored.update_two_view_geometry(*ids, verifier.geometries[pair])
         for pair in found.dropped:
             stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
     pixels = [one.double() for one in matched.keypoints]
+    ends = {pair: pixels_of(pixels, pair, rows) for pair, rows in found.around.items() if len(rows)}
     return tuple(
-        VerifiedPair(
-            views=pair, first=pixels[pair[0]][rows[:, 0]], second=pixels[pair[1]][rows[:, 1]]
-        )
-        for pair, rows in found.around.items()
-        if len(rows)
+        VerifiedPair(views=pair, first=first, second=second)
+        for pair, (first, second) in ends.items()
     )
 
 

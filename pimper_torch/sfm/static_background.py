@@ -11,14 +11,14 @@ pictures were cropped, it is at rest once photographs are mapped to one of them,
 :mod:`pimper_torch.sfm.camera_in_place`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ledger import leave_out
@@ -31,15 +31,20 @@ from pimper_torch.sfm.camera_in_place import (
     still_length_px,
 )
 from pimper_torch.sfm.colmap import loaded, quiet
-from pimper_torch.sfm.epipolar import Ends, sampson_errors, shared_geometry
+from pimper_torch.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.sfm.matching import (
     Keypoints,
     Matched,
-    Pair,
+    Matches,
+    PhotographPair,
+    Rows,
+    Verifier,
+    Verify,
+    add_votes,
     indices,
+    pixels_of,
     read_geometries,
     read_matched,
-    verified_again,
 )
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
@@ -86,10 +91,6 @@ class StaticBackground(Record):
         return self.still_fraction > 0.5 and self.moving_pairs == 0
 
 
-Verify = Callable[[Sequence[Pair]], Sequence[Int[Tensor, "match 2"]]]
-"""Those matches of each pair that one epipolar geometry explains."""
-
-
 def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackground:
     """Find what is at rest while something else moves, and keep features and matches of the latter.
 
@@ -99,29 +100,21 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
         database: With features, matches and verified pairs. Where nothing is at rest it stays
             as it is.
     """
-    verified: dict[tuple[int, int], Any] = {}
     with quiet(), loaded().Database.open(database) as stored:
         matched = read_matched(stored)
-
-        def verify(pairs: Sequence[Pair]) -> list[Int[Tensor, "match 2"]]:
-            geometries = verified_again(matched, pairs, settings)
-            ids = [(matched.ids[pair.first], matched.ids[pair.second]) for pair in pairs]
-            verified.update(zip(ids, geometries, strict=True))
-            return [indices(geometry.inlier_matches) for geometry in geometries]
-
+        verifier = Verifier(matched=matched, settings=settings)
         for maps, pixels, still_px in _ways(matched, settings):
             rest = find_static_background(
                 pixels,
                 matched.pairs,
-                verify,
+                verifier,
                 still_px=still_px,
                 max_error_px=settings.max_error_px,
                 fewest=MIN_MATCHES,
             )
             if rest.room:
-                _keep_moving(
-                    stored, matched, pixels, rest, still_px, read_geometries(stored) | verified
-                )
+                geometries = read_geometries(stored, matched) | verifier.geometries
+                _keep_moving(stored, matched, pixels, rest, still_px, geometries)
                 few = [int(one.sum()) < MIN_MATCHES for one in rest.features]
                 shown = [
                     torch.full_like(one, torch.nan) if lacks else one
@@ -159,7 +152,7 @@ def _ways(
 
 def find_static_background(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Matches,
     verify: Verify,
     *,
     still_px: float,
@@ -176,70 +169,54 @@ def find_static_background(
     """
     votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
     num_moving = num_violating = moving_pairs = 0
-    split = [_split(keypoints, pair, still_px) for pair in pairs]
-    shown = [min(len(one.matches) for one in both) for both in split]
-    order = sorted(range(len(pairs)), key=shown.__getitem__, reverse=True)
-    telling = [split[index] for index in order if shown[index] >= fewest]
+    split = {pair: _split(keypoints, pair, rows, still_px) for pair, rows in pairs.items()}
+    shown = {pair: min(map(len, both)) for pair, both in split.items()}
+    order = sorted(split, key=shown.__getitem__, reverse=True)
+    telling = [pair for pair in order if shown[pair] >= fewest]
     # The first pairs, which show most of both, must contradict one geometry: else no more are
     # verified.
     for start in track(range(0, len(telling), 24)):
         group = telling[start : start + 24]
-        verified = verify([moving for _, moving in group])
-        for (resting, moving), right in zip(group, verified, strict=True):
-            if len(right) < fewest:
+        for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
+            if len(moving) < fewest:
                 continue
-            moving = moving.replace(matches=right)
-            ends = _pixels(keypoints, moving)
-            geometry = shared_geometry(_pixels(keypoints, resting), ends, max_error_px)
+            resting = split[pair][0]
+            ends = pixels_of(keypoints, pair, moving)
+            geometry = shared_geometry(pixels_of(keypoints, pair, resting), ends, max_error_px)
             moving_pairs += 1
-            num_moving += len(moving.matches)
+            num_moving += len(moving)
             num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
-            _count(votes, resting, 1)
-            _count(votes, moving, -1)
+            add_votes(votes, pair, resting, torch.ones_like(resting))
+            add_votes(votes, pair, moving, -torch.ones_like(moving))
         if num_moving and num_violating <= _CONTRADICTION * num_moving:
             break
-    num_still = sum(len(still.matches) for still, _ in split)
+    num_still = sum(len(still) for still, _ in split.values())
     fraction = num_violating / max(num_moving, 1)
     return StaticBackground(
         features=tuple((one > 0) & (fraction > _CONTRADICTION) for one in votes),
-        still_fraction=num_still / max(sum(len(pair.matches) for pair in pairs), 1),
+        still_fraction=num_still / max(sum(map(len, pairs.values())), 1),
         moving_pairs=moving_pairs,
         violating_fraction=fraction,
     )
 
 
 def moving_matches(
-    keypoints: Keypoints, pair: Pair, rest: StaticBackground, still_px: float
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, rest: StaticBackground, still_px: float
 ) -> Bool[Tensor, " match"]:
     """Find matches that are neither still nor of a feature at rest."""
-    first, second = pair.matches.unbind(dim=1)
-    touched = rest.features[pair.first][first] | rest.features[pair.second][second]
-    return ~touched & ~is_still(keypoints, pair, still_px)
+    touched = rest.features[pair[0]][rows[:, 0]] | rest.features[pair[1]][rows[:, 1]]
+    first, second = pixels_of(keypoints, pair, rows)
+    return ~touched & ((first - second).norm(dim=-1) >= still_px)
 
 
-def is_still(keypoints: Keypoints, pair: Pair, still_px: float) -> Bool[Tensor, " match"]:
-    """Find matches whose features lie at the same pixel."""
-    first, second = _pixels(keypoints, pair)
-    return (first - second).norm(dim=-1) < still_px
-
-
-def _split(keypoints: Keypoints, pair: Pair, still_px: float) -> tuple[Pair, Pair]:
-    """Return a pair with its still matches, and with those that clearly move."""
-    first, second = _pixels(keypoints, pair)
+def _split(
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, still_px: float
+) -> tuple[Rows, Rows]:
+    """Return a pair's still matches, and those that clearly move."""
+    first, second = pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
     # Features at rest that were found less exactly are no evidence of motion.
-    still, moving = length < still_px, length >= 4 * still_px
-    return pair.replace(matches=pair.matches[still]), pair.replace(matches=pair.matches[moving])
-
-
-def _pixels(keypoints: Keypoints, pair: Pair) -> Ends:
-    first, second = pair.matches.unbind(dim=1)
-    return keypoints[pair.first][first], keypoints[pair.second][second]
-
-
-def _count(votes: list[Int[Tensor, " _"]], pair: Pair, weight: int) -> None:
-    for view, features in zip((pair.first, pair.second), pair.matches.unbind(dim=1), strict=True):
-        votes[view] = votes[view].index_add(0, features, torch.full_like(features, weight))
+    return rows[length < still_px], rows[length >= 4 * still_px]
 
 
 def _keep_moving(
@@ -248,7 +225,7 @@ def _keep_moving(
     pixels: Keypoints,
     rest: StaticBackground,
     still_px: float,
-    geometries: Mapping[tuple[int, int], Any],
+    geometries: Mapping[PhotographPair, Any],
 ) -> None:
     """Drop features at rest and their matches from the database."""
     described = [stored.read_descriptors(image) for image in matched.ids]
@@ -260,19 +237,19 @@ def _keep_moving(
         stored.write_descriptors(image, kept)
     number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
 
-    def moving(pair: Pair) -> np.ndarray:
-        first, second = pair.matches[moving_matches(pixels, pair, rest, still_px)].unbind(dim=1)
-        rows = torch.stack([number[pair.first][first], number[pair.second][second]], dim=1)
-        return rows.numpy().astype(np.uint32)
+    def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
+        rows = rows[moving_matches(pixels, pair, rows, rest, still_px)]
+        ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
+        return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 
     stored.clear_matches()
     stored.clear_two_view_geometries()
-    for pair in matched.pairs:
-        ids = matched.ids[pair.first], matched.ids[pair.second]
-        stored.write_matches(*ids, moving(pair))
-        if ids in geometries:
-            geometry = geometries[ids]
-            inliers = moving(pair.replace(matches=indices(geometry.inlier_matches)))
+    for pair, rows in matched.pairs.items():
+        ids = matched.ids[pair[0]], matched.ids[pair[1]]
+        stored.write_matches(*ids, moving(pair, rows))
+        if pair in geometries:
+            geometry = geometries[pair]
+            inliers = moving(pair, indices(geometry.inlier_matches))
             if len(inliers) >= MIN_MATCHES:
                 geometry.inlier_matches = inliers
                 stored.write_two_view_geometry(*ids, geometry)
