@@ -27,7 +27,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "sfm.one_lens": ("doubt", "a lens for each photograph fits better"),
     "sfm.missing": ("photographs", "not registered"),
     "sfm.doubt": ("doubt", "points tell no depth"),
-    "sfm.broken_images": ("photographs", "broken in the given model"),
     "sfm.broken_points": ("points", "broken in the given model"),
     "sfm.sound_points": ("points", "not finite"),
     "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),

@@ -263,63 +263,45 @@ _PARSERS = {
 
 
 def sound_model(files: FileModel, folder: Path) -> SparseModel:
-    """Keep what is sound, warn of the rest with its count; views and points by their numbers.
+    """Take views and points by their numbers.
 
-    Broken are cameras whose parameters are not finite or whose focal length is not above 0; images
-    of these, with a pose that is not finite or a quaternion that is none, or that stand twice;
-    points that are not finite; and observations that name an image or a feature that is not
-    there.
+    Points that are not finite, and observations that name an image or a feature that is not there,
+    are left out with a warning.
 
     Raises:
-        InputError: More than half of the images or points are broken.
+        InputError: An image stands in the model twice, or has a pose or a camera that is none; or
+            most points are not finite.
     """
-    lenses = {one.camera: one for one in files.cameras if _camera_fault(one) == ""}
-    kept, faults, seen = [], dict[str, list[str]](), set[object]()
-    for image in sorted(files.images, key=lambda one: one.image):
-        fault = _image_fault(image, files, lenses)
-        if not fault and not seen.isdisjoint({image.image, image.name}):
-            fault = "stand in it twice"
-        if fault:
-            faults.setdefault(fault, []).append(image.name)
-        else:
-            kept.append(image)
-            seen |= {image.image, image.name}
+    lenses = {camera.camera: camera for camera in files.cameras}
+    images = sorted(files.images, key=lambda image: image.image)
+    faults = [f"{image.name} has {fault}" for image in images if (fault := _fault(image, lenses))]
+    names = [image.name for image in images]
+    faults += [f"{name} stands in it twice" for name in sorted(set(names)) if names.count(name) > 1]
     points, order = files.points, np.argsort(files.points.points, kind="stable")
     finite = (np.abs(points.xyz) < _MAX_COORDINATE).all(axis=1)
-    dropped = [
-        f"{len(names)} of {len(files.images)} images ({some(names, 4)}), which {fault}"
-        for fault, names in faults.items()
-    ]
     nowhere = int((~finite).sum())
-    broken = [name for names in faults.values() for name in names]
-    leave_out("sfm.broken_images", len(broken), total=len(files.images), names=broken)
-    leave_out("sfm.broken_points", nowhere, total=len(finite))
-    if nowhere:
-        dropped.append(f"{nowhere} of {len(finite)} points, whose coordinates are not finite")
-    broken_images = 2 * len(kept) < len(files.images)
-    if broken_images or 2 * nowhere > len(finite):
+    if 2 * nowhere > len(finite):
+        faults.append(f"{nowhere} of {len(finite)} points are not finite")
+    if faults:
         raise InputError(
-            f"The COLMAP model in {folder} is broken: unusable are {'; '.join(dropped)}. Needed: a "
-            "model of which at least half is sound. Write it again, or leave it out to run "
-            "structure from motion."
+            f"The COLMAP model in {folder} is broken: {some(faults, 4)}. Write it again, or leave "
+            "it out to run structure from motion."
         )
     used = order[finite[order]]
     new_point = np.full(len(finite), -1)
     new_point[used] = np.arange(len(used))
-    observations, lost = _observations(files, kept, new_point)
-    if lost:
-        total = int((new_point[points.track_point] >= 0).sum())
-        dropped.append(f"{lost} of {total} observations, which name no feature of an image")
-    if dropped:
+    point, view, pixels, lost = _observations(files.points, images, new_point)
+    leave_out("sfm.broken_points", nowhere, total=len(finite))
+    if nowhere or lost:
         caution(
-            f"The COLMAP model in {folder} is partly broken. Left out are {'; '.join(dropped)}. "
-            "Write it again if these matter."
+            f"The COLMAP model in {folder} is partly broken. Left out are {nowhere} of "
+            f"{len(finite)} points, whose coordinates are not finite, and {lost} observations, "
+            "which name no feature of an image. Write it again if these matter."
         )
-    point, view, pixels = observations
     return SparseModel(
-        names=tuple(image.name for image in kept),
-        lenses=tuple(lenses[image.camera] for image in kept),
-        cam_from_world=torch.stack([torch.zeros(4, 4).double(), *map(_pose, kept)])[1:],
+        names=tuple(names),
+        lenses=tuple(lenses[image.camera] for image in images),
+        cam_from_world=torch.stack([torch.zeros(4, 4).double(), *map(_pose, images)])[1:],
         points_world=torch.from_numpy(points.xyz[used]),
         observation_point=torch.from_numpy(point),
         observation_view=torch.from_numpy(view),
@@ -327,28 +309,22 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
     )
 
 
-def _camera_fault(camera: Lens) -> str:
-    if camera.model == "EQUIRECTANGULAR":
-        return "have a camera without a focal length, EQUIRECTANGULAR"
-    if not all(0 < side <= 10**6 for side in (camera.width, camera.height)):
-        return f"are {camera.width} x {camera.height} pixels large by their camera"
-    if not all(abs(value) < _MAX_COORDINATE for value in camera.params):
-        return "have a camera whose parameters are not finite"
-    one = camera.model.startswith(("SIMPLE", "RADIAL"))  # focal length for both axes
-    positive = min(camera.params[: 1 if one else 2]) > 0
-    return "" if positive else "have a camera whose focal length is not above 0"
-
-
-def _image_fault(image: FileImage, files: FileModel, lenses: dict[int, Lens]) -> str:
-    length = float(np.linalg.norm(image.pose[:4]))
-    if not abs(length - 1) <= 0.1:  # other programs than COLMAP round
-        return "have a pose whose quaternion is not of length 1"
+def _fault(image: FileImage, lenses: dict[int, Lens]) -> str:
+    """State why an image cannot be used."""
+    if not abs(float(np.linalg.norm(image.pose[:4])) - 1) <= 0.1:  # other programs round
+        return "a pose whose quaternion is not of length 1"
     if not all(abs(value) < _MAX_COORDINATE for value in image.pose[4:]):
-        return "have a pose that is not finite"
-    if image.camera in lenses:
-        return ""
-    broken = [one for one in files.cameras if one.camera == image.camera]
-    return _camera_fault(broken[0]) if broken else "have no camera"
+        return "a pose that is not finite"
+    lens = lenses.get(image.camera)
+    if lens is None:
+        return "no camera"
+    if not all(0 < side <= 10**6 for side in (lens.width, lens.height)):
+        return f"a camera of {lens.width} x {lens.height} pixels"
+    if not all(abs(value) < _MAX_COORDINATE for value in lens.params):
+        return "a camera that is not finite"
+    focals = lens.params[: 1 if lens.model.startswith(("SIMPLE", "RADIAL")) else 2]
+    wrong = lens.model == "EQUIRECTANGULAR" or min(focals) <= 0
+    return "a camera without a focal length above 0" if wrong else ""
 
 
 def _pose(image: FileImage) -> Float[Tensor, "4 4"]:
@@ -367,26 +343,19 @@ def _pose(image: FileImage) -> Float[Tensor, "4 4"]:
 
 
 def _observations(
-    files: FileModel, kept: list[FileImage], new_point: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
-    """Return point, view and pixel of each sound observation by rising point; count the others.
-
-    Observations of what was dropped are not counted.
-    """
-    track = files.points
-    view_of = {image.image: view for view, image in enumerate(kept)}
-    dropped = [image.image for image in files.images if image.image not in view_of]
+    track: FilePoints, images: list[FileImage], new_point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return point, view and pixel of each sound observation by rising point; count the others."""
+    view_of = {image.image: view for view, image in enumerate(images)}
     view = np.array([view_of.get(image, -1) for image in track.track_image.tolist()], np.int64)
-    starts = np.cumsum([0, *(len(image.pixels) for image in kept)])
-    pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in kept)])
+    starts = np.cumsum([0, *(len(image.pixels) for image in images)])
+    pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in images)])
     point = new_point[track.track_point]
-    seen = (point >= 0) & ~np.isin(track.track_image, dropped)
-    there = (view >= 0) & (track.track_feature >= 0)
-    there &= track.track_feature < np.append(np.diff(starts), 0)[view]
-    feature = starts[view[there]] + track.track_feature[there]
-    sound = seen & there
-    sound[there] &= (np.abs(pixels[feature]) < _MAX_COORDINATE).all(axis=1)
+    sound = (point >= 0) & (view >= 0) & (track.track_feature >= 0)
+    sound &= track.track_feature < np.append(np.diff(starts), 0)[view]
+    feature = starts[view[sound]] + track.track_feature[sound]
+    sound[sound] = (np.abs(pixels[feature]) < _MAX_COORDINATE).all(axis=1)
     chosen = np.flatnonzero(sound)
     chosen = chosen[np.argsort(point[chosen], kind="stable")]
     found = pixels[starts[view[chosen]] + track.track_feature[chosen]]
-    return (point[chosen], view[chosen], found), int((seen & ~sound).sum())
+    return point[chosen], view[chosen], found, int((point >= 0).sum()) - len(chosen)

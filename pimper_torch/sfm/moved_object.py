@@ -204,7 +204,7 @@ def _contradict(
 ) -> bool:
     """Return whether no geometry explains both sets of matches."""
     ends = [pixels_of(keypoints, pair, rows) for rows in (first, second)]
-    shared = shared_geometry(*ends, max_error_px)
+    shared = shared_geometry(ends[0], ends[1], max_error_px)
     far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
     return float(torch.stack(far).amax()) > 0.2
 
