@@ -141,10 +141,6 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
         names=tuple(names),
         lenses=tuple(camera.lens for camera in cameras),
         cam_from_world=torch.stack([camera.cam_from_world for camera in cameras]),
-        points_world=torch.zeros(0, 3, dtype=torch.float64),
-        observation_point=torch.zeros(0, dtype=torch.long),
-        observation_view=torch.zeros(0, dtype=torch.long),
-        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
     )
 
 

@@ -31,10 +31,14 @@ class SparseModel(Record):
     names: tuple[str, ...]
     lenses: tuple[Lens, ...]
     cam_from_world: Float[Tensor, "view 4 4"]
-    points_world: Float[Tensor, "point 3"]
-    observation_point: Int[Tensor, " observation"]
-    observation_view: Int[Tensor, " observation"]
-    observation_pixels: Float[Tensor, "observation 2"]
+    points_world: Float[Tensor, "point 3"] = field(
+        default_factory=lambda: torch.zeros(0, 3).double()
+    )
+    observation_point: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_view: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_pixels: Float[Tensor, "observation 2"] = field(
+        default_factory=lambda: torch.zeros(0, 2).double()
+    )
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     series: Int[Tensor, " divided"] = field(default_factory=no_series)
 

@@ -171,15 +171,7 @@ def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseMode
     options.ba_refine_focal_length = False
     options.ba_refine_extra_params = False
     lenses = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
-    nothing = torch.zeros(0, dtype=torch.long)
-    bare = model.replace(
-        names=space.files,
-        lenses=lenses,
-        points_world=model.points_world[:0],
-        observation_point=nothing,
-        observation_view=nothing,
-        observation_pixels=model.observation_pixels[:0],
-    )
+    bare = SparseModel(names=space.files, lenses=lenses, cam_from_world=model.cam_from_world)
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
         cameras = reconstruction_of(bare)
         with pycolmap.Database.open(space.database) as stored:
