@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
-from pimper_torch.records import Cameras
 from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.sfm.conventions.resized_pictures import (
@@ -142,13 +141,12 @@ def _require_agreement(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float, where: str
 ) -> None:
     """Refuse cameras that explain too little, and warn of doubtful ones."""
-    pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
-    total = sum(pair.num_matches for pair in pairs)
-    given = _fraction(pairs, cameras, max_error_px)
+    total = sum(pair.num_matches for pair in verified)
+    given = _explained_fraction(model, verified, max_error_px)
     if total < 30 or given > _RIGHT:
         return
     found = (
-        f"{given:.0%} of {total} matches in {len(pairs)} pairs of photographs lie within "
+        f"{given:.0%} of {total} matches in {len(verified)} pairs of photographs lie within "
         f"{max_error_px:g} px of the cameras' epipolar lines and before both cameras"
     )
     advice = (
@@ -168,10 +166,7 @@ def _require_agreement(
 def _explained_fraction(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
 ) -> float:
-    return _fraction(undistorted_pairs(model, verified), pinholes_of(model), max_error_px)
-
-
-def _fraction(pairs: Sequence[VerifiedPair], cameras: Cameras, max_error_px: float) -> float:
-    """Return the fraction of undistorted matches that cameras explain."""
+    """Return the fraction of matches that the cameras of a model explain."""
+    pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
     return right / max(sum(pair.num_matches for pair in pairs), 1)
