@@ -163,13 +163,6 @@ def test_a_mirrored_photograph_beside_a_model_of_stored_pixels_is_refused_by_nam
         existing_model(views, sparse)
 
 
-def test_poses_of_other_photographs_are_warned_of(stored, sparse):
-    order = [3, 5, 4, 0, 2, 1]
-    shuffled = stored.replace(images=stored.images[order])
-    with pytest.warns(PimperWarning, match="may be of other photographs of these names"):
-        existing_model(shuffled, sparse)
-
-
 def test_without_points_both_ways_are_left_open(stored, tmp_path):
     folder = written(tmp_path, points=0)
     views = turned(stored, [2] * 6)

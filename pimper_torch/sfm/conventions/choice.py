@@ -7,13 +7,10 @@ photographs show: at each of many places, or as the fraction of them that it exp
 from jaxtyping import Float
 from torch import Tensor
 
-# Standard errors by which one candidate must be better than another, and places it takes: choices.
-ERRORS, _FEWEST = 4.0, 8
-
 
 def standard_errors(differences: Float[Tensor, " place"]) -> float:
     """Compute a mean in standard errors; 0 of too few."""
-    if len(differences) < _FEWEST:
+    if len(differences) < 8:
         return 0.0
     error = differences.std() / len(differences) ** 0.5
     return float(differences.mean() / error.clamp_min(1e-9))
@@ -21,4 +18,4 @@ def standard_errors(differences: Float[Tensor, " place"]) -> float:
 
 def surely_better(one: Float[Tensor, " place"], other: Float[Tensor, " place"]) -> bool:
     """Return whether one candidate scores higher than another, place by place."""
-    return standard_errors(one - other) > ERRORS
+    return standard_errors(one - other) > 4

@@ -22,7 +22,7 @@ from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.conventions.choice import ERRORS, standard_errors, surely_better
+from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.sfm.lenses import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 
@@ -94,26 +94,16 @@ def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
 def choose_turned(ways: Sequence[SparseModel], views: Views, where: str) -> SparseModel:
     """Choose between cameras of photographs as they stand, and as their files store them.
 
-    Warns where the points do not tell, and where photographs agree by chance alone.
-
     Args:
         ways: One or two models in the pixels of the photographs, which differ in turns alone.
     """
-    scores = [correlations(longest_tracks(model, 40), views) for model in ways]
-    best = len(ways) - 1 if surely_better(scores[-1][0][0], scores[0][0][0]) else 0
-    if not best and len(ways) > 1 and not surely_better(scores[0][0][0], scores[1][0][0]):
-        tell_open_turns(where, "points")
-    own, chance = (each[0] for each in scores[best])
-    excess = (own - chance)[own != chance]
-    if len(excess) >= 200 and standard_errors(excess) <= ERRORS:
-        caution(
-            f"What the photographs show round the points of {_within(where)} agrees no better "
-            f"between views than by chance (correlation {float(excess.mean()):.2f} above it, of "
-            f"{len(excess)} observations). The model may be of other photographs of these names, "
-            "or of cropped ones.",
-            stacklevel=4,
-        )
-    return ways[best]
+    if len(ways) > 1:
+        upright, stored = (correlations(longest_tracks(model, 40), views)[0] for model in ways)
+        if surely_better(stored, upright):
+            return ways[1]
+        if not surely_better(upright, stored):
+            tell_open_turns(where, "points")
+    return ways[0]
 
 
 def tell_turned(where: str, evidence: str) -> None:
@@ -151,7 +141,7 @@ def points_tell(
     mine = torch.isin(chosen.observation_view, torch.tensor(changed))
     for reach_px in reaches_px:
         shifts = reach_px * torch.cat([torch.zeros(1, 2), around(chosen.points_world)])
-        own, _ = correlations(chosen, views, shifts, changed)
+        own = correlations(chosen, views, shifts, changed)
         own = own[:, mine & (own[0] != 0)]
         if all(surely_better(own[0], one) for one in own[1:]):
             return float(own[0].mean())
@@ -252,7 +242,7 @@ def correlations(
     views: Views,
     shifts: Float[Tensor, "way 2"] | None = None,
     moved: Collection[int] = (),
-) -> tuple[Float[Tensor, "way observation"], Float[Tensor, "way observation"]]:
+) -> Float[Tensor, "way observation"]:
     """Correlate each observation's square with the mean of its point's others.
 
     Args:
@@ -261,8 +251,7 @@ def correlations(
         moved: Numbers of these views.
 
     Returns:
-        With the others of its own point, and of another point, as chance has it; 0 where a square
-        tells nothing.
+        0 where a square tells nothing.
     """
     shifts = torch.zeros(1, 2) if shifts is None else shifts
     sides = _sides(model)
@@ -277,8 +266,7 @@ def correlations(
     count = int(point.max()) + 1 if len(point) else 0
     sums = squares.new_zeros(len(shifts), count, squares.shape[-1]).index_add(-2, point, squares)
     others = normalize(sums[..., point, :] - squares, dim=-1)
-    strangers = normalize(sums, dim=-1)[..., point - 1, :]
-    return (squares * others).sum(dim=-1), (squares * strangers).sum(dim=-1)
+    return (squares * others).sum(dim=-1)
 
 
 def _sides(model: SparseModel) -> Float[Tensor, "observation 2 2"]:
