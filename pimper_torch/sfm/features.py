@@ -150,8 +150,13 @@ def find_features(
                 device=pycolmap.Device.cpu,
             )
         with pycolmap.Database.open(space.database) as stored:
-            image_ids = {image.name: image.image_id for image in stored.read_all_images()}
-            return [stored.num_keypoints_for_image(image_ids[file]) for file in space.files]
+            return [stored.num_keypoints_for_image(image) for image in image_ids(stored, space)]
+
+
+def image_ids(stored: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - pycolmap is untyped
+    """Return the number of each photograph in the database."""
+    ids = {image.name: image.image_id for image in stored.read_all_images()}
+    return [ids[file] for file in space.files]
 
 
 def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types

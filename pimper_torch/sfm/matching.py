@@ -17,7 +17,7 @@ from pimper_torch.parallel import side_by_side
 from pimper_torch.progress import track
 from pimper_torch.records import Record
 from pimper_torch.sfm.colmap import loaded, quiet
-from pimper_torch.sfm.features import Workspace
+from pimper_torch.sfm.features import Workspace, image_ids
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 # Photographs up to which a set is small: every pair is matched, and every point is looked for in
@@ -112,7 +112,7 @@ def strongest(
 def verified_pairs(space: Workspace) -> list[VerifiedPair]:
     """Read the matches that were verified, pair by pair."""
     with quiet(), loaded().Database.open(space.database) as stored:
-        number = photograph_numbers(stored, space)
+        number = {image: index for index, image in enumerate(image_ids(stored, space))}
         pixels = {
             image: torch.from_numpy(
                 np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
@@ -131,15 +131,6 @@ def verified_pairs(space: Workspace) -> list[VerifiedPair]:
                 low, high = sorted((first, second), key=lambda end: end[0])
                 found.append(VerifiedPair(views=(low[0], high[0]), first=low[1], second=high[1]))
         return found
-
-
-def photograph_numbers(
-    stored: Any,  # noqa: ANN401 - pycolmap is untyped
-    space: Workspace,
-) -> dict[int, int]:
-    """Return the number of the photograph behind each image of the database."""
-    number = {file: index for index, file in enumerate(space.files)}
-    return {image.image_id: number[image.name] for image in stored.read_all_images()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -174,7 +165,7 @@ def match_guided(
     """Replace the matches of verified pairs by those near their epipolar lines."""
     features: dict[int, Features] = {}
     with quiet(), loaded().Database.open(space.database) as stored:
-        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        image_of = image_ids(stored, space)
         geometries, nears = {}, {}
         for pair in pairs:
             ends = (image_of[pair[0]], image_of[pair[1]])

@@ -19,12 +19,11 @@ from torch.nn.functional import normalize
 
 from pimper_torch.parallel import on_one_thread
 from pimper_torch.sfm.colmap import loaded, quiet
-from pimper_torch.sfm.features import Workspace
+from pimper_torch.sfm.features import Workspace, image_ids
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,
     PhotographPair,
     all_pairs,
-    photograph_numbers,
     read_features,
 )
 
@@ -39,7 +38,7 @@ def pairs_to_match(space: Workspace) -> list[PhotographPair]:
     if len(space.files) <= MOST_PAIRED:
         return all_pairs(len(space.files))
     with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
-        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        image_of = image_ids(stored, space)
 
         def descriptors(number: int) -> Descriptors:
             return read_features(stored, image_of[number]).descriptors

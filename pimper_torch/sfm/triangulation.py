@@ -23,14 +23,13 @@ from pimper_torch.sfm.epipolar import (
     undistorted_pairs,
     undistorted_pixels,
 )
-from pimper_torch.sfm.features import Workspace, find_features, too_small, workspace
+from pimper_torch.sfm.features import Workspace, find_features, image_ids, too_small, workspace
 from pimper_torch.sfm.matching import (
     Near,
     PhotographPair,
     VerifiedPair,
     guided_matches,
     match_pairs,
-    photograph_numbers,
     read_features,
     strongest,
     verified_pairs,
@@ -115,11 +114,11 @@ def _match_along_lines(
     pairs, cameras = _pairs(model, verified, settings), pinholes_of(model)
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
-        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        image_of = image_ids(stored, space)
         features = []
-        for number in range(model.num_views):
-            its = read_features(stored, image_of[number])
-            features.append(its.replace(pixels=undistorted_pixels(model, number, its.pixels)))
+        for view, image in enumerate(image_of):
+            its = read_features(stored, image)
+            features.append(its.replace(pixels=undistorted_pixels(model, view, its.pixels)))
 
         def matches(pair: PhotographPair) -> Tensor:
             first, second = (features[number] for number in pair)
