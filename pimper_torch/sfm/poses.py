@@ -15,7 +15,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.sparse_scene import with_views
 
 
@@ -60,22 +60,8 @@ def of_photographs(model: SparseModel, views: Views) -> SparseModel:
     first = {pose: view for view, pose in reversed(list(enumerate(views.poses.tolist())))}
     source = [place.get(views.names[first[pose]], -1) for pose in views.poses.tolist()]
     shown = [view for view, found in enumerate(source) if found >= 0]
-    index = [source[view] for view in shown]
-    rows = [(model.observation_view == found).nonzero()[:, 0] for found in index]
-    row = torch.cat(rows)
-    view = torch.arange(len(shown)).repeat_interleave(torch.tensor([len(one) for one in rows]))
-    order = torch.argsort(model.observation_point[row] * len(shown) + view)
-    maps, series = model.background_from_view, model.series
-    return model.replace(
-        names=tuple(views.names[one] for one in shown),
-        lenses=tuple(model.lenses[one] for one in index),
-        cam_from_world=model.cam_from_world[index],
-        observation_point=model.observation_point[row][order],
-        observation_view=view[order],
-        observation_pixels=model.observation_pixels[row][order],
-        background_from_view=maps[index] if len(maps) else maps,
-        series=series[index] if len(series) else series,
-    )
+    carried = select_views(model, [source[view] for view in shown])
+    return carried.replace(names=tuple(views.names[view] for view in shown))
 
 
 def with_poses(scene: SparseScene) -> SparseScene:
