@@ -16,7 +16,6 @@ from pimper_torch.journal import Journal, current, writing
 from pimper_torch.records.failure import LeftOut, What
 
 GUARDS: dict[str, tuple[What, str]] = {
-    "sfm.quarter_turns": ("doubt", "turned as the sensor lay"),
     "sfm.room": ("features", "at rest while others move"),
     "sfm.shifted_room": ("features", "shift together while others move"),
     "sfm.moved_object": ("matches", "of the surroundings, between series"),

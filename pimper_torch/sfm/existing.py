@@ -10,7 +10,6 @@ from PIL import Image
 from pimper_torch.camera_files.read_cameras import read_cameras
 from pimper_torch.errors import InputError, ReconstructionError, caution, some
 from pimper_torch.file_names import match_files
-from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.conventions.resized_pictures import (
@@ -29,7 +28,6 @@ from pimper_torch.sfm.lenses import (
     turned_pixels,
     turned_pose,
     turned_size,
-    turning,
 )
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import names_by_folder
@@ -169,8 +167,6 @@ def _stored_size(views: Views, view: int) -> tuple[int, int]:
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
     """Put a model's cameras and observations into photographs that were resized and turned.
 
-    Maps to a static background begin in the photographs then, and end where they ended.
-
     Args:
         model: Its pictures have the photographs' shapes once they are turned.
         views: The photographs, in the model's order.
@@ -181,7 +177,6 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
     fresh = 1 + max(lens.camera for lens in model.lenses)
     pixels = torch.empty_like(model.observation_pixels)
     poses = torch.empty_like(model.cam_from_world)
-    maps = model.background_from_view.clone()
     for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
         width, height = views.sizes_px[view].tolist()
         size = turned_size(width, height, quarters)
@@ -197,7 +192,4 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         here = model.observation_view == view
         pixels[here] = turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
         poses[view] = turned_pose(model.cam_from_world[view], quarters)
-        if len(maps):
-            shown_from_model = turning(*size, quarters) @ torch.diag(homogeneous(scale))
-            maps[view] = torch.linalg.solve(shown_from_model.to(maps), maps[view], left=False)
     return model.replace(lenses=tuple(lenses), cam_from_world=poses, observation_pixels=pixels)

@@ -1,4 +1,4 @@
-"""Which photographs were taken with one lens at one focal length, as their files say."""
+"""Lenses: which photographs share one by their files, and lenses of turned and cropped pictures."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, some
-from pimper_torch.mapped import zeros
 from pimper_torch.records import Lens, Views
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
@@ -91,48 +90,8 @@ def _focals(lens: Lens) -> int:
     return 1 if lens.model.startswith(_ONE_FOCAL) else 2
 
 
-def turning(width: int, height: int, quarters: int) -> Float[Tensor, "3 3"]:
-    """Return :func:`turned_pixels` as a matrix on homogeneous pixels; float64."""
-    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
-    origin, right, down = turned_pixels(corners, width, height, quarters)
-    matrix = torch.eye(3, dtype=torch.float64)
-    matrix[:2] = torch.stack([right - origin, down - origin, origin], dim=1)
-    return matrix
-
-
-def turned_views(views: Views, quarters: Sequence[int]) -> Views:
-    """Turn photographs clockwise by quarters, each by its own number; none are not copied.
-
-    The raster is as large as the turned photographs need. Priors do not turn along: they are left
-    out.
-    """
-    if not any(turns % 4 for turns in quarters):
-        return views
-    sizes = [
-        turned_size(width, height, turns)
-        for (width, height), turns in zip(views.sizes_px.tolist(), quarters, strict=True)
-    ]
-    wide, high = (max(sides) for sides in zip(*sizes, strict=True))
-    images = zeros((*views.images.shape[:2], high, wide), views.images.dtype, views.images.device)
-    masks = None if views.masks is None else views.masks.new_zeros(len(sizes), high, wide)
-    for view, ((width, height), turns) in enumerate(zip(sizes, quarters, strict=True)):
-        before = turned_size(width, height, turns)
-        picture = views.images[view, :, : before[1], : before[0]]
-        images[view, :, :height, :width] = torch.rot90(picture, -turns, dims=(1, 2))
-        if views.masks is not None and masks is not None:
-            mask = views.masks[view, : before[1], : before[0]]
-            masks[view, :height, :width] = torch.rot90(mask, -turns)
-    return views.replace(
-        images=images,
-        masks=masks,
-        sizes_px=torch.tensor(sizes).to(views.sizes_px),
-        orientations=None,
-        priors=(),
-    )
-
-
 def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -> list[int]:
-    """Group photographs by size and focal length; either side up is one size.
+    """Group photographs by size and focal length.
 
     Photographs without a focal length are of the lens of their size, if that is one; else of a lens
     of their own.
@@ -143,30 +102,29 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
     Returns:
         The group of each, numbered in the order of their first photographs.
 
-    >>> group_lenses([(9, 6), (6, 9), (9, 6)], [10.0, 10.1, 15.0])
+    >>> group_lenses([(9, 6), (9, 6), (6, 9)], [10.0, 10.1, 10.0])
     [0, 0, 1]
     """
-    shapes = [(max(size), min(size)) for size in sizes]
     known: dict[tuple[int, int], list[float]] = {}
-    told = [one for one in zip(focals_px, shapes, strict=True) if not math.isnan(one[0])]
-    for focal, shape in sorted(told):
-        starts = known.setdefault(shape, [])  # EXIF rounds by less than 2 %
+    told = [one for one in zip(focals_px, sizes, strict=True) if not math.isnan(one[0])]
+    for focal, size in sorted(told):
+        starts = known.setdefault(size, [])  # EXIF rounds by less than 2 %
         if not (starts and focal <= 1.02 * starts[-1]):
             starts.append(focal)
     numbers: dict[tuple[object, ...], int] = {}
     groups = []
-    for focal, shape in zip(focals_px, shapes, strict=True):
-        starts = known.get(shape, [])
+    for focal, size in zip(focals_px, sizes, strict=True):
+        starts = known.get(size, [])
         if math.isnan(focal):
             lens: object = 0 if len(starts) == 1 else None
         else:
             lens = sum(start <= focal for start in starts) - 1
-        groups.append(numbers.setdefault((shape, lens), len(numbers)))
+        groups.append(numbers.setdefault((size, lens), len(numbers)))
     return groups
 
 
 def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> list[int]:
-    """Number the lenses of photographs that lie as their sensors do."""
+    """Number the lenses of photographs."""
     if own:
         return list(range(views.num_views))
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
@@ -186,19 +144,3 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
             "so that lenses are told apart by size and EXIF, or give photographs of one size."
         )
     return [0] * views.num_views
-
-
-def sensor_turns(views: Views) -> tuple[int, ...]:
-    """Find by how many clockwise quarters each photograph is turned from how its sensor lies.
-
-    Sensors lie broadside; a photograph that stands upright beside others that lie is turned, by
-    EXIF's orientation if it says so. Where all stand or all lie, none counts as turned.
-    """
-    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
-    if not any(width > height for width, height in sizes):
-        return (0,) * views.num_views
-    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
-    return tuple(
-        0 if width >= height else 3 if QUARTERS.get(tag) == 3 else 1
-        for (width, height), tag in zip(sizes, tags, strict=True)
-    )

@@ -18,9 +18,9 @@ from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.doubt import choose_component, doubt, doubt_one_lens
-from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
+from pimper_torch.sfm.existing import existing_ways, place, taken
 from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small, workspace
-from pimper_torch.sfm.lenses import choose_lenses, sensor_turns, turned_views
+from pimper_torch.sfm.lenses import choose_lenses
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.moved_object import series_in, with_series
 from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
@@ -172,25 +172,18 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
             f"{some(small)}: have sides of fewer than {SMALLEST_PX} pixels; needed: photographs "
             "in which there are features, of some hundred pixels at least."
         )
-    turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
-    leave_out("sfm.quarter_turns", sum(map(bool, turns)), total=len(turns))
-    lying = turned_views(views, [-quarters for quarters in turns])
-    model = _registered_model(lying, config)
-    numbers = [views.names.index(name) for name in model.names]
-    model = refine_tracks(lying.take(numbers), model, config.track_iterations)
+    model = _registered_model(views, config)
+    model = refine_tracks(taken(views, model), model, config.track_iterations)
     release_memory()
     reason = doubt_one_lens(model)
     leave_out("sfm.one_lens", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
-    if any(turns):
-        turned = [turns[number] for number in numbers]
-        model = follow_pictures(model, views.take(numbers), turned)
     return upright(model)
 
 
 def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
-    """Grow models of photographs that lie as their sensors do, and choose one.
+    """Grow models of photographs, and choose one.
 
     Its views are in the photographs' order, with maps to a room at rest and numbers of series.
     """
