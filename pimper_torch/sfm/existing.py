@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from pimper_torch.camera_files.read_cameras import read_cameras
-from pimper_torch.errors import InputError, ReconstructionError, caution, some
+from pimper_torch.errors import InputError, ReconstructionError, some
 from pimper_torch.file_names import match_files
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
@@ -30,7 +30,7 @@ from pimper_torch.sfm.lenses import (
     turned_size,
 )
 from pimper_torch.sfm.model import SparseModel, match_names
-from pimper_torch.sfm.model_files import names_by_folder
+from pimper_torch.sfm.model_files import largest_model
 
 
 def existing_ways(views: Views, path: Path) -> Ways:
@@ -39,15 +39,15 @@ def existing_ways(views: Views, path: Path) -> Ways:
     Args:
         views: Matched by file name; cameras may have been made from photographs of another size,
             and from the pixels that files store where EXIF turns them.
-        path: Folder of a COLMAP model, or of several in folders, of which the one with most of the
-            photographs is read; or a file of cameras, see
+        path: Folder of a COLMAP model, or of several in folders, of which the
+            largest is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
 
     Raises:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
         InputError: They do not belong to the photographs, or cannot be read.
     """
-    path = _largest(views, path)
+    path = largest_model(path)
     where = place(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
     model = match_names(read, views.names, where, views.folder)
@@ -82,24 +82,6 @@ def existing_ways(views: Views, path: Path) -> Ways:
     if not torch.equal(chosen.cam_from_world, model.cam_from_world):
         tell_turned(where, "what they show round its points")
     return Ways([chosen])
-
-
-def _largest(views: Views, folder: Path) -> Path:
-    """Choose the model of most of the photographs where a folder holds several, each in its own."""
-    counts: dict[Path, int] = {}
-    for path, names in names_by_folder(folder).items():
-        where, photographs = str(path), views.folder
-        matches = match_files(views.names, names, folder=photographs, where=where, what="image")
-        counts[path] = len(matches) - matches.count(None)
-    largest = max(counts, key=lambda path: counts[path], default=folder)
-    others = [f"{path.name} ({count})" for path, count in counts.items() if path != largest]
-    if others:
-        caution(
-            f"{folder} holds {len(counts)} COLMAP models, each in a frame of its own; read is "
-            f"{largest.name}, of {counts[largest]} of {views.num_views} photographs, not "
-            f"{some(others)}. Point to another one if that is meant."
-        )
-    return largest
 
 
 def place(path: Path) -> str:

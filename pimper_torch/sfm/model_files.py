@@ -108,18 +108,19 @@ def read_files(folder: Path) -> FileModel:
     )
 
 
-def names_by_folder(folder: Path) -> dict[Path, list[str]]:
-    """Read the names of images of the models in folders of a folder that holds none itself.
-
-    Raises:
-        InputError: A file of images cannot be read.
-    """
-    folders = sorted(folder.iterdir()) if folder.is_dir() and not _ending(folder) else []
-    endings = {path: ending for path in folders if (ending := _ending(path))}
-    return {
-        path: [image.name for image in _read(path / f"images{ending}", _PARSERS[ending][1], path)]
-        for path, ending in endings.items()
-    }
+def largest_model(folder: Path) -> Path:
+    """Return a folder with a model, or the folder in it that has the largest; warn of others."""
+    inner = sorted(folder.iterdir()) if folder.is_dir() and not _ending(folder) else []
+    endings = {path: ending for path in inner if (ending := _ending(path))}
+    sizes = {path: (path / f"images{ending}").stat().st_size for path, ending in endings.items()}
+    largest = max(sizes, key=sizes.__getitem__, default=folder)
+    if len(sizes) > 1:
+        others = some([path.name for path in sizes if path != largest])
+        caution(
+            f"{folder} holds {len(sizes)} COLMAP models, each in a frame of its own; read is "
+            f"{largest.name}, the largest, not {others}. Point to another one if that is meant."
+        )
+    return largest
 
 
 def _ending(folder: Path) -> str | None:
