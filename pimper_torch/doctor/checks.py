@@ -147,7 +147,8 @@ def exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Group photographs by size and focal length, as each lens is found for itself."""
     numbers = group_lenses(
-        [(one.width, one.height) for one in photographs], [one.focal_px for one in photographs]
+        [(max(one.width, one.height), min(one.width, one.height)) for one in photographs],
+        [one.focal_px for one in photographs],
     )
     if not numbers:
         return

@@ -129,7 +129,7 @@ def test_a_model_with_two_of_the_photographs_is_refused(scene, views, tmp_path):
 
 
 def test_unlike_sizes_with_one_shared_camera_are_refused_naming_files_and_the_way_out():
-    views = blank([(40, 30), (40, 30), (30, 40), (60, 45)])
+    views = blank([(40, 30), (40, 30), (40, 30), (60, 45)])
     with pytest.raises(InputError) as caught:
         Reconstruct(ReconstructConfig(shared_camera=True))(views)
     message = str(caught.value)
