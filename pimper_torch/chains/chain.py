@@ -194,7 +194,11 @@ class Chain(Stage):
                 self.preview(scene, coarse)
 
     def given_mesh(
-        self, mesh: Mesh | None, views: Views | SparseScene, scene: SparseScene
+        self,
+        mesh: Mesh | None,
+        views: Views | SparseScene,
+        scene: SparseScene,
+        silhouettes: Silhouettes,
     ) -> Mesh | None:
         """Prepare a mesh that came with the photographs, see :func:`prepared`.
 
@@ -211,7 +215,7 @@ class Chain(Stage):
             placed = mesh.vertices_world.double()
             mesh = mesh.replace(vertices_world=placed - placed.new_tensor(scene.offset_world))
         with stage("given_mesh") as told:
-            mesh, figures = prepared(mesh, scene)
+            mesh, figures = prepared(mesh, scene, silhouettes)
             told |= figures
         return mesh
 

@@ -135,7 +135,7 @@ class CoarseToFine(Chain):
         placed, held_out = held_apart(every, self.config.hold_out, needed)
         few = one_view_a_pose(placed, needed)
         outlines = run(self.silhouettes, few.scene)
-        mesh = self.given_mesh(mesh, views, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
         scene = settled(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)

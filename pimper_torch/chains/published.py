@@ -111,7 +111,7 @@ class Published(Chain):
         placed = self.placed(run, views, sparse_model, mesh)
         few = one_view_a_pose(placed, tuple(self.references()))
         outlines = run(self.silhouettes, few.scene)
-        mesh = self.given_mesh(mesh, views, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
         scene = settled(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)

@@ -12,7 +12,7 @@ from pimper_torch.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.geometry.topology import face_components, first_of_each
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.geometry.welding import welded
-from pimper_torch.records import Cameras, Mesh, SparseScene
+from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.conventions.mesh_frame import compare_with_scene
 
 # Rays cast along each photograph's longer side. A choice: some 20,000 rays a photograph see every
@@ -23,7 +23,9 @@ _RAYS = 160
 _MIN_HEIGHT = 1e-6
 
 
-def prepared(mesh: Mesh, scene: SparseScene) -> tuple[Mesh, dict[str, int | float]]:
+def prepared(
+    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
+) -> tuple[Mesh, dict[str, int | float]]:
     """Weld a mesh, drop faces that are none, and compare it with the scene.
 
     Returns:
@@ -36,7 +38,7 @@ def prepared(mesh: Mesh, scene: SparseScene) -> tuple[Mesh, dict[str, int | floa
     found, dropped = cleaned(mesh.to(scene.points_world.device))
     if dropped:
         caution(f"Of the given mesh's {len(mesh.faces)} faces {dropped} were left out.")
-    figures = compare_with_scene(found, scene)  # in the precision that it came in
+    figures = compare_with_scene(found, scene, silhouettes)  # in the precision that it came in
     found = found.replace(vertices_world=found.vertices_world.to(scene.cameras.cam_from_world))
     return found, {"faces": len(found.faces), **figures}
 

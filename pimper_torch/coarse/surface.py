@@ -22,7 +22,7 @@ from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
-from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, SparseScene
+from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
 from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
@@ -136,7 +136,7 @@ def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh
             one photograph has the reference's name.
     """
     view = reference_view(scene, reference)
-    mesh, _ = prepared(mesh, scene)
+    mesh, _ = prepared(mesh, scene, Silhouettes.everything(scene.views))
     vertices, faces = oriented_outward(mesh, scene.cameras)
     reliable = reliable_points(scene)
     near = _ON_FACET_PX * pixel_size(scene, reliable) if len(reliable) else 0.0

@@ -8,12 +8,13 @@ from pimper_torch.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_torch.geometry.local_frame import to_local
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import boundary_loops, face_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import Mesh
-from tests.coarse.ball import all_round
+from pimper_torch.records import Mesh, Silhouettes
+from tests.coarse.ball import all_round, silhouettes_of
 
 
 def test_every_component_faces_out_however_its_faces_were_wound():
@@ -67,6 +68,20 @@ def scene(dome_cloud):
 
 
 @pytest.fixture(scope="module")
+def unknown(scene):
+    return Silhouettes.everything(scene.views)
+
+
+@pytest.fixture(scope="module")
+def masks(scene):
+    return silhouettes_of(
+        scene.cameras.to(torch.float64).replace(
+            cam_from_world=to_local(scene.cameras.cam_from_world.double(), tuple(PLACE.tolist()))
+        )
+    )
+
+
+@pytest.fixture(scope="module")
 def true_mesh():
     vertices, faces = icosphere(4)
     return Mesh(vertices_world=vertices + PLACE, faces=faces)
@@ -76,24 +91,26 @@ def exchanged(mesh, *axes):
     return mesh.replace(vertices_world=mesh.vertices_world[:, list(axes)])
 
 
-def test_the_true_mesh_is_taken_as_it_is_and_said_to_fit(scene, true_mesh):
-    found, figures = prepared(true_mesh, scene)
-    assert torch.equal(found.faces, true_mesh.faces)
-    assert torch.equal(found.vertices_world, true_mesh.vertices_world.float())
-    assert figures["faces"] == len(true_mesh.faces)
-    assert figures["on_mesh"] > 0.99
-    assert figures["distance_percent"] < 0.1
-    assert figures["observations"] > 1000
+def test_the_true_mesh_is_taken_as_it_is_and_said_to_fit(scene, unknown, masks, true_mesh):
+    for silhouettes in (unknown, masks):
+        found, figures = prepared(true_mesh, scene, silhouettes)
+        assert torch.equal(found.faces, true_mesh.faces)
+        assert torch.equal(found.vertices_world, true_mesh.vertices_world.float())
+        assert figures["faces"] == len(true_mesh.faces)
+        assert figures["on_mesh"] > 0.99
+        assert figures["distance_percent"] < 0.1
+        assert figures["observations"] > 1000
+    assert figures["overlap"] > 0.95  # a polyhedron in rays 2.5 pixels apart
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb"])
 def test_a_mesh_whose_faces_share_no_vertex_gives_the_surface_of_the_welded_one(
-    scene, true_mesh, suffix, tmp_path
+    scene, unknown, true_mesh, suffix, tmp_path
 ):
     corners = true_mesh.vertices_world[true_mesh.faces].reshape(-1, 3)
     apart = torch.arange(len(corners)).reshape(-1, 3)
     trimesh.Trimesh(corners.numpy(), apart.numpy(), process=False).export(tmp_path / f"a{suffix}")
-    found, _ = prepared(read_mesh(tmp_path / f"a{suffix}"), scene)
+    found, _ = prepared(read_mesh(tmp_path / f"a{suffix}"), scene, unknown)
     assert len(found.vertices_world) == len(true_mesh.vertices_world)
     assert len(found.faces) == len(true_mesh.faces)
     assert len(boundary_loops(found.faces)[0]) == 0
@@ -103,7 +120,7 @@ def test_a_mesh_whose_faces_share_no_vertex_gives_the_surface_of_the_welded_one(
     assert_close(*surface, rtol=0, atol=1e-6)
 
 
-def test_a_texture_seam_is_welded(scene, tmp_path):
+def test_a_texture_seam_is_welded(scene, unknown, tmp_path):
     """As OBJ has it: positions are shared, texture coordinates are not."""
     vertices, faces = icosphere(2)
     lines = [f"v {x} {y} {z}" for x, y, z in (vertices + PLACE).tolist()]
@@ -112,33 +129,34 @@ def test_a_texture_seam_is_welded(scene, tmp_path):
         lines.append("f " + " ".join(f"{v}/{3 * face + c + 1}" for c, v in enumerate(row)))
     (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
     read = read_mesh(tmp_path / "seams.obj")
-    found, _ = prepared(read, scene)
+    found, _ = prepared(read, scene, unknown)
     assert len(found.vertices_world) == len(vertices)
 
 
-def test_faces_that_are_none_are_dropped_and_counted(scene, true_mesh):
+def test_faces_that_are_none_are_dropped_and_counted(scene, unknown, true_mesh):
     faces = true_mesh.faces
     middle = true_mesh.vertices_world[faces[0, :2]].mean(dim=0, keepdim=True)
     vertices = torch.cat([true_mesh.vertices_world, middle])
     sliver = torch.tensor([[int(faces[0, 0]), len(vertices) - 1, int(faces[0, 1])]])
     added = torch.cat([faces, faces[:6, [0, 0, 1]], sliver, faces[:4].flip(1), faces[9:10]])
     with pytest.warns(PimperWarning, match="7 without area and 5 that stand twice were left out"):
-        found, _ = prepared(Mesh(vertices_world=vertices, faces=added), scene)
+        found, _ = prepared(Mesh(vertices_world=vertices, faces=added), scene, unknown)
     assert len(found.vertices_world) == len(true_mesh.vertices_world)
     assert sorted(map(sorted, found.faces.tolist())) == sorted(map(sorted, faces.tolist()))
 
 
-def test_a_mesh_without_any_area_is_refused(scene, true_mesh):
+def test_a_mesh_without_any_area_is_refused(scene, unknown, true_mesh):
     flat = true_mesh.replace(faces=true_mesh.faces[:9, [0, 1, 1]])
     with pytest.raises(InputError, match="none of the given mesh's 9 faces has an area"):
-        prepared(flat, scene)
+        prepared(flat, scene, unknown)
     line = Mesh(vertices_world=PLACE + torch.arange(4)[:, None], faces=torch.tensor([[0, 1, 2]]))
     with pytest.raises(InputError, match="none of the given mesh's 1 faces has an area"):
-        prepared(line, scene)
+        prepared(line, scene, unknown)
     with pytest.raises(InputError, match="no faces"):
-        prepared(true_mesh.replace(faces=true_mesh.faces[:0]), scene)
+        prepared(true_mesh.replace(faces=true_mesh.faces[:0]), scene, unknown)
 
 
+@pytest.mark.parametrize("with_masks", [False, True])
 @pytest.mark.parametrize(
     "change",
     [
@@ -150,30 +168,46 @@ def test_a_mesh_without_any_area_is_refused(scene, true_mesh):
     ],
 )
 def test_a_mesh_in_another_frame_is_refused_or_where_no_ray_meets_it_warned_of(
-    scene, true_mesh, change
+    scene, unknown, masks, true_mesh, change, with_masks
 ):
     with pytest.raises((InputError, PimperWarning), match=r"wh(ere|at) the photographs show"):
-        prepared(change(true_mesh), scene)
+        prepared(change(true_mesh), scene, masks if with_masks else unknown)
 
 
-def test_a_mesh_of_something_else_is_refused_and_a_rough_one_is_said_to_be_off(scene, true_mesh):
+def test_masks_alone_warn_of_another_frame_where_there_are_no_points(scene, masks, true_mesh):
+    bare = scene.replace(
+        points_world=scene.points_world[:0],
+        reprojection_errors_px=scene.reprojection_errors_px[:0],
+        observation_point=scene.observation_point[:0],
+        observation_view=scene.observation_view[:0],
+        observation_pixels=scene.observation_pixels[:0],
+    )
+    _, figures = prepared(true_mesh, bare, masks)
+    assert set(figures) == {"faces", "overlap", "observations"}
+    with pytest.warns(PimperWarning, match=r"is off .*overlap with the masks by 38%"):
+        prepared(exchanged(true_mesh, 0, 2, 1), bare, masks)
+
+
+def test_a_mesh_of_something_else_is_refused_and_a_rough_one_is_said_to_be_off(
+    scene, unknown, true_mesh
+):
     def scaled(factor):
         about = true_mesh.vertices_world - PLACE
         return true_mesh.replace(vertices_world=PLACE + factor * about)
 
     with pytest.raises(InputError, match="not where the photographs show the object: 0% of"):
-        prepared(scaled(0.5), scene)
+        prepared(scaled(0.5), scene, unknown)
     with pytest.warns(PimperWarning, match=r"median distance is 2\.\d% of the diagonal \(0.08"):
-        _, figures = prepared(scaled(0.92), scene)
+        _, figures = prepared(scaled(0.92), scene, unknown)
     assert abs(figures["distance_percent"] - 100 * 0.08 / (0.92 * 12**0.5)) < 0.05
-    prepared(scaled(0.97), scene)  # nothing is said
+    prepared(scaled(0.97), scene, unknown)  # nothing is said
     box = trimesh.creation.box(bounds=[(PLACE - 1).tolist(), (PLACE + 1).tolist()])
     rough = Mesh(vertices_world=torch.tensor(box.vertices), faces=torch.tensor(box.faces).long())
     with pytest.warns(PimperWarning, match="is off what the photographs show"):
-        prepared(rough, scene)
+        prepared(rough, scene, unknown)
 
 
-def test_points_of_the_background_say_nothing_against_a_mesh(scene, true_mesh):
+def test_points_of_the_background_say_nothing_against_a_mesh(scene, unknown, true_mesh):
     """Nor are they explained by a mesh: half the cloud is a wall behind the ball."""
     generator = torch.Generator().manual_seed(3)
     wall = 4 * torch.rand(3000, 3, generator=generator) - 2 + PLACE.float()
@@ -191,24 +225,24 @@ def test_points_of_the_background_say_nothing_against_a_mesh(scene, true_mesh):
         observation_view=torch.cat([scene.observation_view, view]),
         observation_pixels=torch.cat([scene.observation_pixels, torch.zeros(len(point), 2)]),
     )
-    _, figures = prepared(true_mesh, both)
+    _, figures = prepared(true_mesh, both, unknown)
     assert figures["on_mesh"] > 0.95
     with pytest.raises(InputError, match="not where"):
-        prepared(exchanged(true_mesh, 0, 2, 1), both)
+        prepared(exchanged(true_mesh, 0, 2, 1), both, unknown)
 
 
-def test_a_mesh_goes_along_with_cameras_far_from_their_origin(scene, true_mesh):
+def test_a_mesh_goes_along_with_cameras_far_from_their_origin(scene, unknown, true_mesh):
     """With photographs, it is in the frame of their model; with a scene, in that of the scene."""
     chain = load_chain("default")
     far = scene.replace(offset_world=AWAY)
     brought = true_mesh.replace(
         vertices_world=true_mesh.vertices_world + torch.tensor(AWAY, dtype=torch.float64)
     )
-    plain = chain.given_mesh(true_mesh, scene, scene)
+    plain = chain.given_mesh(true_mesh, scene, scene, unknown)
     assert torch.equal(plain.vertices_world, true_mesh.vertices_world.float())
     for mesh, source in ((brought, scene.views), (true_mesh, far)):
-        found = chain.given_mesh(mesh, source, far)
+        found = chain.given_mesh(mesh, source, far, unknown)
         assert_close(found.vertices_world, plain.vertices_world, rtol=0, atol=1e-6)
-    assert chain.given_mesh(None, scene.views, far) is None
+    assert chain.given_mesh(None, scene.views, far, unknown) is None
     with pytest.warns(PimperWarning, match=r"is off .*rays to 0 of \d+ "):
-        chain.given_mesh(exchanged(brought, 0, 2, 1), scene.views, far)
+        chain.given_mesh(exchanged(brought, 0, 2, 1), scene.views, far, unknown)

@@ -1,65 +1,166 @@
-"""Whether a brought mesh is where the photographs show the object."""
+"""Whether a brought mesh is where points and masks show the object."""
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Mesh, SparseScene
+from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
 
-_NEAR = (
-    0.03  # of its diagonal, within which a point is on the mesh: rough meshes are off by as much
-)
+# Rays: at most so many to points, and so many along a photograph's longer side.
+_MAX_RAYS, _SIDE = 4000, 64
+# A point is on the mesh within this fraction of its diagonal: rough meshes are off by as much.
+_NEAR = 0.03
 
 
-def compare_with_scene(mesh: Mesh, scene: SparseScene) -> dict[str, int | float]:
-    """Compare a mesh with the points of a scene; warn of one that is far off.
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Rays(Record):
+    """Rays of the cameras, and what is known of each.
+
+    Attributes:
+        directions: To a point, with its distance for length; through a pixel.
+        inside: Whether a pixel's mask has it; true for points.
+    """
+
+    origins: Float[Tensor, "ray 3"]
+    directions: Float[Tensor, "ray 3"]
+    inside: Bool[Tensor, " ray"]
+    to_point: Bool[Tensor, " ray"]
+
+
+def compare_with_scene(
+    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
+) -> dict[str, int | float]:
+    """Compare a mesh with the points and masks of a scene; warn of one that is far off.
 
     A point that a camera saw lies neither behind the mesh nor before it: rays to observed points
     meet the mesh at the point, or nowhere, as those to the background do.
 
+    Args:
+        silhouettes: Compared too where they are masks that came with the photographs.
+
     Returns:
         Figures, as far as they are known: median distance of points whose rays meet the mesh in per
-        cent of its diagonal, the fraction of these on it, number of such rays.
-
-    Raises:
-        InputError: Next to nothing fits.
+        cent of its diagonal, the fraction of these on it, overlap with masks, number of such rays.
     """
-    used = mesh.vertices_world[mesh.faces.flatten()].double()
-    diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
-    step = -(-len(scene.observation_point) // 4000) or 1
-    point, view = scene.observation_point[::step], scene.observation_view[::step]
-    origins = scene.cameras.centers_world.detach().double()[view].cpu()
-    points = scene.points_world[point].detach().double().cpu()
-    rays = points - origins
-    cast = RayCaster(mesh.vertices_world, mesh.faces).cast(origins, rays)
-    met, length = cast.face >= 0, rays.norm(dim=1)
-    # Nothing is near in a mesh that the cameras are inside of.
-    near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
-    hits, count = int(met.sum()), len(rays)
-    on_mesh, distance = math.nan, math.nan
-    told = f"rays to {hits} of {count} observed points meet it"
-    if hits:
-        distance = float(NearestSurface(mesh).query(points[met]).distance.median()) / diagonal
-    if hits >= min(30, max(1, count // 4)):  # fewer tell nothing
-        on_mesh = int((near & met).sum()) / hits
-        told = (
-            f"{on_mesh:.0%} of {hits} observed points whose rays meet it are within {_NEAR:.0%} of "
-            f"its diagonal of it, their median distance is {100 * distance:.2g}% of the diagonal "
-            f"({distance * diagonal:.3g})"
-        )
+    fit = _fit(mesh, _rays(scene, silhouettes))
     frame = "in the frame of the cameras, with their axes and their unit"
     # The box round an object is off by less than a tenth of its diagonal.
-    if on_mesh < 0.1 and not distance < 0.1:
+    if fit.score < 0.1 and not fit.distance < 0.1:
         raise InputError(
-            f"The given mesh is not where the photographs show the object: {told}. It has to be "
-            f"{frame}: give the model that it belongs to by `--sparse`, or align it first."
+            f"The given mesh is not where the photographs show the object: {fit.told()}. It has to "
+            f"be {frame}: give the model that it belongs to by `--sparse`, or align it first."
         )
-    unknown = math.isnan(on_mesh) and count >= 30
-    if unknown or distance > 0.02 or on_mesh < 0.8:
+    unknown = math.isnan(fit.score) and fit.rays >= 30
+    if unknown or fit.distance > 0.02 or fit.score < 0.8 or fit.overlap < 0.8:
         caution(
-            f"The given mesh is off what the photographs show: {told}. Look whether it is {frame}, "
-            "and of this object."
+            f"The given mesh is off what the photographs show: {fit.told()}. Look whether it is "
+            f"{frame}, and of this object."
         )
-    figures = {"distance_percent": 100 * distance, "on_mesh": on_mesh, "observations": hits}
+    figures = {
+        "distance_percent": 100 * fit.distance,
+        "on_mesh": fit.on_mesh,
+        "overlap": fit.overlap,
+        "observations": fit.hits,
+    }
     return {name: value for name, value in figures.items() if not math.isnan(value)}
+
+
+class _Fit(NamedTuple):
+    """Agreement of a mesh with photographs; NaN for what nothing tells.
+
+    Attributes:
+        hits: Of these, the ones that meet the mesh.
+        on_mesh: Fraction of the hits whose point is on it.
+        overlap: Of its silhouettes with the masks, intersection over union.
+        distance: Median of the hits' points, in diagonals.
+    """
+
+    rays: int
+    hits: int
+    on_mesh: float
+    overlap: float
+    distance: float
+    diagonal: float
+
+    @property
+    def score(self) -> float:
+        """Mean of the fractions that are known: a poor cloud does not refuse what masks show."""
+        known = [value for value in (self.on_mesh, self.overlap) if not math.isnan(value)]
+        return sum(known) / len(known) if known else math.nan
+
+    def told(self) -> str:
+        """State how far off the mesh is, in a part of a sentence."""
+        told = f"rays to {self.hits} of {self.rays} observed points meet it"
+        if not math.isnan(self.on_mesh):
+            told = (
+                f"{self.on_mesh:.0%} of {self.hits} observed points whose rays meet it are within "
+                f"{_NEAR:.0%} of its diagonal of it, their median distance is "
+                f"{100 * self.distance:.2g}% of the diagonal ({self.distance * self.diagonal:.3g})"
+            )
+        if math.isnan(self.overlap):
+            return told
+        return f"{told}, and its silhouettes overlap with the masks by {self.overlap:.0%}"
+
+
+def _fit(mesh: Mesh, rays: Rays) -> _Fit:
+    used = mesh.vertices_world[mesh.faces.flatten()].double()
+    diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
+    cast = RayCaster(mesh.vertices_world, mesh.faces).cast(rays.origins, rays.directions)
+    met, length = cast.face >= 0, rays.directions.norm(dim=1)
+    # Nothing is near in a mesh that the cameras are inside of.
+    near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
+    reached = met & rays.to_point
+    hits, count = int(reached.sum()), int(rays.to_point.sum())
+    shown, inside = met[~rays.to_point], rays.inside[~rays.to_point]
+    distance = on_mesh = overlap = math.nan
+    if hits:
+        points = (rays.origins + rays.directions)[reached]
+        distance = float(NearestSurface(mesh).query(points).distance.median()) / diagonal
+    if hits >= min(30, max(1, count // 4)):  # fewer tell nothing
+        on_mesh = int((near & reached).sum()) / hits
+    if len(inside):
+        overlap = int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
+    return _Fit(count, hits, on_mesh, overlap, distance, diagonal)
+
+
+def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
+    """Return rays to observed points, with masks to those on the object; then through pixels.
+
+    Of every photograph that has a mask a raster of pixels is taken.
+    """
+    cameras, masked = scene.cameras, silhouettes.source == "masks"
+    masks = silhouettes.inside > 0.5
+    step = -(-len(scene.observation_point) // _MAX_RAYS) or 1
+    point, view = scene.observation_point[::step], scene.observation_view[::step]
+    if masked:
+        height, width = masks.shape[-2:]
+        column, row = scene.observation_pixels[::step].floor().long().unbind(dim=-1)
+        drawn = masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        point, view = point[drawn], view[drawn]
+    centers, poses = cameras.centers_world.detach().double(), cameras.cam_from_world.detach()
+    to_points = scene.points_world[point].detach().double() - centers[view]
+    parts = [(centers[view], to_points, torch.ones_like(to_points[:, 0], dtype=torch.bool))]
+    for number in range(cameras.num_views if masked else 0):
+        width, height = (int(side) for side in cameras.sizes_px[number])
+        step = -(-max(width, height) // _SIDE)
+        raster = slice(step // 2, None, step)
+        mask = masks[number, :height, :width][raster, raster].flatten()
+        if (
+            bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= 0.95
+        ):  # else no silhouette
+            pose, K = poses[number].double(), cameras.intrinsics[number].detach().double()
+            pixels = pixel_centers(width, height, like=pose)[raster, raster].reshape(-1, 2)
+            rays = rays_through(pixels, pose, K)
+            parts.append((centers[number].expand_as(rays), rays, mask))
+    origins, directions, inside = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
+    to_point = torch.arange(len(origins)) < len(point)
+    return Rays(origins=origins, directions=directions, inside=inside, to_point=to_point)
