@@ -69,7 +69,7 @@ PATCHES: dict[str, dict[str, object]] = {
     "sfm.one_lens": {"sfm.reconstruct.doubt_one_lens": lambda _: ""},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
-    "silhouettes.shadows": {"silhouettes.agreement._without_shadows": lambda cuts: cuts},
+    "silhouettes.shadows": {"silhouettes.reliability._without_shadows": lambda cuts: cuts},
     "coarse.seen_through": {"coarse.fine_surface._MIN_BEHIND": 10**9},
     "coarse.fringes": {"coarse.fine_surface.fringes": nothing(1)},
     "remesh.outside": {
