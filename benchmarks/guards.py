@@ -63,9 +63,9 @@ def everything(like: int) -> Callable[..., Tensor]:
 PATCHES: dict[str, dict[str, object]] = {
     "sfm.room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
     "sfm.shifted_room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
-    "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: (None, ())},
+    "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: ()},
     "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
-    "sfm.misplaced": {"sfm.agreement._MIN_AGREEMENT": 0.0},
+    "sfm.misplaced": {"sfm.doubt._MIN_AGREEMENT": 0.0},
     "sfm.one_lens": {"sfm.reconstruct.doubt_one_lens": lambda _: ""},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},

@@ -16,7 +16,6 @@ from pimper_torch.journal import Journal, current, writing
 from pimper_torch.records.failure import LeftOut, What
 
 GUARDS: dict[str, tuple[What, str]] = {
-    "sfm.quarter_turns": ("doubt", "turned as the sensor lay"),
     "sfm.room": ("features", "at rest while others move"),
     "sfm.shifted_room": ("features", "shift together while others move"),
     "sfm.moved_object": ("matches", "of the surroundings, between series"),
@@ -27,7 +26,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "sfm.one_lens": ("doubt", "a lens for each photograph fits better"),
     "sfm.missing": ("photographs", "not registered"),
     "sfm.doubt": ("doubt", "points tell no depth"),
-    "sfm.broken_images": ("photographs", "broken in the given model"),
     "sfm.broken_points": ("points", "broken in the given model"),
     "sfm.sound_points": ("points", "not finite"),
     "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),

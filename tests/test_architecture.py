@@ -72,7 +72,7 @@ ROOMS = [
 ]
 
 SOLE_IMPORTERS = {
-    "pycolmap": {"sfm/binding.py"},
+    "pycolmap": {"sfm/colmap.py"},
     "embreex": {"geometry/visibility.py"},
     "xatlas": {"asset/charts.py"},
     "fcpw": {"geometry/nearest.py"},

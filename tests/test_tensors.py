@@ -181,7 +181,7 @@ def test_a_chain_refuses_poses_of_another_convention():
     views = photographs(cameras, lit=False)
     poses = cameras.cam_from_world.inverse()
     made = pt.scene_of(views.images.float(), cameras.intrinsics, poses)
-    with pytest.raises(pt.InputError, match=r"The scene: these cameras.*invert them"):
+    with pytest.raises(pt.InputError, match=r"The scene: these cameras.*not its inverse"):
         placed(made)
 
 

@@ -12,11 +12,11 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
+    decompose_projections,
     number_lenses,
     pinhole_lens,
     rigid_or_refuse,
 )
-from pimper_torch.camera_files.projections import decompose_projections
 from pimper_torch.errors import some
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.numpy_files import read_npz
@@ -132,12 +132,9 @@ def _array(
 
 
 def _decomposed(matrices: Sequence[Float[Tensor, "3 4"]], what: str, file: DataSetPath) -> Rig:
-    intrinsics, poses = [], []
     for index, matrix in enumerate(matrices):
         try:
-            (K,), (pose,) = decompose_projections(matrix[None])
+            decompose_projections(matrix[None])
         except ValueError as error:
             file.refuse(f"K [R t] in {what}{index}", str(error))
-        intrinsics.append(K)
-        poses.append(pose)
-    return torch.stack(intrinsics), torch.stack(poses)
+    return decompose_projections(torch.stack(list(matrices)))

@@ -13,9 +13,6 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, some
 
-_MAX_NAME = 255  # bytes, of most file systems
-_MAX_TEXT, _MAX_VALUE = 400, 80  # characters of a message that quote a file
-
 T = TypeVar("T")
 
 
@@ -41,8 +38,8 @@ class DataSetPath(NamedTuple):
         """
         found = contents(self.path) if found is None else found
         raise InputError(
-            f"{self.path}: not the layout of {self.kind}. Needed: {_shortened(needed, _MAX_TEXT)}. "
-            f"Found: {_shortened(found, _MAX_TEXT)}. Point to the folder that holds it, or choose "
+            f"{self.path}: not the layout of {self.kind}. Needed: {_shortened(needed, 400)}. "
+            f"Found: {_shortened(found, 400)}. Point to the folder that holds it, or choose "
             "the reader of another layout."
         )
 
@@ -87,16 +84,13 @@ class DataSetPath(NamedTuple):
 
         Links that lie in the folder are followed wherever they lead: who put them there wants that.
 
-        Returns:
-            Without ``..``, which would leave the folder behind a link.
-
         Raises:
             InputError: The path is absolute, leads out by ``..``, or is no path.
         """
         longest = max(
             len(part.encode("utf-8", "surrogatepass")) for part in (*Path(name).parts, "")
         )
-        self.expect(longest <= _MAX_NAME, "names of files", f"{name!r}")
+        self.expect(longest <= 255, "names of files", f"{name!r}")
         within = os.path.normpath(name)
         stays = not Path(name).anchor and Path(within).parts[:1] != ("..",) and "\0" not in name
         self.expect(stays, "paths that stay in this folder", f"{name!r}, which leads out of it")
@@ -159,7 +153,7 @@ def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
 
 
 def _shown(value: object) -> str:
-    return "nothing" if value is None else _shortened(repr(value), _MAX_VALUE)
+    return "nothing" if value is None else _shortened(repr(value), 80)
 
 
 def _shortened(text: str, most: int) -> str:

@@ -18,7 +18,6 @@ KIND = "a Meshroom cameras.sfm"
 # by how many parameters they have.
 _PARAMETERS = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3, "brown": 5, "fisheye4": 4}
 _NONE = ("pinhole", "none")
-_MAX_FOCAL_PX = 1e9  # of no lens
 
 
 def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
@@ -98,7 +97,7 @@ def _lens(
         fx = value("focalLength") / value("sensorWidth", default=36.0) * width
         ratio = value("pixelRatio", default=1.0)
         focal = torch.cat([fx, fx / ratio if version < (1, 2, 5) else fx * ratio])
-    positive = bool(((focal > 0) & (focal < _MAX_FOCAL_PX)).all())
+    positive = bool(((focal > 0) & (focal < 1e9)).all())
     file.expect(positive, "a positive focal length", f"{focal.tolist()}")
     center = value("principalPoint", 2)
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)

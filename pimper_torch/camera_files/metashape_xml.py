@@ -126,36 +126,24 @@ def _cam_from_world(
     what = f"transform of {camera.get('label')}"
     chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
     pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, file)
-    similarity = _similarity_of(camera, chunk)
-    if similarity is not None:
-        # Metres or whatever: the scale moves the camera and leaves its axes unit.
-        world_from_chunk, scale = _rigid_and_scale(similarity, file)
-        pose = world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3])
-    return invert_rigid(pose)
-
-
-def _similarity_of(
-    camera: ElementTree.Element, chunk: ElementTree.Element
-) -> ElementTree.Element | None:
     components = {
         component.get("id"): component.find("transform")
         for component in chunk.iterfind("components/component")
     }
-    found = components.get(camera.get("component_id"))
-    return chunk.find("transform") if found is None else found
+    similarity = components.get(camera.get("component_id"))
+    similarity = chunk.find("transform") if similarity is None else similarity
+    if similarity is None:
+        return invert_rigid(pose)
 
-
-def _rigid_and_scale(
-    element: ElementTree.Element, file: DataSetPath
-) -> tuple[Float[Tensor, "4 4"], float]:
     def values(tag: str, count: int, default: str) -> Float[Tensor, " value"]:
-        return file.numbers(element.findtext(tag, default), count, f"{tag} of the chunk")
+        return file.numbers(similarity.findtext(tag, default), count, f"{tag} of the chunk")
 
     rotation = values("rotation", 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
-    translation = values("translation", 3, "0 0 0")
-    scale = float(values("scale", 1, "1"))
+    shift, scale = values("translation", 3, "0 0 0"), float(values("scale", 1, "1"))
     file.expect(scale > 0, "a positive scale of the chunk", f"{scale}")
-    return rigid_or_refuse(rotation, translation, "the chunk's transform", file), scale
+    world_from_chunk = rigid_or_refuse(rotation, shift, "the chunk's transform", file)
+    # Metres or whatever: the scale moves the camera and leaves its axes unit.
+    return invert_rigid(world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3]))
 
 
 def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[Lens, float]:

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import scipy.linalg
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,9 +12,6 @@ from torch import Tensor
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Lens, Record
-
-# Files round a rotation to some digits; more than this is a scale or a reflection.
-_MAX_FROM_ROTATION = 1e-2
 
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
 """Width and height of photographs by their names in a file; ``None`` for those not there."""
@@ -26,7 +25,6 @@ class PosedCamera(Record):
         name: Of its photograph, or path, as the file has it.
         cam_from_world: Rigid, in float64; camera axes x right, y down, z forward.
         lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own.
-        skew_px: ``K[0, 1]``.
     """
 
     name: str
@@ -64,5 +62,42 @@ def rigid_or_refuse(
     off = float((rotation - nearest).abs().max())
     mirrored = bool(torch.linalg.det(nearest) < 0)
     found = "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation"
-    file.expect(off <= _MAX_FROM_ROTATION and not mirrored, f"a rotation in {what}", found)
+    # Files round a rotation to some digits; more than this is a scale or a reflection.
+    file.expect(off <= 0.01 and not mirrored, f"a rotation in {what}", found)
     return rigid(nearest, translation)
+
+
+def decompose_projections(
+    projections: Float[Tensor, "view 3 4"],
+) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
+    r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
+
+    ``P`` is known up to a factor, negative ones included. The left 3x3 block is an upper
+    triangular matrix times an orthogonal one (RQ); that ``K`` has a positive diagonal and
+    ``R`` is a rotation makes the split unique. What the cameras project stays exactly the
+    same, also where a file's ``R`` was not orthogonal: the rest goes into ``K``.
+
+    Returns:
+        ``K`` with ``K[2, 2] = 1``, its skew kept, and rigid transforms; float64.
+
+    Raises:
+        ValueError: A left block without inverse, the matrix of no finite camera.
+
+    Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
+    """
+    intrinsics, poses = [], []
+    for matrix in projections.detach().cpu().double().numpy():
+        left = matrix[:, :3]
+        determinant = float(np.linalg.det(left))
+        size = float(np.linalg.norm(left))
+        # Rows of K [R | t] differ by the focal length in pixels, cubes of it at most.
+        if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
+            raise ValueError("the left 3x3 block has no inverse")
+        proper = matrix if determinant > 0 else -matrix
+        K, R = scipy.linalg.rq(proper[:, :3])
+        signs = np.where(np.diag(K) < 0, -1.0, 1.0)
+        K, R = K * signs, signs[:, None] * R
+        intrinsics.append(torch.from_numpy(K / K[2, 2]))
+        translation = torch.from_numpy(np.linalg.solve(K, proper[:, 3]))
+        poses.append(rigid(torch.from_numpy(R), translation))
+    return torch.stack(intrinsics), torch.stack(poses)

@@ -18,7 +18,6 @@ def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> l
     """Read the cameras of ``transforms.json``, Meshroom, Metashape, or NumPy's archives.
 
     Args:
-        path: The file. JSON tells by what it holds whose it is.
         photographs: Their names, for cameras that go by the order of these.
         sizes_of: Photographs that a file names, for cameras without a size.
 

@@ -38,9 +38,9 @@ from pimper_torch.records import (
 from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
 from pimper_torch.sfm.poses import with_poses
 from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.sound_views import sound
+from pimper_torch.sfm.sparse_scene import sound
 from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
-from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+from pimper_torch.sfm.undistort import with_undistorted_priors
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store
 

@@ -20,14 +20,8 @@ from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 from pimper_torch.sfm.lenses import group_lenses
 
-# Choices, all of them; 24 photographs of the demo and rendered scenes are within.
-_FEW = 8  # with fewer, hardly a facet is lit in enough views
+# 24 photographs of the demo and rendered scenes are within these and the other limits.
 _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and beside the median of the folder
-_SHARP_PX = 0.5  # as sharp as pixels are
-_SATURATED = 0.05
-_DARK = 0.05  # of saturation: in 8 bits of sRGB 63 levels are left
-_FEW_OF_A_LENS = 3  # with fewer, its focal length is hardly told from its distance
-_NAMED = 4  # photographs in a sentence
 
 
 def examine_folder(
@@ -35,12 +29,8 @@ def examine_folder(
 ) -> list[Finding]:
     """Examine the photographs of a folder, in seconds.
 
-    Args:
-        encoding: As of :func:`pimper_torch.io.photographs.load_views`.
-
     Returns:
-        In the order of the checks: files, samples, number, blur, saturation, exposure, lenses,
-        overlap, light, cost.
+        Of files, samples, number, blur, saturation, exposure, lenses, overlap, light and cost.
 
     Raises:
         InputError: No such folder, or no images in it.
@@ -87,9 +77,9 @@ def number(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     if len(photographs) < MIN_PHOTOGRAPHS:
         advice = "Take 20 to 40 round the object, each under another position of the light."
         yield warned("number", found, f"{MIN_PHOTOGRAPHS} at least", advice, "error")
-    elif len(photographs) < _FEW:
+    elif len(photographs) < 8:
         advice = "Normals come from at least 4 lights on every part. Take more photographs."
-        yield warned("number", found, f"{_FEW} or more", advice)
+        yield warned("number", found, "8 or more", advice)
     else:
         yield ok("number", found)
 
@@ -105,7 +95,7 @@ def blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     if blurred:
         yield warned(
             "blur",
-            f"{len(blurred)} of {len(photographs)} are blurred: {some(blurred, _NAMED)}",
+            f"{len(blurred)} of {len(photographs)} are blurred: {some(blurred, 4)}",
             f"edges of at most {limit:.1f} px, the median being {usual:.1f}",
             "Take them again from a tripod or with a shorter exposure, or leave them out.",
         )
@@ -119,36 +109,34 @@ def blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
             "note",
         )
     else:
-        amount = f"{usual:.1f} px" if usual >= _SHARP_PX else f"less than {_SHARP_PX} px"
+        amount = f"{usual:.1f} px" if usual >= 0.5 else "less than 0.5 px"
         yield ok("blur", f"sharp, edges blurred by {amount} in the median")
 
 
 def saturation(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Find photographs of which much is saturated."""
-    burnt = [
-        f"{one.name} ({one.saturated:.0%})" for one in photographs if one.saturated > _SATURATED
-    ]
+    burnt = [f"{one.name} ({one.saturated:.0%})" for one in photographs if one.saturated > 0.05]
     most = max((one.saturated for one in photographs), default=0.0)
     if not burnt:
         yield ok("saturation", f"at most {most:.1%} of a photograph saturated")
         return
     yield warned(
         "saturation",
-        f"{len(burnt)} of {len(photographs)} are saturated in part: {some(burnt, _NAMED)}",
-        f"{_SATURATED:.0%} of the pixels at most",
+        f"{len(burnt)} of {len(photographs)} are saturated in part: {some(burnt, 4)}",
+        "5% of the pixels at most",
         "Saturated pixels tell no light. Expose less, or darken a white background.",
     )
 
 
 def exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Find photographs that are dark all over."""
-    dark = [f"{one.name} ({one.bright:.1%})" for one in photographs if one.bright < _DARK]
+    dark = [f"{one.name} ({one.bright:.1%})" for one in photographs if one.bright < 0.05]
     if dark:
         yield warned(
             "exposure",
             f"{len(dark)} of {len(photographs)} are dark, brightest parts in per cent of "
-            f"saturation: {some(dark, _NAMED)}",
-            f"{_DARK:.0%} or more",
+            f"saturation: {some(dark, 4)}",
+            "5% or more",
             "Expose longer: noise takes the place of shading.",
         )
     elif photographs:
@@ -159,7 +147,8 @@ def exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
 def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Group photographs by size and focal length, as each lens is found for itself."""
     numbers = group_lenses(
-        [(one.width, one.height) for one in photographs], [one.focal_px for one in photographs]
+        [(max(one.width, one.height), min(one.width, one.height)) for one in photographs],
+        [one.focal_px for one in photographs],
     )
     if not numbers:
         return
@@ -172,11 +161,11 @@ def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     )
     several = len(counts) > 1
     what = f"{len(counts)} lenses, focal lengths or formats" if several else "one lens"
-    if several and min(count for _, count in counts) < _FEW_OF_A_LENS:
+    if several and min(count for _, count in counts) < 3:
         yield warned(
             "lenses",
             f"{what}: {told}",
-            f"{_FEW_OF_A_LENS} photographs or more of each, as each is found for itself",
+            "3 photographs or more of each, as each is found for itself",
             "Crop and zoom no more, or give `--reconstruct.shared-camera` if it is one lens "
             "whatever EXIF says.",
         )

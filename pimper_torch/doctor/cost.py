@@ -13,7 +13,6 @@ from pimper_torch.doctor.photograph import Photograph
 # photograph: 1.2 GB for the demo, 3.0 for the jar. Depth maps take 7.3 MB a photograph
 # (docs/decisions.md, "Photographs on disk").
 _GB, _GB_A_MEGAPIXEL_OF_ONE, _GB_A_VIEW = 0.9, 1.25, 0.0073
-_GB_OF_DISK = 0.045  # a megapixel: photographs twice, masks, silhouettes and pyramids
 
 
 def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
@@ -67,7 +66,7 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
     told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
-    if (disk := _GB_OF_DISK * megapixels) > needed:
+    if (disk := 0.045 * megapixels) > needed:  # photographs twice, masks and pyramids
         told = f"{told}; {disk:.0f} GB of disk for temporary files"
     if available_gb is None or needed <= available_gb:
         yield ok("cost", told)

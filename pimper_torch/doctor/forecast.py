@@ -5,9 +5,6 @@ from collections.abc import Sequence
 
 from pimper_torch.records import StageReport
 
-# Share of a plan's seconds that its own scale is worth, beside what this machine took so far.
-_PLANNED_WEIGHT = 0.05
-
 
 class Forecast:
     """An observer that scales planned seconds by what stages took in this run.
@@ -67,6 +64,7 @@ class Forecast:
         own = [real / planned for one, planned, real in self._ended if one == name]
         if own:
             return own[-1]
-        weight = _PLANNED_WEIGHT * sum(seconds for _, seconds in self.plan)
+        # What the plan's own scale is worth, beside what this machine took so far.
+        weight = 0.05 * sum(seconds for _, seconds in self.plan)
         planned = sum(seconds for _, seconds, _ in taken)
         return (weight + sum(real for *_, real in taken)) / (weight + planned)

@@ -12,9 +12,7 @@ from pimper_torch.cores import usable_cores
 from pimper_torch.doctor.findings import Finding, ok, warned
 from pimper_torch.io.version import versions
 
-_GB = 1e9
 _NEEDED = ("numba", "pycolmap", "kornia", "embreex", "fcpw", "cholespy", "cv2", "skimage")
-_LEAST_GB = 2.5  # of memory: the demo takes 2.06 (benchmarks/README.md, "Speed")
 
 
 def machine() -> Iterator[Finding]:
@@ -37,9 +35,9 @@ def machine() -> Iterator[Finding]:
         yield Finding(check="memory", severity="note", found="the system does not tell its memory")
         return
     found = f"{free:.1f} of {total:.1f} GB are free"
-    if free < _LEAST_GB:
+    if free < 2.5:
         advice = "Close other programs; the demo takes that much."
-        yield warned("memory", found, f"{_LEAST_GB} GB", advice)
+        yield warned("memory", found, "2.5 GB", advice)
     else:
         yield ok("memory", found)
 
@@ -55,11 +53,11 @@ def available_gb() -> float | None:
         limit = float((group / "memory.max").read_text(encoding="ascii"))
         used = float((group / "memory.current").read_text(encoding="ascii"))
         free = min(free or limit, limit - used)
-    return None if free is None else free / _GB
+    return None if free is None else free / 1e9
 
 
 def total_gb() -> float | None:
     """Return the memory of the machine; ``None`` where the system does not tell."""
     with suppress(AttributeError, OSError, ValueError):
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / _GB
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return None

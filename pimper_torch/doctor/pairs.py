@@ -16,23 +16,15 @@ from pimper_torch.doctor.photograph import Photograph
 from pimper_torch.errors import some
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Views
-from pimper_torch.sfm.features import SMALLEST_PX, find_features
+from pimper_torch.sfm.features import SMALLEST_PX, find_features, workspace
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs, match_pairs, verified_pairs
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.workspace import workspace
 
-_MAX_PAIRS = 800  # of 40 photographs all; of more those next in the order of their names
-# Verified matches of a pair: fewer come about by chance.
-_LINKED = 12
-_WINDOW = 5  # pixels of the small copy round a feature, as blobs are
-_NEIGHBOURS = 9  # features whose median tells shading, which is smooth, from noise, which is not
 _MIN_MATCHES = 30
-_DARK = 0.004  # of saturation: below, a level of 8 bits is a fifth of the value
 # Of four rendered scenes of 12 photographs, mug and potatoes: 0.02 and 0.01 under constant light,
 # 0.47 and 0.18 under a point light that moves; 0.11 of the demo's skull, whose flash is on the
 # camera.
 _CONSTANT = 0.04
-_GAUSSIAN = 1.4826  # standard deviations in a median absolute deviation
 
 
 def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[VerifiedPair]:
@@ -60,7 +52,8 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Verifi
     )
     with workspace(views, settings.num_threads) as space:
         find_features(space, settings, [None] * count, range(count))
-        match_pairs(space, pairs[:_MAX_PAIRS], settings, _LINKED)
+        # Of 40 photographs all pairs; fewer verified matches come about by chance.
+        match_pairs(space, pairs[:800], settings, 12)
         return [
             pair.replace(views=(large[pair.views[0]], large[pair.views[1]]))
             for pair in verified_pairs(space)
@@ -110,9 +103,9 @@ def light_variation(
         Robust standard deviation of the logarithm of the ratio of shadings: 0.1 is 10 per cent.
     """
     ratio = (second / first).log()
-    near = torch.cdist(pixels, pixels).topk(_NEIGHBOURS, largest=False).indices
+    near = torch.cdist(pixels, pixels).topk(9, largest=False).indices
     smooth = ratio[near].median(dim=1).values
-    return _GAUSSIAN * float((smooth - smooth.median()).abs().median())
+    return 1.4826 * float((smooth - smooth.median()).abs().median())
 
 
 def variations(photographs: Sequence[Photograph], matches: Sequence[VerifiedPair]) -> list[float]:
@@ -122,7 +115,8 @@ def variations(photographs: Sequence[Photograph], matches: Sequence[VerifiedPair
     for match in matches:
         one, other = (means[index] for index in match.views)
         here, there = _at(one, match.first), _at(other, match.second)
-        kept = (here > _DARK) & (there > _DARK)  # NaN where saturated
+        # Below, a level of 8 bits is a fifth of the value; NaN where saturated.
+        kept = (here > 0.004) & (there > 0.004)
         if kept.sum() >= _MIN_MATCHES:
             found.append(light_variation(here[kept], there[kept], match.first[kept]))
     return found
@@ -157,7 +151,7 @@ def _mean(one: Photograph) -> Float[Tensor, "rows columns"]:
     """Average radiance over windows; NaN where some of it is saturated."""
     burnt = (one.small_saturated >= SATURATED).to(one.small)
     radiance, saturated = avg_pool2d(
-        torch.stack([one.small, burnt]), _WINDOW, 1, _WINDOW // 2, count_include_pad=False
+        torch.stack([one.small, burnt]), 5, 1, 2, count_include_pad=False
     )
     return torch.where(saturated > 0, torch.nan, radiance)
 

@@ -13,8 +13,8 @@ from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights
 from pimper_torch.numpy_files import read_npz
 from pimper_torch.records import Estimate, Reconstruction
-from pimper_torch.sfm.agreement import pinholes_of
 from pimper_torch.sfm.colmap import read_model
+from pimper_torch.sfm.epipolar import pinholes_of
 
 _KIND = "a result of `pimper reconstruct`"
 

@@ -21,7 +21,6 @@ from pimper_torch.io.responses import tell_cautions
 from pimper_torch.mapped import drop_pages, each, parts, zeros
 from pimper_torch.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.records import Views
-from pimper_torch.sfm.conventions.masks import drawn_as_stored, object_is_dark
 
 MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
 _LIT_FRACTION = 1e-3  # more than hot pixels
@@ -107,11 +106,10 @@ def load_views(
     drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
     opacities, dark = [], False
     if mask_paths is not None:
-        ways = _read_masks(mask_paths, paths, headers)
-        opacities = _laid(ways, images, sizes, Path(str(masks)))
+        opacities = _read_masks(mask_paths, paths, headers)
         dark = mask_object == "dark"
         if mask_object == "auto":
-            dark = object_is_dark(opacities, str(masks))
+            dark = _object_is_dark(opacities, str(masks))
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if opacities:
             opacity = 1 - opacities[index] if dark else opacities[index]
@@ -376,8 +374,8 @@ def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height wi
 
 def _read_masks(
     paths: Sequence[Path], photographs: Sequence[Path], headers: Sequence[Header]
-) -> list[list[Float[Tensor, "_ _"]]]:
-    """Read 1 on the object, 0 off it, in the ways in which each mask may lie on its photograph."""
+) -> list[Float[Tensor, "_ _"]]:
+    """Read 1 on the object, 0 off it."""
     masks = [read_header(path) for path in paths]
     levels = parts([(mask.height, mask.width) for mask in masks])
     for (level,), path, mask, header in zip(each(levels), paths, masks, headers, strict=True):
@@ -385,13 +383,13 @@ def _read_masks(
         if sorted((mask.width, mask.height)) == sorted((header.width, header.height)):
             level.copy_(_brightness(path))
     drawn = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
-    return [_mask_ways(*one) for one in drawn]
+    return [_laid(*one) for one in drawn]
 
 
-def _mask_ways(
+def _laid(
     drawn: Float[Tensor, "_ _"], path: Path, mask: Header, photograph: Path, header: Header
-) -> list[Float[Tensor, "_ _"]]:
-    """Return the ways in which a mask may lie on its photograph: as it is, or turned by EXIF.
+) -> Float[Tensor, "_ _"]:
+    """Return a mask as it is, or where only that fits turned by its photograph's EXIF.
 
     Args:
         drawn: As the mask's file has it, turned by an EXIF of its own.
@@ -401,29 +399,33 @@ def _mask_ways(
         ways.append(torch.from_numpy(rotated(drawn.numpy(), header.orientation)))
     fitting = [way for way in ways if way.shape == (header.height, header.width)]
     if fitting:
-        return fitting
+        return fitting[0]
     raise InputError(
         f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} is "
         f"{header.width} x {header.height}; needed: a mask of the same size."
     )
 
 
-def _laid(
-    ways: Sequence[list[Float[Tensor, "_ _"]]],
-    images: Float[Tensor, "view channel height width"],
-    sizes: Sequence[tuple[int, int]],
-    folder: Path,
-) -> list[Float[Tensor, "_ _"]]:
-    """Lay masks on their photographs, those of stored pixels turned."""
-    if all(len(several) == 1 for several in ways):
-        return [several[0] for several in ways]
-    drawn = [
-        tuple(resized_mask(way, *size) for way in several) if len(several) > 1 else ()
-        for several, size in zip(ways, sizes, strict=True)
-    ]
-    pictures = [image[:, :high, :wide] for image, (wide, high) in zip(images, sizes, strict=True)]
-    stored = drawn_as_stored(drawn, pictures, str(folder))
-    return [several[-1 if stored else 0] for several in ways]
+def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: str) -> bool:
+    """Return whether masks show the object dark, by all of them together; a warning says so."""
+    border, centre = [], []
+    for (opacity,) in each(opacities):
+        high, wide = opacity.shape
+        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
+        border.append(opacity[:, -1].mean())
+        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
+        centre.append(inner.mean())
+    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    # An object that fills its photographs is bright in the centre, too.
+    dark = fractions[1] < 0.75 < fractions[0]
+    if dark:
+        caution(
+            f"{where}: the masks are bright along {fractions[0]:.0%} of the border and "
+            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
+            "`--mask-object bright` says that it is not.",
+            stacklevel=4,
+        )
+    return dark
 
 
 def _brightness(path: Path) -> Float[Tensor, "height width"]:

@@ -21,34 +21,19 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.sfm.static_background import Keypoints, Pair
+from pimper_torch.sfm.matching import Keypoints, Matches, pixels_of
 
-# References tried, evenly over the sequence; the one to which most photographs can be tied is
-# taken. One alone may have been blurred or covered.
-_REFERENCES = 3
 # Fraction of the photographs that must be tied to the reference. Before rooms that shift all of 20
 # are (6 rendered turntables); of the skull's 24, round which a camera moves, 8 at most.
 _MIN_TIED = 0.5
-# Random pairs of matches; enough to hit two of the room once at 0.99 where it has 15 % of them.
-_TRIALS = 200
-# Matches that a hypothesis is scored on, and that a photograph is tied to all others by: choices.
-# All that there are take twice as long on 20 photographs, with the same features left out.
-_SCORED, _POOLED = 2000, 4000
 # Zoom, and roll in radians, of a touched tripod or of a cropped picture: a choice.
 _MAX_ZOOM, _MAX_ROLL = 1.3, 0.35
-# Fits to the matches that follow, half of them with the perspective row alone: choices.
-_ITERATIONS = 10
-# Times that every photograph is tied to all others together: a choice; the second sees all maps
-# that the first corrected.
-_SWEEPS = 2
-# Longest still match of a room that shifts: a choice; 4 times as much counts as motion.
-_MOST_STILL_PX = 10.0
 Ends = tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]
 
 
 def reference_from_photographs(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Matches,
     *,
     max_error_px: float,
     fewest: int,
@@ -59,9 +44,6 @@ def reference_from_photographs(
     Photographs are tied to a reference by the similarity that most of the matches of a pair
     follow. That may be part of the object's in some: each is then tied again, to all others
     together, of which only the room's agree.
-
-    Args:
-        max_error_px: Distance up to which a match follows a map.
 
     Returns:
         ``A`` of each photograph, the identity where one cannot be tied; ``None`` where most
@@ -77,7 +59,7 @@ def reference_from_photographs(
         best = max(best, maps, key=len)
     if len(best) < _MIN_TIED * count or shift_px(tuple(best.values()), keypoints) < 1:
         return None
-    for _ in range(_SWEEPS):
+    for _ in range(2):  # the second sees all maps that the first corrected
         for view in range(count):
             others = [other for other in matched[view] if other in best]
             if not others:
@@ -86,14 +68,14 @@ def reference_from_photographs(
                 torch.cat([matched[view][other][0] for other in others]),
                 torch.cat([mapped(best[other], matched[view][other][1]) for other in others]),
             )
-            some = torch.randperm(len(ends[0]), generator=generator)[:_POOLED]
+            some = torch.randperm(len(ends[0]), generator=generator)[:4000]
             found = fit_map(ends[0][some], ends[1][some], centre, max_error_px, generator)
             if found is not None and found[1].sum() >= fewest:
                 best[view] = found[0]
     return tuple(best.get(view, identity) for view in range(count))
 
 
-def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float) -> float:
+def still_length_px(keypoints: Keypoints, pairs: Matches, least_px: float) -> float:
     """Return the length up to which a match is still, between photographs mapped to one of them.
 
     A tripod that was touched has moved by a little, too, and things at other depths than most of
@@ -101,26 +83,19 @@ def still_length_px(keypoints: Keypoints, pairs: Sequence[Pair], least_px: float
     that are short: simulated with 0.2 px of noise and a camera that moves by 2 % of its distance
     before a room of that depth and twice as far, 5.7 px, with which 96 % of its features are
     found; with 2 px 69 %.
-
-    Args:
-        least_px: Given where more would not be needed.
     """
     lengths = torch.cat(
-        [
-            (keypoints[pair.first][first] - keypoints[pair.second][second]).norm(dim=1)
-            for pair in pairs
-            for first, second in [pair.matches.unbind(dim=1)]
-        ]
+        [torch.sub(*pixels_of(keypoints, pair, rows)).norm(dim=1) for pair, rows in pairs.items()]
     )
-    short = lengths[lengths < _MOST_STILL_PX]
+    short = lengths[lengths < 10]
     if len(short) == 0:
         return least_px
-    return min(max(least_px, 3 * float(short.median())), _MOST_STILL_PX)
+    return min(max(least_px, 3 * float(short.median())), 10.0)
 
 
 def references(count: int) -> list[int]:
-    """Name a few photographs, evenly over a sequence."""
-    return sorted({(2 * slot + 1) * count // (2 * _REFERENCES) for slot in range(_REFERENCES)})
+    """List three photographs, evenly over a sequence: one alone may be blurred or covered."""
+    return sorted({(2 * slot + 1) * count // 6 for slot in range(3)})
 
 
 def tied_to(
@@ -132,13 +107,10 @@ def tied_to(
     *,
     any_homography: bool = True,
 ) -> dict[int, tuple[Float[Tensor, "3 3"], Bool[Tensor, " match"]]]:
-    """Map photographs to a reference, each by itself.
+    """Find the map to a reference of each photograph that can be tied, and the matches that follow.
 
     Args:
         matched: Pixels in the reference and in each other photograph.
-
-    Returns:
-        The map to the reference of each photograph that can be tied, and the matches that follow.
     """
     tied = {}
     for view, (here, there) in matched.items():
@@ -176,8 +148,6 @@ def fit_map(
 
     Args:
         first: Pixels, also of matches that are wrong or of what turns.
-        centre: Of the picture, where the camera's axis meets it.
-        max_error_px: Distance up to which a match follows.
         any_homography: Whether the last fits are of all homographies, which large turns need: a
             plane seen from round it follows them, too, and no similarity with a perspective row.
 
@@ -188,22 +158,23 @@ def fit_map(
         return None
     first, second = first.double(), second.double()
     x, y = (torch.view_as_complex(end.contiguous()) for end in (first, second))
-    one, other = torch.randint(len(x), (2, _TRIALS), generator=generator)
+    # Enough to hit two of the room once at 0.99 where it has 15 % of the matches.
+    one, other = torch.randint(len(x), (2, 200), generator=generator)
     scale = (y[other] - y[one]) / (x[other] - x[one])  # not finite where both are one match
     small = (scale.abs().log().abs() < math.log(_MAX_ZOOM)) & (scale.angle().abs() < _MAX_ROLL)
     scale, shift = scale[small], (y[one] - scale * x[one])[small]
     if len(scale) == 0:
         return None
-    some = torch.randperm(len(x), generator=generator)[:_SCORED]
+    some = torch.randperm(len(x), generator=generator)[:2000]
     # Without perspective, a map is right in a part of the picture only.
     error = (scale[:, None] * x[some] + shift[:, None] - y[some]).abs()
     most = int((error < 2 * max_error_px).sum(dim=1).argmax())
     follows = (scale[most] * x + shift[most] - y).abs() < 2 * max_error_px
     matrix = _similarity(scale[most], shift[most])
-    for step in range(_ITERATIONS):
+    for step in range(10):
         if follows.sum() < 8:
             break
-        free = any_homography and step >= _ITERATIONS // 2
+        free = any_homography and step >= 5
         matrix = least_squares_map(first[follows], second[follows], None if free else centre)
         follows = (mapped(matrix, first) - second).norm(dim=1) < max_error_px
     return matrix, follows
@@ -257,13 +228,11 @@ def _similarity(scale: Complex[Tensor, ""], shift: Complex[Tensor, ""]) -> Float
     return torch.stack([a, -b, right, b, a, down, none, none, none + 1]).reshape(3, 3)
 
 
-def both_ways(keypoints: Keypoints, pairs: Sequence[Pair]) -> list[dict[int, Ends]]:
-    """Give, photograph by photograph, the matches with each other one: pixels here and there."""
+def both_ways(keypoints: Keypoints, pairs: Matches) -> list[dict[int, Ends]]:
+    """List, for each photograph, the matches with each other one: pixels here and there."""
     found: list[dict[int, Ends]] = [{} for _ in keypoints]
-    for pair in pairs:
-        if len(pair.matches):
-            first, second = pair.matches.unbind(dim=1)
-            ends = keypoints[pair.first][first], keypoints[pair.second][second]
-            found[pair.first][pair.second] = ends
-            found[pair.second][pair.first] = ends[1], ends[0]
+    for (first, second), rows in pairs.items():
+        if len(rows):
+            ends = pixels_of(keypoints, (first, second), rows)
+            found[first][second], found[second][first] = ends, ends[::-1]
     return found

@@ -1,5 +1,11 @@
 """COLMAP's models: of cameras, and of what they see."""
 
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +14,52 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.errors import OutputError
+from pimper_torch.errors import OutputError, caution
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras, Lens
-from pimper_torch.sfm.binding import loaded, quiet
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.model_files import read_files
-from pimper_torch.sfm.sound_model import sound_model
+from pimper_torch.sfm.model_files import read_files, sound_model
+
+
+def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
+    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace.
+
+    Pillow is loaded before it: both carry zlib, and where pycolmap's comes first, Pillow damages
+    its memory as soon as it writes a PNG.
+    """
+    fresh = "pycolmap" not in sys.modules
+    import PIL.Image  # noqa: F401 - see above
+    import pycolmap
+
+    if fresh and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    _tell_order()
+    return pycolmap
+
+
+@cache
+def _tell_order() -> None:
+    """Warn, once, where a script has loaded pycolmap before Pillow."""
+    names = list(sys.modules)  # in the order of loading
+    if names.index("pycolmap") < names.index("PIL._imaging"):
+        caution(
+            "pycolmap was imported before Pillow: both carry zlib, and writing a PNG will end this "
+            "process. Put `import PIL.Image` before `import pycolmap`."
+        )
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep COLMAP's log off stderr; what matters comes back as results or exceptions."""
+    pycolmap = loaded()
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -28,16 +74,9 @@ CAMERA_MODELS = (
 )
 """COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
 
-# A ray 40 degrees off the axis, where every fisheye is a tenth or more off a pinhole.
-_OBLIQUE = np.array([[0.7, 0.5, 1.0]])
-_SAME = 1e-9  # of a pixel's coordinate: rounding in double precision
-
 
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, text or binary.
-
-    Args:
-        folder: Holds ``cameras``, ``images`` and ``points3D``, each ``.txt`` or ``.bin``.
 
     Raises:
         InputError: The folder holds no model, one that is cut short or of another format, or one of
@@ -51,7 +90,6 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
     """Write a model as COLMAP's binary files.
 
     Args:
-        colors: 8-bit RGB, one a point.
         folder: Made if it does not exist; files of those names in it are replaced.
 
     Raises:
@@ -78,22 +116,16 @@ def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
 def is_pinhole(lens: Lens) -> bool:
     """Return whether the lens images straight lines as straight lines.
 
-    COLMAP calls a lens undistorted whose coefficients are all zero. Of a fisheye that is the
-    equidistant one, ``r = f theta``: an oblique ray tells it from a pinhole.
+    COLMAP calls a lens undistorted whose coefficients are all zero; of a fisheye that is the
+    equidistant one, ``r = f theta``.
     """
-    camera = _camera_of(lens)
-    if not bool(camera.is_undistorted()):
-        return False
-    pixel = np.asarray(camera.img_from_cam(_OBLIQUE), dtype=np.float64).reshape(2)
-    straight = (camera.calibration_matrix() @ _OBLIQUE[0])[:2]
-    return bool(np.abs(pixel - straight).max() <= _SAME * np.abs(straight).max())
+    return "FISHEYE" not in lens.model and bool(_camera_of(lens).is_undistorted())
 
 
 def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 2"]:
     """Find where the lens images directions, in pixels of the photograph.
 
     Args:
-        lens: Any of COLMAP's perspective or fisheye models.
         rays_cam: Camera frame, any length.
 
     Returns:
@@ -105,7 +137,7 @@ def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 
 
 
 def undistort_pixels(lens: Lens, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
-    """Undo :func:`distort`: give ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel."""
+    """Return ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel, as :func:`distort`."""
     columns = np.ascontiguousarray(pixels.detach().cpu().double().numpy())
     found = np.array(_camera_of(lens).cam_from_img(columns), dtype=np.float64).reshape(-1, 2)
     return torch.from_numpy(found).to(pixels)
@@ -115,13 +147,7 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
     """Follow a resize of the photograph."""
     camera = _camera_of(lens)
     camera.rescale(width, height)
-    return Lens(
-        camera=lens.camera,
-        model=lens.model,
-        params=tuple(float(value) for value in camera.params),
-        width=width,
-        height=height,
-    )
+    return _lens_of(camera)
 
 
 def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
@@ -174,7 +200,7 @@ def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
     )
 
 
-def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> Any:  # noqa: ANN401
+def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see _camera_of
     """Make COLMAP's own model; its ids keep the order of views and points."""
     pycolmap = loaded()
 
@@ -195,7 +221,8 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"]) -> A
     starts = np.searchsorted(
         model.observation_point.numpy()[order], np.arange(len(model.points_world) + 1)
     )
-    rgb = colors.cpu().numpy()
+    black = torch.zeros(len(model.points_world), 3, dtype=torch.uint8)
+    rgb = (black if colors is None else colors.cpu()).numpy()
     for index, xyz in enumerate(model.points_world.numpy()):
         track = pycolmap.Track()
         for observation in order[starts[index] : starts[index + 1]]:
@@ -218,3 +245,71 @@ def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
             Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
         )
     return tuple(lenses)
+
+
+def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
+    """Return the distance between where a point is seen and where it should be, in pixels.
+
+    Infinite for a point that a camera sees from behind.
+    """
+    residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
+    for index, lens in enumerate(model.lenses):
+        here = torch.nonzero(model.observation_view == index)[:, 0]
+        points = model.points_world[model.observation_point[here]]
+        expected = distort(lens, transform(model.cam_from_world[index], points))
+        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
+        residual[here] = distance.nan_to_num(nan=torch.inf)
+    return residual
+
+
+def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
+    """Average :func:`observation_errors` over each point's track."""
+    total = torch.zeros_like(model.points_world[:, 0])
+    total = total.index_add(0, model.observation_point, observation_errors(model))
+    count = torch.bincount(model.observation_point, minlength=len(total))
+    return total / count.clamp_min(1)
+
+
+def bundle(
+    model: SparseModel,
+    scale_px: float,
+    *,
+    cameras: bool = True,
+    tolerance: float = 1e-6,
+) -> SparseModel:
+    """Adjust poses, lenses and points to the observations, robustly.
+
+    Principal points stay; focal lengths and distortions are adjusted, one set a lens. On one
+    thread, so that the same observations give the same bits.
+
+    Args:
+        scale_px: Residual at which Cauchy's weight is a half.
+
+    Returns:
+        Views, points and observations in their old order.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale_px
+    options.ceres.solver_options.max_num_iterations = 100
+    options.ceres.solver_options.function_tolerance = tolerance
+    options.ceres.solver_options.num_threads = 1
+    with quiet():
+        reconstruction = reconstruction_of(model)
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            config.add_image(image_id)
+            if not cameras:
+                image = reconstruction.image(image_id)
+                config.set_constant_rig_from_world_pose(image.frame_id)
+                config.set_constant_cam_intrinsics(image.camera_id)
+        if cameras:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    return model_of(reconstruction).replace(
+        background_from_view=model.background_from_view, series=model.series
+    )

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -19,15 +20,31 @@ from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import barycentric
 from pimper_torch.geometry.topology import half_edges
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.exchange import read_faces, write_cloud, write_faces
+from pimper_torch.sfm.colmap import loaded, quiet
+
+
+def write_cloud(
+    points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"], path: Path
+) -> None:
+    """Write points with normals as binary PLY."""
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    start = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    rows = torch.cat([points, normals], dim=1).detach().cpu().float().numpy().astype("<f4")
+    path.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
+
+
+def read_faces(path: Path) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Read a triangle mesh that COLMAP wrote; float32."""
+    import trimesh
+
+    mesh = trimesh.load_mesh(path, process=False)
+    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32).reshape(-1, 3))
+    return vertices, torch.from_numpy(np.array(mesh.faces, dtype=np.int64).reshape(-1, 3))
+
 
 # COLMAP's octree is dense down to this depth, or to the least that any call of the process asked
 # for: a call with less would change the surfaces of all calls after it.
 _DENSE_DEPTH = 5
-
-# Weight of a mesh's border against its area when vertices are merged. A choice.
-_BORDER_WEIGHT = 10.0
 
 
 def poisson_surface(
@@ -73,7 +90,6 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     autograd.
 
     Args:
-        mesh: Any; one that is small enough comes back as it is.
         num_faces: Of the result at most; a few more are left where nothing else can be merged.
 
     Raises:
@@ -86,17 +102,20 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     require(num_faces >= 4, "faces", num_faces, "4 at least, those of a tetrahedron")
     if len(mesh.faces) <= num_faces:
         return mesh
+    import trimesh
+
     pycolmap = loaded()
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio = num_faces / len(mesh.faces)
-    options.boundary_weight, options.num_threads = _BORDER_WEIGHT, 1
+    options.boundary_weight, options.num_threads = 10.0, 1
     options.interpolate_colors = False
     # COLMAP works in single precision: a mesh far from the origin is brought there.
     places = mesh.vertices_world.detach().cpu().double()
     centre = places.median(dim=0).values
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        write_faces(places - centre, mesh.faces, before)
+        moved = trimesh.Trimesh((places - centre).numpy(), mesh.faces.cpu().numpy(), process=False)
+        moved.export(before, vertex_normal=False)
         vertices, faces = _made(
             after, "simplification", pycolmap.simplify_mesh, before, after, options
         )

@@ -1,40 +1,36 @@
 """A COLMAP model, or a file of cameras, that the photographs come with."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 from PIL import Image
 
 from pimper_torch.camera_files.read_cameras import read_cameras
-from pimper_torch.errors import InputError, ReconstructionError, caution, some
+from pimper_torch.errors import InputError, ReconstructionError, some
 from pimper_torch.file_names import match_files
-from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.conventions.resized_pictures import (
     REACHES,
     Ways,
-    allowed_turns,
     changed_views,
-    find_turns,
+    choose_turned,
     points_tell,
     possible_crops,
     possible_turns,
     tell_crop,
+    tell_turned,
 )
-from pimper_torch.sfm.model import SparseModel, match_names
-from pimper_torch.sfm.model_files import names_by_folder
-from pimper_torch.sfm.quarter_turns import (
+from pimper_torch.sfm.lenses import (
     turned_lens,
     turned_pixels,
     turned_pose,
     turned_size,
-    turning,
 )
-
-# Of the corners of a photograph by a skew, up to which it is rounding: a choice.
-_MAX_SKEW_PX = 0.1
+from pimper_torch.sfm.model import SparseModel, match_names
+from pimper_torch.sfm.model_files import largest_model
 
 
 def existing_ways(views: Views, path: Path) -> Ways:
@@ -43,15 +39,15 @@ def existing_ways(views: Views, path: Path) -> Ways:
     Args:
         views: Matched by file name; cameras may have been made from photographs of another size,
             and from the pixels that files store where EXIF turns them.
-        path: Folder of a COLMAP model, or of several in folders, of which the one with most of the
-            photographs is read; or a file of cameras, see
+        path: Folder of a COLMAP model, or of several in folders, of which the
+            largest is read; or a file of cameras, see
             :func:`~pimper_torch.camera_files.read_cameras.read_cameras`.
 
     Raises:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
         InputError: They do not belong to the photographs, or cannot be read.
     """
-    path = _largest(views, path)
+    path = largest_model(path)
     where = place(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
     model = match_names(read, views.names, where, views.folder)
@@ -62,49 +58,30 @@ def existing_ways(views: Views, path: Path) -> Ways:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    sizes = _whole_sizes(shown, model)
+    sizes = []  # before photographs were shrunk on reading, as the pictures lie
+    for view, lens in enumerate(model.lenses):
+        wide, high = _stored_size(shown, view)
+        sizes.append(turned_size(wide, high, int((wide > high) != (lens.width > lens.height))))
     changed = changed_views(model, sizes)
-    fits = bool(allowed_turns(model, shown).any(dim=1).all())
     plain, cropped = (
-        [
-            (one, follow_pictures(one, shown, way))
-            for one in some
-            for way in possible_turns(one, shown)
-        ]
-        for some in ([model] if fits else [], possible_crops(model, sizes))
+        [follow_pictures(one, shown, way) for one in models for way in possible_turns(one, shown)]
+        for models in ([model], possible_crops(model, sizes))
     )
     # That photographs were resized is the plain explanation: it may be told in larger steps.
     reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
-    told = model
-    if changed and not any(points_tell(one, shown, changed, reaches) for _, one in plain):
-        scores = [points_tell(one, shown, changed) for _, one in cropped]
+    if changed and not any(points_tell(one, shown, changed, reaches) for one in plain):
+        scores = [points_tell(one, shown, changed) for one in cropped]
         if not any(scores):
-            return Ways([one for _, one in plain], [one for _, one in cropped], changed)
-        told = cropped[scores.index(max(scores))][0]
+            return Ways(plain, cropped, changed)
+        crop = cropped[scores.index(max(scores))]
+        tell_crop(where, crop, changed, "what they show round its points")
+        return Ways([crop])
     if not len(model.points_world):
-        return Ways([one for _, one in plain])
-    placed = follow_pictures(told, shown, find_turns(told, shown, where))
-    if told is not model:
-        tell_crop(where, placed, changed, "what they show round its points")
-    return Ways([placed])
-
-
-def _largest(views: Views, folder: Path) -> Path:
-    """Choose the model of most of the photographs where a folder holds several, each in its own."""
-    counts: dict[Path, int] = {}
-    for path, names in names_by_folder(folder).items():
-        where, photographs = str(path), views.folder
-        matches = match_files(views.names, names, folder=photographs, where=where, what="image")
-        counts[path] = len(matches) - matches.count(None)
-    largest = max(counts, key=lambda path: counts[path], default=folder)
-    others = [f"{path.name} ({count})" for path, count in counts.items() if path != largest]
-    if others:
-        caution(
-            f"{folder} holds {len(counts)} COLMAP models, each in a frame of its own; read is "
-            f"{largest.name}, of {counts[largest]} of {views.num_views} photographs, not "
-            f"{some(others)}. Point to another one if that is meant."
-        )
-    return largest
+        return Ways(plain)
+    chosen = choose_turned(plain, shown, where)
+    if not torch.equal(chosen.cam_from_world, model.cam_from_world):
+        tell_turned(where, "what they show round its points")
+    return Ways([chosen])
 
 
 def place(path: Path) -> str:
@@ -130,7 +107,8 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
     skewed = [
         camera.name
         for camera in cameras
-        if abs(camera.skew_px) * camera.lens.height > 2 * _MAX_SKEW_PX * camera.lens.params[1]
+        if abs(camera.skew_px) * camera.lens.height
+        > 0.2 * camera.lens.params[1]  # of 0.1 px in the corners
     ]
     twice = sorted({name for name in names if names.count(name) > 1})
     if skewed or twice:
@@ -143,19 +121,12 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
         names=tuple(names),
         lenses=tuple(camera.lens for camera in cameras),
         cam_from_world=torch.stack([camera.cam_from_world for camera in cameras]),
-        points_world=torch.zeros(0, 3, dtype=torch.float64),
-        observation_point=torch.zeros(0, dtype=torch.long),
-        observation_view=torch.zeros(0, dtype=torch.long),
-        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
     )
 
 
 def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
-    """Return the sizes of photographs in their files, which others' programs count pixels of.
-
-    Where there is no such file, those that they were read at.
-    """
-    where = f"The file of cameras {path}"
+    """Return the sizes of photographs in their files, which others' programs count pixels of."""
+    where = place(path)
     found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
     sizes: list[tuple[int, int] | None] = [None] * len(names)
     for view, camera in enumerate(found):
@@ -165,31 +136,18 @@ def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[
 
 
 def _stored_size(views: Views, view: int) -> tuple[int, int]:
+    """Return a photograph's size in its file; that which it was read at where there is none."""
     width, height = (int(side) for side in views.sizes_px[view])
-    if not views.folder:
-        return width, height
-    try:
-        with Image.open(Path(views.folder) / views.names[view]) as picture:
-            # In camera raw it may be the preview.
-            return picture.size if max(picture.size) >= max(width, height) else (width, height)
-    except (OSError, ValueError, Image.DecompressionBombError):
-        return width, height
-
-
-def _whole_sizes(views: Views, model: SparseModel) -> list[tuple[int, int]]:
-    """Return the sizes of photographs before they were shrunk on reading, as the pictures lie."""
-    sizes = []
-    for view, lens in enumerate(model.lenses):
-        whole = _stored_size(views, view)
-        across = (whole[0] > whole[1]) != (lens.width > lens.height)
-        sizes.append(turned_size(*whole, int(across)))
-    return sizes
+    with suppress(OSError, ValueError, Image.DecompressionBombError):
+        if views.folder:
+            with Image.open(Path(views.folder) / views.names[view]) as picture:
+                if max(picture.size) >= max(width, height):  # in camera raw it may be the preview
+                    return picture.size
+    return width, height
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
     """Put a model's cameras and observations into photographs that were resized and turned.
-
-    Maps to a static background begin in the photographs then, and end where they ended.
 
     Args:
         model: Its pictures have the photographs' shapes once they are turned.
@@ -201,7 +159,6 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
     fresh = 1 + max(lens.camera for lens in model.lenses)
     pixels = torch.empty_like(model.observation_pixels)
     poses = torch.empty_like(model.cam_from_world)
-    maps = model.background_from_view.clone()
     for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
         width, height = views.sizes_px[view].tolist()
         size = turned_size(width, height, quarters)
@@ -217,7 +174,4 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         here = model.observation_view == view
         pixels[here] = turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
         poses[view] = turned_pose(model.cam_from_world[view], quarters)
-        if len(maps):
-            shown_from_model = turning(*size, quarters) @ torch.diag(homogeneous(scale))
-            maps[view] = torch.linalg.solve(shown_from_model.to(maps), maps[view], left=False)
     return model.replace(lenses=tuple(lenses), cam_from_world=poses, observation_pixels=pixels)

@@ -1,20 +1,95 @@
 """SIFT features of photographs, found by COLMAP on the CPU."""
 
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from pimper_torch.mapped import drop_pages
+from pimper_torch.memory import release_memory
 from pimper_torch.progress import track
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
-from pimper_torch.sfm.binding import loaded, quiet
+from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.workspace import Workspace
 
-# Photographs in which a thread finds features between two reports of progress.
-_PER_THREAD = 2
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workspace:
+    """A folder with the files of one run.
+
+    Attributes:
+        files: Names of the photographs in ``images``, in the order of the views.
+        masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
+            behind, as COLMAP wants them.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    masked: bool
+    database_name: str = "database.db"
+
+    @property
+    def images(self) -> Path:
+        """Folder of the photographs."""
+        return self.folder / "images"
+
+    @property
+    def masks(self) -> Path:
+        """Folder of the masks."""
+        return self.folder / "masks"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.folder / self.database_name
+
+    def with_copied_database(self, name: str) -> "Workspace":
+        """Copy the database to another file of the folder, for matches of another hypothesis."""
+        copied = replace(self, database_name=name)
+        shutil.copyfile(self.database, copied.database)
+        return copied
+
+
+@contextmanager
+def workspace(views: Views, threads: int) -> Iterator[Workspace]:
+    """Write photographs and masks to a temporary folder, which goes when the block ends."""
+    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+        space = Workspace(
+            folder=Path(folder),
+            files=tuple(f"{index:06d}.png" for index in range(views.num_views)),
+            masked=views.masks is not None,
+        )
+        space.images.mkdir()
+        space.masks.mkdir()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda index: _write(views, index, space), range(views.num_views)))
+        release_memory()
+        yield space
+
+
+def _write(views: Views, index: int, space: Workspace) -> None:
+    """Write a photograph in 8-bit sRGB without its padding, and its mask if there is one."""
+    width, height = (int(side) for side in views.sizes_px[index])
+    pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
+    array = pixels.permute(1, 2, 0).numpy()
+    gray = array.shape[-1] == 1
+    picture = Image.fromarray(np.ascontiguousarray(array[..., 0] if gray else array))
+    # Fast compression: the files live for seconds. COLMAP looks for features in luma alone.
+    picture.convert("L").save(space.images / space.files[index], compress_level=1)
+    if views.masks is not None:
+        mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
+        Image.fromarray(mask).save(space.masks / f"{space.files[index]}.png", compress_level=1)
+    drop_pages()
 
 
 # The side of photographs below which COLMAP 4.2's covariant detector reads past their end.
@@ -62,7 +137,7 @@ def find_features(
         _import(space, reader, lenses)
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
-        step = _PER_THREAD * settings.num_threads
+        step = 2 * settings.num_threads  # photographs between two reports of progress
         starts = range(0, len(space.files), step)
         for start in track(starts):
             pycolmap.extract_features(
@@ -75,8 +150,13 @@ def find_features(
                 device=pycolmap.Device.cpu,
             )
         with pycolmap.Database.open(space.database) as stored:
-            image_ids = {image.name: image.image_id for image in stored.read_all_images()}
-            return [stored.num_keypoints_for_image(image_ids[file]) for file in space.files]
+            return [stored.num_keypoints_for_image(image) for image in image_ids(stored, space)]
+
+
+def image_ids(stored: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - pycolmap is untyped
+    """Return the number of each photograph in the database."""
+    ids = {image.name: image.image_id for image in stored.read_all_images()}
+    return [ids[file] for file in space.files]
 
 
 def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types

@@ -1,18 +1,97 @@
-"""Which photographs were taken with one lens at one focal length, as their files say."""
+"""Lenses: which photographs share one by their files, and lenses of turned and cropped pictures."""
 
 import math
 from collections.abc import Sequence
 
-from pimper_torch.errors import InputError, some
-from pimper_torch.records import Views
-from pimper_torch.sfm.quarter_turns import QUARTERS
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
-SAME_FOCAL = 0.02
-"""Relative difference of focal lengths that EXIF rounds; a choice."""
+from pimper_torch.errors import InputError, some
+from pimper_torch.records import Lens, Views
+
+QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Clockwise quarters by which EXIF's orientations turn a file's pixels; the others mirror, too."""
+
+# Where a model's focal lengths are two, its principal point stands behind them, else behind one.
+_ONE_FOCAL = ("SIMPLE_", "RADIAL")
+# Positions of pairs of parameters that turn as vectors: decentering and thin prisms.
+_VECTORS = {
+    "OPENCV": ((7, 6),),
+    "FULL_OPENCV": ((7, 6),),
+    "THIN_PRISM_FISHEYE": ((7, 6), (10, 11)),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((10, 11), (12, 14), (13, 15)),
+}
+
+
+def turned_size(width: int, height: int, quarters: int) -> tuple[int, int]:
+    """Exchange width and height where a picture is turned by an odd number of quarters."""
+    return (height, width) if quarters % 2 else (width, height)
+
+
+def turned_pixels(
+    pixels: Float[Tensor, "*batch 2"], width: int, height: int, quarters: int
+) -> Float[Tensor, "*batch 2"]:
+    """Return where pixels are after clockwise quarter turns of their picture.
+
+    >>> turned_pixels(torch.tensor([3.0, 1.0]), width=8, height=6, quarters=1)
+    tensor([5., 3.])
+    """
+    for _ in range(quarters % 4):
+        pixels = torch.stack([height - pixels[..., 1], pixels[..., 0]], dim=-1)
+        width, height = height, width
+    return pixels
+
+
+def turned_vectors(vectors: Float[Tensor, "*batch 2"], quarters: int) -> Float[Tensor, "*batch 2"]:
+    """Return what differences of pixels are after clockwise quarter turns."""
+    return turned_pixels(vectors, 0, 0, quarters)
+
+
+def turned_pose(
+    cam_from_world: Float[Tensor, "*batch 4 4"], quarters: int
+) -> Float[Tensor, "*batch 4 4"]:
+    """Turn a camera with its picture; exact."""
+    x, y, *rest = cam_from_world.unbind(dim=-2)
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return torch.stack([x, y, *rest], dim=-2)
+
+
+def turned_lens(lens: Lens, quarters: int) -> Lens:
+    """Turn a lens with its picture, of whatever model of COLMAP's: it images turned directions so.
+
+    Focal lengths are exchanged by a quarter, the principal point moves, and parameters that are
+    vectors in the picture are turned: ``p2, p1`` and ``sx1, sy1``.
+    """
+    size = lens.width, lens.height
+    values, focals = list(lens.params), _focals(lens)
+    if focals == 2 and quarters % 2:
+        values[0], values[1] = values[1], values[0]
+    center = torch.tensor(values[focals : focals + 2], dtype=torch.float64)
+    values[focals : focals + 2] = turned_pixels(center, *size, quarters).tolist()
+    for first, second in _VECTORS.get(lens.model, ()):
+        vector = torch.tensor([values[first], values[second]], dtype=torch.float64)
+        values[first], values[second] = turned_vectors(vector, quarters).tolist()
+    width, height = turned_size(*size, quarters)
+    return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]) -> Lens:
+    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves."""
+    values, focals = list(lens.params), _focals(lens)
+    values[focals] -= float(corner[0])
+    values[focals + 1] -= float(corner[1])
+    return lens.replace(params=tuple(values), width=width, height=height)
+
+
+def _focals(lens: Lens) -> int:
+    """Count the focal lengths, behind which the principal point stands."""
+    return 1 if lens.model.startswith(_ONE_FOCAL) else 2
 
 
 def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -> list[int]:
-    """Group photographs by size and focal length; either side up is one size.
+    """Group photographs by size and focal length.
 
     Photographs without a focal length are of the lens of their size, if that is one; else of a lens
     of their own.
@@ -23,34 +102,29 @@ def group_lenses(sizes: Sequence[tuple[int, int]], focals_px: Sequence[float]) -
     Returns:
         The group of each, numbered in the order of their first photographs.
 
-    >>> group_lenses([(9, 6), (6, 9), (9, 6)], [10.0, 10.1, 15.0])
+    >>> group_lenses([(9, 6), (9, 6), (6, 9)], [10.0, 10.1, 10.0])
     [0, 0, 1]
     """
-    shapes = [(max(size), min(size)) for size in sizes]
     known: dict[tuple[int, int], list[float]] = {}
-    told = [one for one in zip(focals_px, shapes, strict=True) if not math.isnan(one[0])]
-    for focal, shape in sorted(told):
-        starts = known.setdefault(shape, [])
-        if not (starts and focal <= (1 + SAME_FOCAL) * starts[-1]):
+    told = [one for one in zip(focals_px, sizes, strict=True) if not math.isnan(one[0])]
+    for focal, size in sorted(told):
+        starts = known.setdefault(size, [])  # EXIF rounds by less than 2 %
+        if not (starts and focal <= 1.02 * starts[-1]):
             starts.append(focal)
     numbers: dict[tuple[object, ...], int] = {}
     groups = []
-    for focal, shape in zip(focals_px, shapes, strict=True):
-        starts = known.get(shape, [])
+    for focal, size in zip(focals_px, sizes, strict=True):
+        starts = known.get(size, [])
         if math.isnan(focal):
             lens: object = 0 if len(starts) == 1 else None
         else:
             lens = sum(start <= focal for start in starts) - 1
-        groups.append(numbers.setdefault((shape, lens), len(numbers)))
+        groups.append(numbers.setdefault((size, lens), len(numbers)))
     return groups
 
 
 def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> list[int]:
-    """Number the lenses of photographs that lie as their sensors do.
-
-    Args:
-        views: Photographs, see :func:`sensor_turns`.
-    """
+    """Number the lenses of photographs."""
     if own:
         return list(range(views.num_views))
     sizes = [(width, height) for width, height in views.sizes_px.tolist()]
@@ -70,19 +144,3 @@ def choose_lenses(views: Views, *, shared: bool = False, own: bool = False) -> l
             "so that lenses are told apart by size and EXIF, or give photographs of one size."
         )
     return [0] * views.num_views
-
-
-def sensor_turns(views: Views) -> tuple[int, ...]:
-    """Find by how many clockwise quarters each photograph is turned from how its sensor lies.
-
-    Sensors lie broadside; a photograph that stands upright beside others that lie is turned, by
-    EXIF's orientation if it says so. Where all stand or all lie, none counts as turned.
-    """
-    sizes = [(width, height) for width, height in views.sizes_px.tolist()]
-    if not any(width > height for width, height in sizes):
-        return (0,) * views.num_views
-    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
-    return tuple(
-        0 if width >= height else 3 if QUARTERS.get(tag) == 3 else 1
-        for (width, height), tag in zip(sizes, tags, strict=True)
-    )

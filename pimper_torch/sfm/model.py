@@ -31,10 +31,14 @@ class SparseModel(Record):
     names: tuple[str, ...]
     lenses: tuple[Lens, ...]
     cam_from_world: Float[Tensor, "view 4 4"]
-    points_world: Float[Tensor, "point 3"]
-    observation_point: Int[Tensor, " observation"]
-    observation_view: Int[Tensor, " observation"]
-    observation_pixels: Float[Tensor, "observation 2"]
+    points_world: Float[Tensor, "point 3"] = field(
+        default_factory=lambda: torch.zeros(0, 3).double()
+    )
+    observation_point: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_view: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_pixels: Float[Tensor, "observation 2"] = field(
+        default_factory=lambda: torch.zeros(0, 2).double()
+    )
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     series: Int[Tensor, " divided"] = field(default_factory=no_series)
 
@@ -49,6 +53,15 @@ class SparseModel(Record):
         shape = len(self.points_world), self.num_views
         return pairs_table(self.observation_point, self.observation_view, shape)
 
+    def with_points(self, other: "SparseModel") -> "SparseModel":
+        """Take points and observations from a model of the same views."""
+        return self.replace(
+            points_world=other.points_world,
+            observation_point=other.observation_point,
+            observation_view=other.observation_view,
+            observation_pixels=other.observation_pixels,
+        )
+
     def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
         """Leave observations out, and points that fewer than two views see then."""
         kept = self.replace(
@@ -60,45 +73,39 @@ class SparseModel(Record):
 
 
 def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
-    """Keep some views of a model, in the order given, and the points that two of them see.
-
-    Args:
-        chosen: Indices into the model's views, without repetition.
+    """Take views of a model, in the order given, and the points that two of them see.
 
     Returns:
         Points in their old order. Observations are sorted by point, then view.
     """
-    new_view = torch.full((model.num_views,), -1)
-    new_view[torch.tensor(chosen, dtype=torch.long)] = torch.arange(len(chosen))
-    view = new_view[model.observation_view]
-    shape = len(model.points_world), len(chosen)
-    seen = pairs_table(model.observation_point[view >= 0], view[view >= 0], shape)
-    tied = seen.sum(dim=1) >= 2
-    new_point = torch.cumsum(tied, dim=0) - 1
-    kept = torch.nonzero((view >= 0) & tied[model.observation_point])[:, 0]
-    point, view = new_point[model.observation_point[kept]], view[kept]
+    views, counts = (
+        torch.tensor(chosen, dtype=torch.long),
+        torch.bincount(model.observation_view, minlength=model.num_views),
+    )
+    by_view = torch.split(torch.argsort(model.observation_view, stable=True), counts.tolist())
+    rows = torch.cat([views[:0], *(by_view[view] for view in chosen)])
+    view = torch.arange(len(chosen)).repeat_interleave(counts[views])
+    point = model.observation_point[rows]
+    tied = pairs_table(point, view, (len(model.points_world), len(chosen))).sum(dim=1) >= 2
+    rows, view, point = (values[tied[point]] for values in (rows, view, point))
+    point = (torch.cumsum(tied, dim=0) - 1)[point]
     order = torch.argsort(point * max(len(chosen), 1) + view, stable=True)
+    maps, series = model.background_from_view, model.series
     return SparseModel(
         names=tuple(model.names[index] for index in chosen),
         lenses=tuple(model.lenses[index] for index in chosen),
-        cam_from_world=model.cam_from_world[torch.tensor(chosen, dtype=torch.long)],
+        cam_from_world=model.cam_from_world[views],
         points_world=model.points_world[tied],
         observation_point=point[order],
         observation_view=view[order],
-        observation_pixels=model.observation_pixels[kept][order],
-        background_from_view=model.background_from_view[list(chosen)]
-        if len(model.background_from_view)
-        else model.background_from_view,
-        series=model.series[list(chosen)] if len(model.series) else model.series,
+        observation_pixels=model.observation_pixels[rows[order]],
+        background_from_view=maps[views] if len(maps) else maps,
+        series=series[views] if len(series) else series,
     )
 
 
 def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
-    """Drop views that see too few points for their pose to be trusted, until none is left.
-
-    Args:
-        fewest: Points that a view must see.
-    """
+    """Drop views that see too few points for their pose to be trusted, until none is left."""
     while model.num_views:
         seen = torch.bincount(model.observation_view, minlength=model.num_views)
         strong = torch.nonzero(seen >= fewest)[:, 0].tolist()

@@ -15,12 +15,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.sound_views import with_views
-
-# Distance in pixels, at the object, up to which two cameras are one pose. A choice: bundle
-# adjustment leaves such photographs 0.1 px apart, and between neighbours of a set lie tens.
-_SAME_PX = 0.5
+from pimper_torch.sfm.model import SparseModel, select_views
+from pimper_torch.sfm.sparse_scene import with_views
 
 
 def pictures_of_poses(views: Views) -> Views:
@@ -57,33 +53,15 @@ def pictures_of_poses(views: Views) -> Views:
 
 
 def of_photographs(model: SparseModel, views: Views) -> SparseModel:
-    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses.
-
-    Returns:
-        In the order of the photographs; each observes what the picture of its pose does.
-    """
+    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses."""
     if views.poses is None:
         return model
     place = {name: index for index, name in enumerate(model.names)}
     first = {pose: view for view, pose in reversed(list(enumerate(views.poses.tolist())))}
     source = [place.get(views.names[first[pose]], -1) for pose in views.poses.tolist()]
     shown = [view for view, found in enumerate(source) if found >= 0]
-    index = [source[view] for view in shown]
-    rows = [(model.observation_view == found).nonzero()[:, 0] for found in index]
-    row = torch.cat(rows)
-    view = torch.arange(len(shown)).repeat_interleave(torch.tensor([len(one) for one in rows]))
-    order = torch.argsort(model.observation_point[row] * len(shown) + view)
-    maps, series = model.background_from_view, model.series
-    return model.replace(
-        names=tuple(views.names[one] for one in shown),
-        lenses=tuple(model.lenses[one] for one in index),
-        cam_from_world=model.cam_from_world[index],
-        observation_point=model.observation_point[row][order],
-        observation_view=view[order],
-        observation_pixels=model.observation_pixels[row][order],
-        background_from_view=maps[index] if len(maps) else maps,
-        series=series[index] if len(series) else series,
-    )
+    carried = select_views(model, [source[view] for view in shown])
+    return carried.replace(names=tuple(views.names[view] for view in shown))
 
 
 def with_poses(scene: SparseScene) -> SparseScene:
@@ -105,7 +83,8 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
     extent = (centers - centers.mean(dim=0)).norm(dim=1).mean()
     turned = (pose[:, None, :3, :3] - pose[None, :, :3, :3]).flatten(2).norm(dim=2) / 2**0.5
     moved = (centers[:, None] - centers).norm(dim=2)
-    same = focal[:, None] * (turned + moved / extent) < _SAME_PX
+    # Bundle adjustment leaves photographs of one pose 0.1 px apart; between neighbours lie tens.
+    same = focal[:, None] * (turned + moved / extent) < 0.5
     return same.long().argmax(dim=1)  # the first of each pose
 
 

@@ -16,30 +16,23 @@ from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.components import choose_component
 from pimper_torch.sfm.conventions.resized_pictures import Ways
-from pimper_torch.sfm.doubt import doubt
-from pimper_torch.sfm.existing import existing_ways, follow_pictures, place, taken
-from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small
-from pimper_torch.sfm.lenses import choose_lenses, sensor_turns
+from pimper_torch.sfm.doubt import choose_component, doubt, doubt_one_lens
+from pimper_torch.sfm.existing import existing_ways, place, taken
+from pimper_torch.sfm.features import SMALLEST_PX, find_features, too_small, workspace
+from pimper_torch.sfm.lenses import choose_lenses
 from pimper_torch.sfm.model import SparseModel, select_views
-from pimper_torch.sfm.one_lens import doubt_one_lens
+from pimper_torch.sfm.moved_object import series_in, with_series
 from pimper_torch.sfm.poses import of_photographs, pictures_of_poses
-from pimper_torch.sfm.quarter_turns import turned_views
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
-from pimper_torch.sfm.registration import Registration, register
-from pimper_torch.sfm.series import series_in, with_series
+from pimper_torch.sfm.registration import register
 from pimper_torch.sfm.sparse_scene import assemble_scene, model_of_scene, with_model_points
 from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from pimper_torch.sfm.upright import upright
-from pimper_torch.sfm.workspace import workspace
 from pimper_torch.stage import Stage
 from pimper_torch.store import Store, digest, kept, opened
 from pimper_torch.store.digest import code
-
-# Fraction of the photographs that the largest component must hold when the model splits.
-_MIN_FRACTION = 0.6
 
 
 class Reconstruct(Stage):
@@ -179,50 +172,41 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
             f"{some(small)}: have sides of fewer than {SMALLEST_PX} pixels; needed: photographs "
             "in which there are features, of some hundred pixels at least."
         )
-    turns = (0,) * views.num_views if config.own_cameras else sensor_turns(views)
-    leave_out("sfm.quarter_turns", sum(map(bool, turns)), total=len(turns))
-    lying = turned_views(views, [-quarters for quarters in turns])
-    lenses = choose_lenses(lying, shared=config.shared_camera, own=config.own_cameras)
-    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
-    with workspace(lying, config.num_threads) as space:
-        counts = find_features(space, config, _known_focals(views), lenses)
-        _require_features(counts, views.names)
-        release_memory()
-        found = register(space, config)
-    release_memory()
-    names = dict(zip(space.files, views.names, strict=True))
-    model = _chosen(found, names, 0.0 if found.around else _MIN_FRACTION)
-    if found.around:
-        model = with_series(model, series_in(model, views.names, found.around), views.names)
-    series = dict(zip(model.names, model.series.tolist(), strict=False))
-    numbers = [views.names.index(name) for name in model.names]
-    model = refine_tracks(lying.take(numbers), model, config.track_iterations)
+    model = _registered_model(views, config)
+    model = refine_tracks(taken(views, model), model, config.track_iterations)
     release_memory()
     reason = doubt_one_lens(model)
     leave_out("sfm.one_lens", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
-    model = with_background(model, found, names)
-    if series:
-        model = model.replace(series=torch.tensor([series[name] for name in model.names]))
-    if any(turns):
-        turned = [turns[number] for number in numbers]
-        model = follow_pictures(model, views.take(numbers), turned)
     return upright(model)
 
 
-def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> SparseModel:
-    """Choose among the models and put its views in the photographs' order."""
-    models = [
-        model.replace(names=tuple(names[file] for file in model.names)) for model in found.models
-    ]
-    photographs = tuple(names.values())
-    parts = [model.names for model in models]
-    model = models[choose_component(parts, found.spread, photographs, min_fraction)]
+def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
+    """Grow models of photographs, and choose one.
+
+    Its views are in the photographs' order, with maps to a room at rest and numbers of series.
+    """
+    lenses = choose_lenses(views, shared=config.shared_camera, own=config.own_cameras)
+    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
+    with workspace(views, config.num_threads) as space:
+        counts = find_features(space, config, _known_focals(views), lenses)
+        _require_features(counts, views.names)
+        release_memory()
+        found = register(space, config)
+    release_memory()
+    # The largest of several models must hold most photographs, if they are not of several series.
+    min_fraction = 0.0 if found.around else 0.6
+    parts = [[space.files.index(file) for file in model.names] for model in found.models]
+    names = [tuple(views.names[number] for number in part) for part in parts]
+    chosen = choose_component(names, found.spread, views.names, min_fraction)
+    order = sorted(range(len(parts[chosen])), key=parts[chosen].__getitem__)
+    model = select_views(found.models[chosen].replace(names=names[chosen]), order)
+    name_of = dict(zip(space.files, views.names, strict=True))
     misplaced = [
-        f"{names[file]} ({fraction:.0%} agree)"
+        f"{name_of[file]} ({fraction:.0%} agree)"
         for file, fraction in found.misplaced.items()
-        if names[file] in model.names
+        if name_of[file] in model.names
     ]
     leave_out("sfm.misplaced", len(misplaced), total=model.num_views)
     if misplaced:
@@ -232,17 +216,13 @@ def _chosen(found: Registration, names: dict[str, str], min_fraction: float) -> 
             "for sides that look alike; add photographs between these and their neighbours.",
             stacklevel=4,
         )
-    return select_views(
-        model, [model.names.index(name) for name in photographs if name in model.names]
-    )
-
-
-def with_background(model: SparseModel, found: Registration, names: dict[str, str]) -> SparseModel:
-    """Add the maps to a static background, if there is one."""
-    maps = {names[file]: one for file, one in found.background.items()}
-    if not maps:
-        return model
-    return model.replace(background_from_view=torch.stack([maps[name] for name in model.names]))
+    if found.background:
+        maps = {name_of[file]: rest for file, rest in found.background.items()}
+        rests = torch.stack([maps[name] for name in model.names])
+        model = model.replace(background_from_view=rests)
+    if found.around:
+        model = with_series(model, series_in(model, views.names, found.around), views.names)
+    return model
 
 
 def _known_focals(views: Views) -> list[float | None]:

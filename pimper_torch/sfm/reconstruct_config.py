@@ -19,8 +19,7 @@ class ReconstructConfig:
     Attributes:
         camera_model: COLMAP's name of the lens model.
         shared_camera: One camera took all photographs, with one lens at one focal length, whatever
-            EXIF says. By default lenses are told apart by EXIF's focal length and by size; a
-            camera that was held upright is the same.
+            EXIF says. By default lenses are told apart by EXIF's focal length and by size.
         own_cameras: Each photograph has a lens of its own.
         peak_threshold: Contrast below which a feature is dropped; in COLMAP's units, where
             its own default is 0.0067. Lower finds the faint marks of smooth surfaces.

@@ -8,21 +8,16 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.sfm import colmap
-from pimper_torch.sfm.bundling import bundle
+from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS
-from pimper_torch.sfm.reprojection import observation_errors
-from pimper_torch.sfm.tangent_planes import tangents
 from pimper_torch.sfm.track_observations import (
-    SightingSettings,
     TrackObservations,
     log_pictures,
     sight,
+    tangents,
 )
 from pimper_torch.sfm.undistort import pinholes_for, undistorted
-
-# Views that must show a point, its reference among them, for its features to be given up.
-_FEWEST_TRACK_OBSERVATIONS = 3
 
 # Residual at which a track observation counts half, before the residuals themselves tell; then
 # their spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
@@ -32,17 +27,12 @@ _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 # Relative falls of the cost that end the adjustment that tells the spread, and the one after it.
 _FIRST_TOLERANCE, _TOLERANCE = 1e-4, 1e-5
 
-# Median length of a two-dimensional Gaussian's draws, in standard deviations.
-_MEDIAN_LENGTH = 1.1774
 
 # Points a view in the rounds before the last, whose cameras are where the next one looks from. On
 # 20 photographs of 640x480 with 8,900 points both rounds take 21 in place of 35 CPU s, and cameras
 # put places 0.009 % of the diagonal off (0.013 % with all points); with 128 points 0.024 %. In the
 # last round the number tells: 128 points a view there, 0.13 %.
 _PILOTS = 256
-
-# Scales beyond which an observation is an outlier, and pixels in which features are none.
-_OUTLIER_SCALES, _FEATURE_PX = 10.0, 2.0
 
 
 def refine_tracks(
@@ -75,7 +65,7 @@ def refine_tracks(
         else:
             model = _with_others(renewed, tied, leading, scale)
     if rounds:
-        limit = torch.where(aligned, _OUTLIER_SCALES * scale, _FEATURE_PX)
+        limit = torch.where(aligned, 10 * scale, 2.0)  # features are less exact
         before = len(model.points_world)
         model = model.without(observation_errors(model) > limit)
         lost = before - len(model.points_world)
@@ -93,16 +83,14 @@ def _sighted(views: Views, model: SparseModel) -> tuple[TrackObservations, Camer
         sizes_px=views.sizes_px.cpu(),
     )
     planes = tangents(model.points_world, model.observed, cameras)
-    return sight(pictures, cameras, planes, SightingSettings()), cameras
+    return sight(pictures, cameras, planes), cameras
 
 
 def _renewed(
     model: SparseModel, found: TrackObservations, cameras: Cameras
 ) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
     """Replace features by track observations; tell which observations are track observations."""
-    often = (
-        torch.bincount(found.point, minlength=len(model.points_world)) >= _FEWEST_TRACK_OBSERVATIONS
-    )
+    often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]
     pixels = _photographed(found.pixels[kept], view, cameras, model)
@@ -153,7 +141,8 @@ def _adjusted(
     leading = points[model.observation_point]
     tied = model.without(~leading)
     tied = bundle(tied, _FIRST_SCALE_PX, cameras=cameras, tolerance=_FIRST_TOLERANCE)
-    spread = float(observation_errors(tied)[aligned[leading]].median()) / _MEDIAN_LENGTH
+    # The median length of a two-dimensional Gaussian's draws is 1.1774 standard deviations.
+    spread = float(observation_errors(tied)[aligned[leading]].median()) / 1.1774
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
     return bundle(tied, scale, cameras=cameras, tolerance=_TOLERANCE), points, scale
 

@@ -6,38 +6,85 @@ rest before a turning object is looked for, and an object that was moved on its 
 is taken if it explains clearly more of its verified matches.
 """
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import caution
+from pimper_torch.errors import ReconstructionError, caution
 from pimper_torch.ledger import leave_out
-from pimper_torch.sfm.agreement import judged
-from pimper_torch.sfm.components import FEWEST_VIEWS, require_motion
-from pimper_torch.sfm.doubt import count_views_with_depth, doubt
-from pimper_torch.sfm.guided import match_guided
-from pimper_torch.sfm.leave_out import enter_room, leave_out_room
-from pimper_torch.sfm.mapping import map_views
+from pimper_torch.progress import report
+from pimper_torch.sfm.colmap import loaded, model_of, quiet
+from pimper_torch.sfm.doubt import (
+    FEWEST_VIEWS,
+    MOVE,
+    count_views_with_depth,
+    doubt,
+    judged,
+)
+from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,
-    PhotographPair,
     VerifiedPair,
     all_pairs,
+    match_guided,
     match_pairs,
     strongest,
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel, drop_weak_views
+from pimper_torch.sfm.moved_object import tie_series
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.static_background import StaticBackground
-from pimper_torch.sfm.tie_series import tie_series
-from pimper_torch.sfm.workspace import Workspace
+from pimper_torch.sfm.static_background import StaticBackground, enter_room, leave_out_room
 
-# Distances that verify a match, at which it still agrees with a model: the lens is the model's.
-_AGREEING = 2.0
+
+def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list[SparseModel]:
+    """Grow models from the best pair of views on, until no view can be added.
+
+    On one thread, so that the same matches give the same bits.
+
+    Args:
+        pairs_count: Points that only two views see take part, too: they tie views with
+            little overlap, less exactly.
+
+    Returns:
+        One model a component, the one with most views first. Names are files of ``space``.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.extract_colors = False
+    options.num_threads = 1
+    options.random_seed = seed
+    options.mapper.abs_pose_min_num_inliers = MIN_POINTS
+    # Growth between two adjustments of all. COLMAP's own 1.1 suits models that are final, and takes
+    # 29 in place of 25 CPU s on 66 photographs; here everything is adjusted to tracks.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.2
+    options.triangulation.ignore_two_view_tracks = not pairs_count
+    if len(space.files) > MOST_PAIRED:
+        # Half of the CPU seconds, with the same cameras after tracks are found again.
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+        options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+        options.ba_global_function_tolerance = 1e-4
+        options.ba_local_function_tolerance = 1e-4
+    registered, total = count(3), len(space.files)  # the first call follows a model of two views
+
+    def tell() -> None:
+        report(min(next(registered), total), total)  # models that begin anew add views again
+
+    with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
+        found = pycolmap.incremental_mapping(
+            space.database, space.images, output, options, next_image_callback=tell
+        )
+    models = [model_of(reconstruction) for reconstruction in found.values()]
+    return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
+
+
 # Fraction of the verified matches that a plain model must explain. Right models of 12 potatoes on a
 # patterned table explain 0.99 to 1.00, with a time stamp in the corner or a zoom in EXIF, too, and
 # 0.95 where zoomed photographs share a lens; of a mug that was turned over, at most 0.73.
@@ -53,8 +100,7 @@ class Registration:
 
     Attributes:
         models: One a component, the one with most views that see depth first.
-        spread: How many views of each see depth, see
-            :func:`~pimper_torch.sfm.doubt.count_views_with_depth`.
+        spread: Views of each that see depth.
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
             the matches in those that agrees.
@@ -116,7 +162,7 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     if plain.sound:
         return plain
     rest, background = _leave_out_room(other, settings)
-    around = () if background else tie_series(other.database, settings)[1]
+    around = () if background else tie_series(other.database, settings)
     if not background and not around:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)
@@ -138,8 +184,8 @@ def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}
-        some = strongest(counts, len(space.files), settings.guided_pairs)
-        verified = _guided(space, some, settings)
+        match_guided(space, strongest(counts, len(space.files), settings.guided_pairs), settings)
+        verified = verified_pairs(space)
     return _mapped(space, verified, settings, settings.seed)
 
 
@@ -154,7 +200,8 @@ def _thorough(space: Workspace, best: Registration, settings: ReconstructConfig)
         again = [pair for pair in again if apart & set(pair)]
     if not small:
         match_pairs(space, again, settings)
-    verified = _guided(space, again, settings)
+    match_guided(space, again, settings)
+    verified = verified_pairs(space)
     seeds = [settings.seed + start for start in range(settings.starts)]
     for seed, pairs_count in [*((seed, False) for seed in seeds), (settings.seed, True)]:
         rival = _mapped(space, verified, settings, seed, pairs_count=pairs_count)
@@ -169,7 +216,13 @@ def _leave_out_room(
 ) -> tuple[StaticBackground, Mapping[str, Float[Tensor, "3 3"]]]:
     """Leave out the features of a room at rest; return it with each file's map to where it is."""
     rest = leave_out_room(space.database, settings)
-    require_motion(rest, len(space.files))
+    if rest.nothing_moves:
+        raise ReconstructionError(
+            f"Nothing moves in {len(space.files)} photographs: {rest.still_fraction:.0%} of the "
+            "matches lie at the same pixel, and in no pair do enough others agree on a motion. "
+            "Camera and background were at rest, and an object that turned has too little "
+            f"texture. {MOVE}"
+        )
     return rest, dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}
 
 
@@ -189,14 +242,6 @@ def _tell_room(rest: StaticBackground) -> None:
     )
 
 
-def _guided(
-    space: Workspace, pairs: Sequence[PhotographPair], settings: ReconstructConfig
-) -> list[VerifiedPair]:
-    """Match some pairs along their epipolar lines; give all that are verified then."""
-    match_guided(space, pairs, settings)
-    return verified_pairs(space)
-
-
 def _mapped(
     space: Workspace,
     verified: Sequence[VerifiedPair],
@@ -212,21 +257,23 @@ def _mapped(
             without them (median error 0.19 in place of 0.13 degrees on 24 photographs of a skull):
             they come last.
     """
-    grown = map_views(space, seed, pairs_count=pairs_count)
-    whole = [drop_weak_views(model, MIN_POINTS) for model in grown]
-    found = [model for model in whole if model.num_views]
-    counts = count_views_with_depth(found, MIN_POINTS)
-    counted = list(zip(counts, found, strict=True))
+    grown = [
+        drop_weak_views(model, MIN_POINTS)
+        for model in map_views(space, seed, pairs_count=pairs_count)
+    ]
+    found = [model for model in grown if model.num_views]
+    counted = list(zip(count_views_with_depth(found, MIN_POINTS), found, strict=True))
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
     models = tuple(model for _, model in counted)
-    registered = models[0].names if models else ()
-    limit = _AGREEING * settings.max_error_px
-    judgement = judged(models[0], space.files, verified, limit) if models else None
-    doubtful = judgement is None or bool(doubt(models[0], len(space.files)))
+    if not models:
+        return Registration(models=(), spread=(), missing=space.files, misplaced={}, explained=0.0)
+    # At twice the distance that verifies a match it still agrees: the lens is the model's.
+    judgement = judged(models[0], space.files, verified, 2 * settings.max_error_px)
+    doubtful = bool(doubt(models[0], len(space.files)))
     return Registration(
         models=models,
         spread=tuple(spread for spread, _ in counted),
-        missing=tuple(file for file in space.files if file not in registered),
-        misplaced=judgement.misplaced if judgement else {},
-        explained=0.0 if doubtful or judgement is None else judgement.explained,
+        missing=tuple(file for file in space.files if file not in models[0].names),
+        misplaced=judgement.misplaced,
+        explained=0.0 if doubtful else judgement.explained,
     )

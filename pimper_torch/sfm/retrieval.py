@@ -18,29 +18,27 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.parallel import on_one_thread
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.guided import read_features
-from pimper_torch.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, photograph_numbers
-from pimper_torch.sfm.workspace import Workspace
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.features import Workspace, image_ids
+from pimper_torch.sfm.matching import (
+    MOST_PAIRED,
+    PhotographPair,
+    all_pairs,
+    read_features,
+)
 
 # Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
 _WORDS, _NEIGHBOURS = 128, 20
-# Features that the vocabulary is learned from, and rounds: choices.
-_LEARNED, _ROUNDS = 40_000, 10
 
 Descriptors = Float[Tensor, "feature length"]
 
 
 def pairs_to_match(space: Workspace) -> list[PhotographPair]:
-    """List all pairs of a small set; of a larger, those of each photograph with those most like it.
-
-    Args:
-        space: With features. Those of one photograph are in memory at a time.
-    """
+    """List all pairs of a small set; of a larger, each photograph with those most like it."""
     if len(space.files) <= MOST_PAIRED:
         return all_pairs(len(space.files))
     with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
-        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        image_of = image_ids(stored, space)
 
         def descriptors(number: int) -> Descriptors:
             return read_features(stored, image_of[number]).descriptors
@@ -52,12 +50,8 @@ def pairs_to_match(space: Workspace) -> list[PhotographPair]:
 def global_descriptors(
     descriptors: Callable[[int], Descriptors], count: int
 ) -> Float[Tensor, "photograph word_length"]:
-    """Return a vector of length 1 for each photograph; 0 for one without features.
-
-    Args:
-        descriptors: Of the features of a photograph, by its number.
-    """
-    each = -(-_LEARNED // count)
+    """Return a vector of length 1 for each photograph; 0 for one without features."""
+    each = -(-40_000 // count)
     learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
     words = vocabulary(learned, _WORDS)
     return torch.stack([_aggregated(descriptors(number), words) for number in range(count)])
@@ -66,7 +60,7 @@ def global_descriptors(
 def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word length"]:
     """Return the centres of clusters (k-means), first evenly spread among the descriptors."""
     words = _some(descriptors, count)
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         word = _nearest(descriptors, words)
         sums = torch.zeros_like(words).index_add(0, word, descriptors)
         sizes = torch.bincount(word, minlength=len(words))[:, None]

@@ -1,33 +1,31 @@
 """From a sparse model and the photographs to the scene, and back to COLMAP's files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from pimper_torch.errors import ReconstructionError
+from pimper_torch.failures import skipped
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
 from pimper_torch.geometry.pixels import grid_from_pixels, homogeneous
 from pimper_torch.geometry.projection import project
-from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Cameras, Lens, SparseScene, Views
+from pimper_torch.ledger import leave_out
+from pimper_torch.mapped import each
+from pimper_torch.radiometry import SATURATED, to_bytes
+from pimper_torch.records import Cameras, Failure, Lens, SparseScene, Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.camera_in_place import least_squares_map, mapped
+from pimper_torch.sfm.colmap import reprojection_errors
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.reprojection import reprojection_errors
-from pimper_torch.sfm.undistort import undistort
-from pimper_torch.sfm.undistort_priors import with_undistorted_priors
-
-_RASTER = 9  # pixels each way that a map is fitted to
+from pimper_torch.sfm.undistort import undistort, with_undistorted_priors
 
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
     """Undistort the registered photographs and priors, and put them beside cameras and cloud.
-
-    Args:
-        views: All photographs, in any order.
-        model: Its names are among theirs, and its lenses have their sizes.
 
     Returns:
         Views in the model's order. Device and dtype are those of the photographs. A model far from
@@ -44,6 +42,8 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         views.take([number[name] for name in model.names]), model.lenses
     )
     like = views.images
+    lensed = zip(model.background_from_view, model.lenses, intrinsics, strict=False)
+    maps = [_undistorted_map(one, lens, to_pinhole.to(one)) for one, lens, to_pinhole in lensed]
     scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
         cameras=Cameras(
@@ -58,39 +58,23 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         observation_pixels=model.observation_pixels.to(like),
         lenses=model.lenses,
         unregistered=tuple(name for name in views.names if name not in model.names),
-        background_from_view=_undistorted_maps(model, intrinsics).to(like),
+        background_from_view=torch.stack([torch.eye(3).double(), *maps])[1:].to(like),
         offset_world=offset,
         series=model.series.to(like.device),
     )
     return with_undistorted_priors(scene)
 
 
-def _undistorted_maps(
-    model: SparseModel, intrinsics: Float[Tensor, "view 3 3"]
-) -> Float[Tensor, "mapped 3 3"]:
-    """Return the maps to a static background between undistorted pictures, as one lens has them.
-
-    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
-    """
-    maps = model.background_from_view
-    return (
-        torch.stack(
-            [
-                _undistorted_map(one, lens, to_pinhole.to(one))
-                for one, lens, to_pinhole in zip(maps, model.lenses, intrinsics, strict=False)
-            ]
-        )
-        if len(maps)
-        else maps
-    )
-
-
 def _undistorted_map(
     one: Float[Tensor, "3 3"], lens: Lens, intrinsics: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "3 3"]:
+    """Return a map to a static background between undistorted pictures, as one lens has them.
+
+    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
+    """
     if not bool(one.isfinite().all()):
         return one
-    across = torch.linspace(0, 1, _RASTER, dtype=one.dtype)
+    across = torch.linspace(0, 1, 9, dtype=one.dtype)
     raster = torch.cartesian_prod(lens.width * across, lens.height * across)
     ends = raster, mapped(one, raster)
     first, second = (mapped(intrinsics, colmap.undistort_pixels(lens, pixels)) for pixels in ends)
@@ -148,21 +132,8 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     The cameras are the photographs' own lenses, not the pinholes, and the observations are
     where they were made: the model belongs to the photographs as they were loaded, and
     reading it back with them gives the same scene.
-
-    Args:
-        folder: Gets ``cameras.bin``, ``images.bin``, ``points3D.bin`` and what else the
-            installed COLMAP writes; made if it does not exist.
     """
-    model = SparseModel(
-        names=scene.views.names,
-        lenses=scene.lenses,
-        cam_from_world=from_local(scene.cameras.cam_from_world.detach().cpu(), scene.offset_world),
-        points_world=scene.points_world.detach().cpu().double()
-        + torch.tensor(scene.offset_world, dtype=torch.float64),
-        observation_point=scene.observation_point.cpu(),
-        observation_view=scene.observation_view.cpu(),
-        observation_pixels=scene.observation_pixels.detach().cpu().double(),
-    )
+    model = model_of_scene(scene).replace(lenses=scene.lenses)
     colmap.write_binary(model, point_colors(scene), folder)
 
 
@@ -172,7 +143,7 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
     height, width = images.shape[-2:]
     total = images.new_zeros(len(scene.points_world), images.shape[1])
     for index in range(scene.views.num_views):
-        seen = _points_in(scene, index)
+        seen = scene.observation_point[scene.observation_view == index]
         pixels, _ = project(
             scene.points_world[seen],
             scene.cameras.cam_from_world[index],
@@ -185,5 +156,99 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
     return to_bytes((total / count[:, None]).expand(-1, 3))
 
 
-def _points_in(scene: SparseScene, view: int) -> Int[Tensor, " seen"]:
-    return scene.observation_point[scene.observation_view == view]
+@torch.no_grad()
+def sound(scene: SparseScene) -> SparseScene:
+    """Leave out views that show nothing or stand nowhere, and points that are nowhere.
+
+    Args:
+        scene: Photographs, cameras and cloud. Where all can be used, it is returned as it is.
+    """
+    finite = scene.points_world.isfinite().all(dim=1)
+    leave_out("sfm.sound_points", ~finite)
+    if not bool(finite.all()):
+        lost = f"{int((~finite).sum())} of {len(finite)}"
+        skipped(_failure("points", lost, "their coordinates are not finite", "They are left out"))
+        scene = with_points(scene, finite)
+    reasons = dict(_unusable(scene))
+    unusable = [scene.views.names[view] for view in reasons]
+    leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
+    if not reasons:
+        return scene
+    names, left = scene.views.names, scene.views.num_views - len(reasons)
+    if left < 3:  # the least that a sweep compares
+        listed = "; ".join(f"{names[view]}: {reason}" for view, reason in reasons.items())
+        raise ReconstructionError(
+            f"{left} of {scene.views.num_views} views can be used; needed: 3. {listed}. Look at "
+            "these photographs, masks and cameras."
+        )
+    done = "These views are left out, as if they had not been taken"
+    skipped(*(_failure("view", names[view], reason, done) for view, reason in reasons.items()))
+    return with_views(scene, torch.tensor([view not in reasons for view in range(len(names))]))
+
+
+def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
+    """Keep some of the views, and what these observe; the others count as not registered."""
+    index = kept.nonzero()[:, 0].tolist()
+    observed = kept.to(scene.observation_view.device)[scene.observation_view]
+    number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
+    maps, series, names = scene.background_from_view, scene.series, scene.views.names
+    left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
+    return scene.replace(
+        views=scene.views.take(index),
+        cameras=scene.cameras.take(index),
+        observation_point=scene.observation_point[observed],
+        observation_view=number[scene.observation_view[observed]],
+        observation_pixels=scene.observation_pixels[observed],
+        lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
+        unregistered=(*scene.unregistered, *left_out),
+        background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
+        series=series[kept.to(series.device)] if len(series) else series,
+    )
+
+
+def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene:
+    """Keep some of the points, and where they were observed."""
+    observed = kept[scene.observation_point]
+    number = kept.long().cumsum(dim=0) - 1
+    return scene.replace(
+        points_world=scene.points_world[kept],
+        reprojection_errors_px=scene.reprojection_errors_px[kept],
+        observation_point=number[scene.observation_point[observed]],
+        observation_view=scene.observation_view[observed],
+        observation_pixels=scene.observation_pixels[observed],
+    )
+
+
+def _failure(what: str, name: str, reason: str, done: str) -> Failure:
+    return Failure(stage="cameras", what=what, name=name, reason=reason, done=done)
+
+
+def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
+    """List the views that cannot be used, each with the reason."""
+    masks = scene.views.masks
+    for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
+        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN
+        reason = _nowhere(scene, view)
+        if not reason and not bool(lit.any()):
+            reason = "it is black, saturated or not finite all over"
+        elif not reason and masks is not None and not bool((lit & masks[view]).any()):
+            reason = "its mask is empty, or shows nothing that is lit"
+        if reason:
+            yield view, reason
+
+
+def _nowhere(scene: SparseScene, view: int) -> str:
+    """State why a camera cannot be where it is said to be, if so."""
+    pose, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
+    if not bool(pose.isfinite().all() and intrinsics.isfinite().all()):
+        return "its camera has numbers that are not finite"
+    points = scene.points_world[scene.observation_point[scene.observation_view == view]]
+    if len(points) == 0:
+        return ""
+    pixels, depth = project(points, pose, intrinsics)
+    size = scene.cameras.sizes_px[view]
+    within = (pixels > -0.1 * size) & (pixels < 1.1 * size)
+    share = float((within.all(dim=1) & (depth > 0)).float().mean())
+    if share >= 0.5:  # far below any camera of a model, whose points reproject within pixels
+        return ""
+    return f"its camera has {share:.0%} of the points that it observed in its frame"

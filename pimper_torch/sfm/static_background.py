@@ -5,44 +5,56 @@ photographs: the object's, and none at all. A match whose features lie at the sa
 A rigid scene has still matches, too: points at infinity before a camera that only shifts, or points
 near the axis of a turn. But there one epipolar geometry explains them together with the matches
 that move. No geometry explains a room at rest together with an object that turns.
+
+Where the room shifts from photograph to photograph, because the camera was turned in its place or
+pictures were cropped, it is at rest once photographs are mapped to one of them, see
+:mod:`pimper_torch.sfm.camera_in_place`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
-from kornia.geometry.epipolar import normalize_points, sampson_epipolar_distance
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.geometry.pixels import homogeneous
+from pimper_torch.ledger import leave_out
 from pimper_torch.progress import track
 from pimper_torch.records import Record
+from pimper_torch.sfm.camera_in_place import (
+    mapped,
+    reference_from_photographs,
+    shift_px,
+    still_length_px,
+)
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.epipolar import sampson_errors, shared_geometry
+from pimper_torch.sfm.matching import (
+    Keypoints,
+    Matched,
+    Matches,
+    PhotographPair,
+    Rows,
+    Verifier,
+    Verify,
+    add_votes,
+    indices,
+    pixels_of,
+    read_geometries,
+    read_matched,
+)
+from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
-# Features at rest that were found less exactly are no evidence of motion: in rendered rooms 1 in
-# 100 is 1 to 4 px off.
-_CLEARLY = 4.0
 # Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
 _CONTRADICTION = 0.1
-# Pairs verified together; the first, which show most of both, must contradict one geometry: else no
-# more are verified. A choice.
-_TOGETHER = 24
-# Fits with other weights: in simulation the fraction of violations changes by 0.01 at most after 6.
-_ITERATIONS = 6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pair(Record):
-    """Matched features of two photographs.
-
-    Attributes:
-        matches: A feature of the first and one of the second in each row.
-    """
-
-    first: int
-    second: int
-    matches: Int[Tensor, "match 2"]
+# Longest still match. Of 24 rendered photographs of 640x480, 99 % of the matches of a room at rest
+# are shorter, and 0.4 % of those of a turning mug; where the room shifts and is brought back (20 of
+# 800x600, panned by up to 80 px), 99 % and 0.8 % are shorter than twice as much.
+_STILL_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -79,14 +91,68 @@ class StaticBackground(Record):
         return self.still_fraction > 0.5 and self.moving_pairs == 0
 
 
-Keypoints = Sequence[Float[Tensor, "_ 2"]]  # one length a photograph
-Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two photographs
-Verify = Callable[[Sequence[Pair]], Sequence[Int[Tensor, "match 2"]]]
+def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackground:
+    """Find what is at rest while something else moves, and keep features and matches of the latter.
+
+    Pairs that were verified on what is at rest are verified anew.
+
+    Args:
+        database: With features, matches and verified pairs. Where nothing is at rest it stays
+            as it is.
+    """
+    with quiet(), loaded().Database.open(database) as stored:
+        matched = read_matched(stored)
+        verifier = Verifier(matched=matched, settings=settings)
+        for maps, pixels, still_px in _ways(matched, settings):
+            rest = find_static_background(
+                pixels,
+                matched.pairs,
+                verifier,
+                still_px=still_px,
+                max_error_px=settings.max_error_px,
+                fewest=MIN_MATCHES,
+            )
+            if rest.room:
+                geometries = read_geometries(stored, matched) | verifier.geometries
+                _keep_moving(stored, matched, pixels, rest, still_px, geometries)
+                few = [int(one.sum()) < MIN_MATCHES for one in rest.features]
+                shown = [
+                    torch.full_like(one, torch.nan) if lacks else one
+                    for one, lacks in zip(maps, few, strict=True)
+                ]
+                shift = shift_px(maps, matched.keypoints)
+                return rest.replace(maps=tuple(shown), shift_px=shift)
+    return rest
+
+
+def enter_room(rest: StaticBackground) -> tuple[int, int]:
+    """Enter in the ledger how many features rest with a room; return their and all numbers."""
+    resting = sum(int(one.sum()) for one in rest.features)
+    total = sum(map(len, rest.features))
+    leave_out("sfm.shifted_room" if rest.shift_px else "sfm.room", resting, total=total)
+    return resting, total
+
+
+def _ways(
+    matched: Matched, settings: ReconstructConfig
+) -> Iterator[tuple[Sequence[Float[Tensor, "3 3"]], Keypoints, float]]:
+    """List maps of photographs under which a room may rest, pixels there, and still lengths."""
+    maps = reference_from_photographs(
+        matched.keypoints,
+        matched.pairs,
+        max_error_px=2 * _STILL_PX,
+        fewest=MIN_MATCHES,
+        generator=torch.Generator().manual_seed(settings.seed),
+    )
+    if maps is not None:
+        pixels = [mapped(*one).float() for one in zip(maps, matched.keypoints, strict=True)]
+        yield maps, pixels, still_length_px(pixels, matched.pairs, 2 * _STILL_PX)
+    yield [torch.eye(3).double()] * len(matched.keypoints), matched.keypoints, _STILL_PX
 
 
 def find_static_background(
     keypoints: Keypoints,
-    pairs: Sequence[Pair],
+    pairs: Matches,
     verify: Verify,
     *,
     still_px: float,
@@ -100,133 +166,90 @@ def find_static_background(
     where more says so, unless one geometry explains still and moving matches together: then
     the scene is rigid and all its features stay. Pairs of identical photographs have no moving
     matches and do not vote.
-
-    Args:
-        verify: Gives those matches of each pair that one epipolar geometry explains; called for
-            moving matches only.
-        still_px: Distance between the features of a still match, less than.
-        max_error_px: Sampson error above which a match violates a geometry.
-        fewest: Matches below which a pair does not vote.
     """
     votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
     num_moving = num_violating = moving_pairs = 0
-    split = [_split(keypoints, pair, still_px) for pair in pairs]
-    shown = [min(len(one.matches) for one in both) for both in split]
-    order = sorted(range(len(pairs)), key=shown.__getitem__, reverse=True)
-    telling = [split[index] for index in order if shown[index] >= fewest]
-    for start in track(range(0, len(telling), _TOGETHER)):
-        some = telling[start : start + _TOGETHER]
-        verified = verify([moving for _, moving in some])
-        for (resting, moving), right in zip(some, verified, strict=True):
-            if len(right) < fewest:
+    split = {pair: _split(keypoints, pair, rows, still_px) for pair, rows in pairs.items()}
+    shown = {pair: min(map(len, both)) for pair, both in split.items()}
+    order = sorted(split, key=shown.__getitem__, reverse=True)
+    telling = [pair for pair in order if shown[pair] >= fewest]
+    # The first pairs, which show most of both, must contradict one geometry: else no more are
+    # verified.
+    for start in track(range(0, len(telling), 24)):
+        group = telling[start : start + 24]
+        for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
+            if len(moving) < fewest:
                 continue
-            moving = moving.replace(matches=right)
-            ends = _pixels(keypoints, moving)
-            geometry = shared_geometry(_pixels(keypoints, resting), ends, max_error_px)
+            resting = split[pair][0]
+            ends = pixels_of(keypoints, pair, moving)
+            geometry = shared_geometry(pixels_of(keypoints, pair, resting), ends, max_error_px)
             moving_pairs += 1
-            num_moving += len(moving.matches)
+            num_moving += len(moving)
             num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
-            _count(votes, resting, 1)
-            _count(votes, moving, -1)
+            add_votes(votes, pair, resting, torch.ones_like(resting))
+            add_votes(votes, pair, moving, -torch.ones_like(moving))
         if num_moving and num_violating <= _CONTRADICTION * num_moving:
             break
-    num_still = sum(len(still.matches) for still, _ in split)
+    num_still = sum(len(still) for still, _ in split.values())
     fraction = num_violating / max(num_moving, 1)
     return StaticBackground(
         features=tuple((one > 0) & (fraction > _CONTRADICTION) for one in votes),
-        still_fraction=num_still / max(sum(len(pair.matches) for pair in pairs), 1),
+        still_fraction=num_still / max(sum(map(len, pairs.values())), 1),
         moving_pairs=moving_pairs,
         violating_fraction=fraction,
     )
 
 
 def moving_matches(
-    keypoints: Keypoints, pair: Pair, rest: StaticBackground, still_px: float
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, rest: StaticBackground, still_px: float
 ) -> Bool[Tensor, " match"]:
     """Find matches that are neither still nor of a feature at rest."""
-    first, second = pair.matches.unbind(dim=1)
-    touched = rest.features[pair.first][first] | rest.features[pair.second][second]
-    return ~touched & ~is_still(keypoints, pair, still_px)
+    touched = rest.features[pair[0]][rows[:, 0]] | rest.features[pair[1]][rows[:, 1]]
+    first, second = pixels_of(keypoints, pair, rows)
+    return ~touched & ((first - second).norm(dim=-1) >= still_px)
 
 
-def is_still(keypoints: Keypoints, pair: Pair, still_px: float) -> Bool[Tensor, " match"]:
-    """Find matches whose features lie at the same pixel."""
-    first, second = _pixels(keypoints, pair)
-    return (first - second).norm(dim=-1) < still_px
-
-
-def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Tensor, "3 3"]:
-    """Fit the fundamental matrix that explains still and moving matches best; float64.
-
-    The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
-    the same. Every translation explains the still ones, so that it is mostly the moving ones that
-    violate the result where no geometry explains both.
-
-    Args:
-        still: Pixels in the first and in the second photograph.
-    """
-    first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
-    count = torch.tensor([len(still[0]), len(moving[0])])
-    weight = even = (1 / count.double()).repeat_interleave(count)
-    for _ in range(_ITERATIONS):
-        geometry = fundamental_matrix(first, second, weight)
-        error = sampson_errors(geometry, first, second)
-        lines = torch.cat([homogeneous(first) @ geometry.mT, homogeneous(second) @ geometry], dim=1)
-        gradient = lines[:, [0, 1, 3, 4]].square().sum(dim=1)  # of the algebraic residual
-        tiny = torch.finfo(gradient.dtype).tiny
-        weight = even / (gradient.clamp_min(tiny) * (1 + (error / max_error_px).square()))
-    return geometry
-
-
-def fundamental_matrix(
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
-    weight: Float[Tensor, " match"],
-) -> Float[Tensor, "3 3"]:
-    """Fit ``F``, with ``second^T F first = 0``, by weighted least squares; float64.
-
-    kornia's ``find_fundamental`` weighs the normalization of the pixels, too: reweighted, still and
-    moving matches that contradict one another then violate the fit as little as 2 %, here 26 % at
-    least (30 turntables of two photographs).
-
-    Args:
-        first: Pixels, 8 or more.
-
-    Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
-    """
-    x, from_first = (part[0] for part in normalize_points(first.double()[None]))
-    y, from_second = (part[0] for part in normalize_points(second.double()[None]))
-    rows = (homogeneous(y)[:, :, None] * homogeneous(x)[:, None, :]).flatten(1)
-    least = torch.linalg.eigh(rows.mT @ (weight[:, None] * rows)).eigenvectors[:, 0]
-    u, s, v = torch.linalg.svd(least.reshape(3, 3))
-    s[2] = 0
-    return from_second.mT @ (u * s) @ v @ from_first
-
-
-def sampson_errors(
-    geometry: Float[Tensor, "3 3"],
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
-) -> Float[Tensor, " match"]:
-    """Return the first-order distance of matches from an epipolar geometry, in pixels."""
-    ends = first.double(), second.double()
-    errors: Tensor = sampson_epipolar_distance(*ends, geometry, squared=False)
-    return errors
-
-
-def _split(keypoints: Keypoints, pair: Pair, still_px: float) -> tuple[Pair, Pair]:
-    """Return a pair with its still matches, and with those that clearly move."""
-    first, second = _pixels(keypoints, pair)
+def _split(
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, still_px: float
+) -> tuple[Rows, Rows]:
+    """Return a pair's still matches, and those that clearly move."""
+    first, second = pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
-    still, moving = length < still_px, length >= _CLEARLY * still_px
-    return pair.replace(matches=pair.matches[still]), pair.replace(matches=pair.matches[moving])
+    # Features at rest that were found less exactly are no evidence of motion.
+    return rows[length < still_px], rows[length >= 4 * still_px]
 
 
-def _pixels(keypoints: Keypoints, pair: Pair) -> Ends:
-    first, second = pair.matches.unbind(dim=1)
-    return keypoints[pair.first][first], keypoints[pair.second][second]
+def _keep_moving(
+    stored: Any,  # noqa: ANN401 - pycolmap is untyped
+    matched: Matched,
+    pixels: Keypoints,
+    rest: StaticBackground,
+    still_px: float,
+    geometries: Mapping[PhotographPair, Any],
+) -> None:
+    """Drop features at rest and their matches from the database."""
+    described = [stored.read_descriptors(image) for image in matched.ids]
+    stored.clear_descriptors()
+    for image, resting, one in zip(matched.ids, rest.features, described, strict=True):
+        moves = (~resting).numpy()
+        stored.update_keypoints(image, np.array(stored.read_keypoints(image))[moves])
+        kept = loaded().FeatureDescriptors(one.type, one.data[moves])
+        stored.write_descriptors(image, kept)
+    number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
 
+    def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
+        rows = rows[moving_matches(pixels, pair, rows, rest, still_px)]
+        ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
+        return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 
-def _count(votes: list[Int[Tensor, " _"]], pair: Pair, weight: int) -> None:
-    for view, features in zip((pair.first, pair.second), pair.matches.unbind(dim=1), strict=True):
-        votes[view] = votes[view].index_add(0, features, torch.full_like(features, weight))
+    stored.clear_matches()
+    stored.clear_two_view_geometries()
+    for pair, rows in matched.pairs.items():
+        ids = matched.ids[pair[0]], matched.ids[pair[1]]
+        stored.write_matches(*ids, moving(pair, rows))
+        if pair in geometries:
+            geometry = geometries[pair]
+            inliers = moving(pair, indices(geometry.inlier_matches))
+            if len(inliers) >= MIN_MATCHES:
+                geometry.inlier_matches = inliers
+                stored.write_two_view_geometry(*ids, geometry)

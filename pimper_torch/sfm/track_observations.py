@@ -1,10 +1,10 @@
 r"""Points found again in photographs, to a small fraction of a pixel, whatever the light.
 
-What a view shows round a point is the reference view's patch, moved along the plane by a few
-numbers. Of the logarithm of the radiance, light that changes from view to view adds a constant
-and, over a patch, about a slope; both are projected out of patch and template alike, a common
-factor (contrast) is fitted. What remains is aligned by Gauss-Newton on the template's slopes,
-which are computed once for all views (inverse compositional).
+What a view shows round a point is the reference view's patch, moved along the point's tangent plane
+by a few numbers. Of the logarithm of the radiance, light that changes from view to view adds a
+constant and, over a patch, about a slope; both are projected out of patch and template alike, a
+common factor (contrast) is fitted. What remains is aligned by Gauss-Newton on the template's
+slopes, which are computed once for all views (inverse compositional).
 
 Source: Baker & Matthews, Lucas-Kanade 20 years on, IJCV 2004; that points of structure from motion
 deserve it, Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021, with learned
@@ -17,61 +17,143 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample, pad
+from torch.nn.functional import grid_sample, normalize, pad
 
 from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.mapped import drop_pages, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
-from pimper_torch.sfm.tangent_planes import Tangents, plane_homographies
+from pimper_torch.sfm.matching import MOST_PAIRED
 
-# Fraction of the median radiance below which the logarithm fades: darker is noise.
-_DARK = 0.02
-
-# Pixels from one to the next of those whose median is taken.
-_MEDIAN_STRIDE = 4
-
-_ITERATIONS = 10
-
-# Curvature of a template's match along its worst direction over that along its best, at least:
-# below, it is a stripe, and noise tells its place.
-_MIN_ROUNDNESS = 0.01
-
-# Steps of the plane, about pixels of the reference: the longest at once; the one that ends.
-_LONGEST_STEP, _CONVERGED = 1.5, 0.02
-
-# After so many iterations a patch that is nowhere near is given up.
-_TRIAL, _HOPELESS = 4, 0.4
-
-# Bounds of the contrast against the template's.
-_CONTRAST = (0.3, 3.0)
-
-# Fraction of a patch that a view may lack: padding, masked, saturated.
-_MAX_LACKING = 0.1
-
-_AT_ONCE = 4096
-
-# Points whose templates are in memory together: 115 MB of them, several times while they are made.
-_TEMPLATES = 2**15
+# Half the side of a patch, in steps of the plane, which are about pixels of the reference.
+_RADIUS = 8
+# Cosine between normal and ray down to which a view is worth asking.
+_MIN_COSINE = 0.35
+# Iterations; the longest step; the step that ends them; iterations after which a patch is given up
+# whose correlation is below the next; bounds of the contrast against the template's.
+_LIMITS = (10, 1.5, 0.02, 4, 0.4, 0.3, 3.0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SightingSettings:
-    """When a point counts as found.
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Tangents(Record):
+    """Tangent planes of points, float64.
 
     Attributes:
-        radius_px: Half the side of the patch.
-        min_correlation: With the template, light taken out.
-        max_shift_px: From where the cameras put the point.
-        max_deviation_px: Standard deviation of the place along its worst direction.
+        steps_world: Two vectors along the plane, right-angled and equally long: about a pixel of
+            the reference view each.
+        reference: The view that shows the plane best among those that see the point.
+        candidates: Views in front of the plane that have the point in their image; not the
+            reference.
     """
 
-    radius_px: int = 8
-    min_correlation: float = 0.8
-    max_shift_px: float = 3.0
-    max_deviation_px: float = 0.5
+    points_world: Float[Tensor, "point 3"]
+    steps_world: Float[Tensor, "point 2 3"]
+    reference: Int[Tensor, " point"]
+    candidates: Bool[Tensor, "point view"]
+
+
+def tangents(
+    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
+) -> Tangents:
+    """Lay a plane through every point and choose the views to look for it in."""
+    at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
+    points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
+    towards = [_towards(some, by, cameras) for some, by in zip(points, seen, strict=True)]
+    normals = torch.split(plane_normals(points_world, torch.cat(towards)), at_once)
+    laid = zip(points, seen, normals, strict=True)
+    return Tangents.cat([_laid(some, by, across, cameras) for some, by, across in laid])
+
+
+def _towards(
+    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
+) -> Float[Tensor, "point 3"]:
+    """Return the mean directions to the views that see points."""
+    rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
+    return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
+
+
+def _laid(
+    points_world: Float[Tensor, "point 3"],
+    observed: Bool[Tensor, "point view"],
+    normals: Float[Tensor, "point 3"],
+    cameras: Cameras,
+) -> Tangents:
+    """Lay planes of known normals."""
+    rays = cameras.centers_world - points_world[:, None]
+    distance = rays.norm(dim=-1)
+    cosine = (normalize(rays, dim=-1) * normals[:, None]).sum(dim=-1)
+    focals = cameras.intrinsics[:, 0, 0]
+    sharpness = torch.where(observed, cosine.clamp_min(1e-3) * focals / distance, 0)
+    reference = sharpness.argmax(dim=1)
+    here = reference[:, None]
+    pixel = (distance / focals).gather(1, here)
+    # Foreshortened along one axis, a pixel covers more of the plane.
+    pixel = pixel / cosine.gather(1, here).clamp(_MIN_COSINE, 1).sqrt()
+    pixels, depth = project(points_world, cameras.cam_from_world, cameras.intrinsics)
+    sizes = cameras.sizes_px[:, None].to(pixels)
+    inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
+    candidates = (inside.mT & (cosine > _MIN_COSINE)).scatter(1, here, value=False)
+    if cameras.num_views > MOST_PAIRED:
+        most = torch.full_like(here, 24)  # see docs/decisions.md
+        seen = evenly(candidates & observed, most)
+        left = most - seen.sum(dim=1, keepdim=True)
+        candidates = seen | evenly(candidates & ~observed, left)
+    return Tangents(
+        points_world=points_world,
+        steps_world=pixel[:, None] * _along(normals),
+        reference=reference,
+        candidates=candidates,
+    )
+
+
+def evenly(
+    candidates: Bool[Tensor, "point view"], most: Int[Tensor, "point 1"]
+) -> Bool[Tensor, "point view"]:
+    """Keep so many views of each point at most, evenly spread among the candidates."""
+    place = candidates.cumsum(dim=1) * most
+    count = torch.maximum(candidates.sum(dim=1, keepdim=True), most).clamp_min(1)
+    return candidates & (place // count > (place - most) // count)
+
+
+def plane_normals(
+    points: Float[Tensor, "point 3"], towards: Float[Tensor, "point 3"]
+) -> Float[Tensor, "point 3"]:
+    """Return the unit normals of the planes that points and their nearest ones lie on.
+
+    Args:
+        towards: Unit; what a normal points to, and what it is where neighbours say otherwise.
+    """
+    places = points.detach().cpu().numpy()
+    count = min(16, len(places))
+    _, nearest = cKDTree(places).query(places, k=list(range(1, count + 1)))
+    around = points[torch.from_numpy(nearest).to(points.device)]
+    steps = around - around.median(dim=1, keepdim=True).values  # a stray neighbour shifts no median
+    axes = torch.linalg.eigh(steps.mT @ steps).eigenvectors
+    across = axes[:, :, 0]
+    facing = (across * towards).sum(dim=-1, keepdim=True)
+    return torch.where(facing.abs() > 0.5, across * facing.sign(), towards)
+
+
+def plane_homographies(
+    tangent: Tangents, cameras: Cameras, view: int, some: Int[Tensor, " chosen"]
+) -> Float[Tensor, "chosen 3 3"]:
+    """Return the homographies from planes, in steps from the centre, to a view's pixels."""
+    steps = tangent.steps_world[some]
+    centre = transform(cameras.cam_from_world[view], tangent.points_world[some])
+    rotated = steps @ cameras.cam_from_world[view, :3, :3].mT
+    return cameras.intrinsics[view] @ torch.cat([rotated, centre[:, None]], dim=1).mT
+
+
+def _along(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 2 3"]:
+    """Return two unit vectors at right angles to each normal and to one another."""
+    axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
+    first = normalize(torch.linalg.cross(normals, axis), dim=-1)
+    return torch.stack([first, torch.linalg.cross(normals, first)], dim=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -93,7 +175,6 @@ def log_pictures(
     """Take logarithms of photographs one by one, so that no others are held.
 
     Args:
-        photographs: Radiance, channels first, and where it is valid; of any sizes.
         raster: How many there are, and the height and width that they are padded to.
 
     Returns:
@@ -108,19 +189,15 @@ def log_pictures(
         log[index, :height, :width] = torch.where(usable, radiance.mean(dim=0), 0)
         unusable[index, :height, :width] = ~usable
         drop_pages()
-    some = log[:, ::_MEDIAN_STRIDE, ::_MEDIAN_STRIDE]
-    some = some[some > 0]
-    floor = _DARK * some.median() if len(some) else torch.ones(())
+    lit = log[:, ::4, ::4]
+    lit = lit[lit > 0]
+    floor = 0.02 * lit.median() if len(lit) else torch.ones(())  # darker is noise
     return LogPictures(log=log.add_(floor.clamp_min(1e-6)).log_(), unusable=unusable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class TrackObservations(Record):
-    """Where views show points.
-
-    Attributes:
-        pixels: Where, in the undistorted photograph.
-    """
+    """Where views show points."""
 
     point: Int[Tensor, " sighting"]
     view: Int[Tensor, " sighting"]
@@ -145,12 +222,12 @@ class _Templates(Record):
 class _Window:
     """The raster of a patch in steps of the plane, its weights, and what light may change."""
 
-    def __init__(self, radius: int, like: Tensor) -> None:
-        side = torch.arange(-radius, radius + 1).to(like)
+    def __init__(self, like: Tensor) -> None:
+        side = torch.arange(-_RADIUS, _RADIUS + 1).to(like)
         v, u = torch.meshgrid(side, side, indexing="ij")
-        self.side = 2 * radius + 1
+        self.side = 2 * _RADIUS + 1
         self.places = torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
-        weight = torch.exp(-(u.square() + v.square()).flatten() * 1.5 / radius**2)
+        weight = torch.exp(-(u.square() + v.square()).flatten() * 1.5 / _RADIUS**2)
         self.root, self.total = weight.sqrt(), float(weight.sum())
         light = (self.places * self.root).mT
         self.light = torch.linalg.qr(light).Q
@@ -162,7 +239,11 @@ class _Window:
 
 
 def sight(
-    pictures: LogPictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+    pictures: LogPictures,
+    cameras: Cameras,
+    tangents: Tangents,
+    max_shift_px: float = 3.0,
+    at_once: int = 2**13,
 ) -> TrackObservations:
     """Find points in all views that may show them.
 
@@ -174,32 +255,28 @@ def sight(
         the point. A constant to autograd.
     """
     found = []
-    for first in range(0, max(len(tangents.points_world), 1), _TEMPLATES):
-        some = _sight(pictures, cameras, tangents.take(slice(first, first + _TEMPLATES)), settings)
-        found.append(some.replace(point=some.point + first))
+    for first in range(0, max(len(tangents.points_world), 1), at_once):
+        part = _sight(pictures, cameras, tangents.take(slice(first, first + at_once)), max_shift_px)
+        found.append(part.replace(point=part.point + first))
     return TrackObservations.cat(found)
 
 
 def _sight(
-    pictures: LogPictures, cameras: Cameras, tangents: Tangents, settings: SightingSettings
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, max_shift_px: float
 ) -> TrackObservations:
-    """Find so many points that their templates fit in memory."""
     with torch.no_grad():
-        window = _Window(settings.radius_px, like=pictures.log)
+        window = _Window(like=pictures.log)
         templates = _templates(pictures, cameras, tangents, window)
 
         def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
-            (some,) = torch.nonzero(tangents.candidates[:, view] & templates.usable, as_tuple=True)
-            found = [(some[:0], some[:0], tangents.points_world[:0, :2])]
-            for chosen in torch.split(some, _AT_ONCE):
-                homographies = plane_homographies(tangents, cameras, view, chosen)
-                kept, pixels = _aligned(
-                    pictures, view, homographies, chosen, templates, window, settings
-                )
-                shown = chosen[kept]
-                found.append((shown, torch.full_like(shown, view), pixels[kept]))
-            point, view_, pixels = (torch.cat(part) for part in zip(*found, strict=True))
-            return point, view_, pixels
+            mine = tangents.candidates[:, view] & templates.usable
+            (chosen,) = torch.nonzero(mine, as_tuple=True)
+            homographies = plane_homographies(tangents, cameras, view, chosen)
+            kept, pixels = _aligned(
+                pictures, view, homographies, chosen, templates, window, max_shift_px
+            )
+            shown = chosen[kept]
+            return shown, torch.full_like(shown, view), pixels[kept]
 
         parts = side_by_side(in_view, range(len(pictures.log)))
         point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -208,7 +285,7 @@ def _sight(
         (own,) = torch.nonzero(found, as_tuple=True)
         point = torch.cat([point, own])
         view_ = torch.cat([view_, tangents.reference[own]])
-        pixels = torch.cat([pixels, _own(tangents, cameras)[own]])
+        pixels = torch.cat([pixels, _reference_pixels(tangents, cameras)[own]])
         order = torch.argsort(point * len(pictures.log) + view_)
         return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 
@@ -224,8 +301,6 @@ def _templates(
     whole = torch.zeros(count, dtype=torch.bool, device=pictures.log.device)
     for view in range(len(pictures.log)):
         (some,) = torch.nonzero(tangents.reference == view, as_tuple=True)
-        if len(some) == 0:
-            continue
         homographies = plane_homographies(tangents, cameras, view, some)
         patches[some] = _look_up(pictures.log[view], homographies, window)
         whole[some] = _complete(pictures.unusable[view], homographies, window)
@@ -234,7 +309,8 @@ def _templates(
     slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
     normal = slopes.mT @ slopes
     worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
-    told = (best > 1e-9) & (worst > _MIN_ROUNDNESS * best)
+    # Below, the patch is a stripe, and noise tells its place.
+    told = (best > 1e-9) & (worst > 0.01 * best)
     safe = torch.where(told[:, None, None], normal, torch.eye(2).to(normal))
     return _Templates(
         values=window.freed(patches),
@@ -251,12 +327,11 @@ def _aligned(
     chosen: Int[Tensor, " point"],
     templates: _Templates,
     window: _Window,
-    settings: SightingSettings,
+    max_shift_px: float,
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
     """Align one view's patches; return which were found, and their pixels."""
     from pimper_torch.kernels.patch_alignment import align
 
-    limits = (_ITERATIONS, _LONGEST_STEP, _CONVERGED, _TRIAL, _HOPELESS, *_CONTRAST)
     shift = homographies.new_empty(len(homographies), 2)
     deviation, correlation = torch.empty_like(shift).mT.contiguous()
     align(
@@ -269,15 +344,14 @@ def _aligned(
         window.places.contiguous().numpy(),
         window.root.contiguous().numpy(),
         window.light.contiguous().numpy(),
-        np.array([*limits, settings.max_shift_px], dtype=np.float64),
+        np.array([*_LIMITS, max_shift_px], dtype=np.float64),
         shift.numpy(),
         deviation.numpy(),
         correlation.numpy(),
     )
     arrived = shift.isfinite().all(dim=1)
     final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
-    found = arrived & (correlation >= settings.min_correlation)
-    found &= deviation <= settings.max_deviation_px
+    found = arrived & (correlation >= 0.8) & (deviation <= 0.5)
     found &= _complete(pictures.unusable[view], final, window)
     return found, final[:, :2, 2] / final[:, 2:, 2]
 
@@ -290,7 +364,7 @@ def _shifted(
     return torch.cat([homographies[:, :, :2], centre[..., None]], dim=2)
 
 
-def _own(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
+def _reference_pixels(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
     """Return the points' pixels in their reference views."""
     frames = cameras.cam_from_world[tangents.reference]
     points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
@@ -306,7 +380,7 @@ def _complete(
     """Find whose patches a view shows nearly all of."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
     fraction = (lacking * window.root.square()).sum(dim=1) / window.total
-    return fraction <= _MAX_LACKING
+    return fraction <= 0.1
 
 
 def _look_up(

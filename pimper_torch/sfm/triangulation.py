@@ -13,39 +13,36 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
-from pimper_torch.sfm.agreement import (
+from pimper_torch.sfm.colmap import loaded, model_of, observation_errors, quiet, reconstruction_of
+from pimper_torch.sfm.conventions.by_matches import choose_way
+from pimper_torch.sfm.conventions.resized_pictures import Ways
+from pimper_torch.sfm.epipolar import (
     epipolar_geometry,
+    explained,
     pinholes_of,
     undistorted_pairs,
     undistorted_pixels,
 )
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.colmap import model_of, reconstruction_of
-from pimper_torch.sfm.conventions.by_matches import choose_way, explained
-from pimper_torch.sfm.conventions.resized_pictures import Ways
-from pimper_torch.sfm.features import find_features, too_small
-from pimper_torch.sfm.guided import Near, guided_matches, read_features
-from pimper_torch.sfm.leave_out import enter_room, leave_out_room
+from pimper_torch.sfm.features import Workspace, find_features, image_ids, too_small, workspace
 from pimper_torch.sfm.matching import (
+    Near,
     PhotographPair,
     VerifiedPair,
+    guided_matches,
     match_pairs,
-    photograph_numbers,
+    read_features,
     strongest,
     verified_pairs,
 )
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
-from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.retrieval import pairs_to_match
-from pimper_torch.sfm.workspace import Workspace, workspace
+from pimper_torch.sfm.static_background import enter_room, leave_out_room
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
 # help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
 FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
-# Angle between optical axes from which on photographs have nothing to match. A choice.
-_MAX_ANGLE_DEG = 60.0
 
 
 def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
@@ -70,9 +67,6 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
         found, which a :class:`~pimper_torch.errors.PimperWarning` says.
-
-    Raises:
-        InputError: Cameras and photographs do not belong together.
     """
     if too_small(views) and ways.plain:
         _tell_nothing(0, where)
@@ -91,16 +85,22 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
         offset = local_origin(given.cam_from_world, given.points_world)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
-        found = _triangulated(space, local, settings.seed)
+        found = local.with_points(_triangulated(space, local, settings.seed))
     release_memory()
     if len(found.points_world):
         found = refine_tracks(views, found, settings.track_iterations, cameras=False)
     points = found.points_world + found.points_world.new_tensor(offset)
-    found = _with_cameras_of(given, found.replace(points_world=points))
+    found = given.with_points(found.replace(points_world=points))
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
         _tell_nothing(len(found.points_world), where)
         return given
-    _tell(found, where)
+    caution(
+        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
+        "were triangulated from the photographs with the cameras held fixed, observed "
+        f"{len(found.observation_point):,} times; median reprojection error "
+        f"{float(observation_errors(found).median()):.2f} px.",
+        stacklevel=3,
+    )
     return found
 
 
@@ -114,17 +114,17 @@ def _match_along_lines(
     pairs, cameras = _pairs(model, verified, settings), pinholes_of(model)
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
-        image_of = {number: image for image, number in photograph_numbers(stored, space).items()}
+        image_of = image_ids(stored, space)
         features = []
-        for number in range(model.num_views):
-            its = read_features(stored, image_of[number])
-            features.append(its.replace(pixels=undistorted_pixels(model, number, its.pixels)))
+        for view, image in enumerate(image_of):
+            its = read_features(stored, image)
+            features.append(its.replace(pixels=undistorted_pixels(model, view, its.pixels)))
 
         def matches(pair: PhotographPair) -> Tensor:
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px, planar=False)
+            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px)
             found = guided_matches(first, second, near, settings.max_ratio)
             ends = VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
@@ -148,9 +148,9 @@ def _pairs(
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
     cameras, limit = pinholes_of(model), settings.max_error_px
     weights = {
-        (first, second): 1 - float(angles[first, second]) / _MAX_ANGLE_DEG
+        (first, second): 1 - float(angles[first, second]) / 60
         for first, second in combinations(range(model.num_views), 2)
-        if float(angles[first, second]) < _MAX_ANGLE_DEG
+        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
     }
     for pair in undistorted_pairs(model, verified):
         count = int(explained(cameras, pair, limit).sum())
@@ -160,7 +160,7 @@ def _pairs(
 
 
 def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
-    """Let COLMAP triangulate the matches in the database; names and cameras are the model's."""
+    """Let COLMAP triangulate the matches in the database."""
     pycolmap = loaded()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -170,43 +170,16 @@ def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseMode
     options.ba_refine_focal_length = False
     options.ba_refine_extra_params = False
     lenses = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
-    nothing = torch.zeros(0, dtype=torch.long)
-    bare = model.replace(
-        names=space.files,
-        lenses=lenses,
-        points_world=model.points_world[:0],
-        observation_point=nothing,
-        observation_view=nothing,
-        observation_pixels=model.observation_pixels[:0],
-    )
+    bare = SparseModel(names=space.files, lenses=lenses, cam_from_world=model.cam_from_world)
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
-        cameras = reconstruction_of(bare, torch.zeros(0, 3, dtype=torch.uint8))
+        cameras = reconstruction_of(bare)
         with pycolmap.Database.open(space.database) as stored:
             for camera in cameras.cameras.values():
                 stored.update_camera(camera)
         found = pycolmap.triangulate_points(
             cameras, space.database, space.images, output, True, options
         )
-    return _with_cameras_of(model, model_of(found))
-
-
-def _with_cameras_of(given: SparseModel, found: SparseModel) -> SparseModel:
-    return found.replace(
-        names=given.names,
-        lenses=given.lenses,
-        cam_from_world=given.cam_from_world,
-        background_from_view=given.background_from_view,
-    )
-
-
-def _tell(found: SparseModel, where: str) -> None:
-    caution(
-        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
-        "were triangulated from the photographs with the cameras held fixed, observed "
-        f"{len(found.observation_point):,} times; median reprojection error "
-        f"{float(observation_errors(found).median()):.2f} px.",
-        stacklevel=4,
-    )
+    return model_of(found)
 
 
 def _tell_nothing(count: int, where: str) -> None:

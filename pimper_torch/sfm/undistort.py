@@ -1,32 +1,38 @@
 """Photographs as a pinhole would have taken them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.mapped import zeros
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import (
+    AlbedoPrior,
+    DepthPrior,
+    InlierPrior,
+    Lens,
+    LightPrior,
+    MapPrior,
+    NormalPrior,
+    Prior,
+    SilhouettePrior,
+    SparseScene,
+    Views,
+)
 from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
-
-_MAX_ZOOM = 1.25
-_AT_ONCE = 2**17  # pixels that are distorted at a time: rays and powers of radii take memory
-_TOUCHED = 1e-3  # fraction of saturated light in a pixel; below is the rounding of its weights
 
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
 
     The pinholes are those of :func:`pinhole_for`, of the photographs' sizes.
-
-    Args:
-        views: Any; padding stays zero.
 
     Returns:
         The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
@@ -53,11 +59,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 def undistorted(
     views: Views, lenses: tuple[Lens, ...]
 ) -> Iterator[tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]]:
-    """Undistort photographs one by one, as :func:`undistort` does, without padding.
-
-    Yields:
-        Radiance, and where it is valid.
-    """
+    """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     alike = len(set(lenses)) == 1
     shared = source_grid(lenses[0], like=views.images) if alike else None
 
@@ -113,7 +115,7 @@ def _undistort_image(
     radiance = _sampled(image, places).masked_fill_(~inside, 0)
     saturated = image >= SATURATED
     if bool(saturated.any()):
-        touched = _sampled(saturated.to(image), places) > _TOUCHED
+        touched = _sampled(saturated.to(image), places) > 1e-3  # the rounding of weights
         radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
     if mask is not None:
         inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
@@ -147,7 +149,7 @@ def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
             reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
             needed = (end - K[axis, 2]).abs() / K[axis, axis]
             zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
-    zoom = zoom.clamp_max(_MAX_ZOOM)
+    zoom = zoom.clamp_max(1.25)
     return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
 
 
@@ -164,9 +166,105 @@ def photograph_pixels(
     scale = K.new_tensor([lens.width / width, lens.height / height])
     pixels = pixel_centers(width, height, like=K).reshape(-1, 2)
     found = torch.empty_like(pixels)
-    parts = torch.split(pixels, _AT_ONCE), torch.split(found, _AT_ONCE)
+    parts = torch.split(pixels, 2**17), torch.split(found, 2**17)  # rays take memory
     for some, into in zip(*parts, strict=True):
         plane = (some * scale - K[:2, 2]) / K.diagonal()[:2]
         rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
         into.copy_(distort(lens, rays) / scale)
     return found.reshape(height, width, 2)
+
+
+_VALUES: dict[type[MapPrior], str] = {
+    NormalPrior: "normals",
+    DepthPrior: "depth",
+    AlbedoPrior: "albedo",
+    InlierPrior: "probability",
+    SilhouettePrior: "inside",
+}
+_Raster = Float[Tensor, "1 channel height width"]
+AnyMap = TypeVar("AnyMap", bound=MapPrior)
+
+
+def with_undistorted_priors(scene: SparseScene) -> SparseScene:
+    """Resample the priors of the original photographs as these were undistorted.
+
+    Means of what a pixel touches count by their precision; its variance is theirs and that of the
+    values among them, so that it is large at edges. What looks past the photograph's edge is not
+    known: variance is infinite, and probability one half. Maps keep their sizes. A photograph
+    without distortion keeps its map bit for bit. Differentiable in values and variances.
+
+    Args:
+        scene: Where it has no lenses, its photographs came without distortion.
+
+    Returns:
+        With maps of the scene's own views; the scene itself where there is nothing to do.
+    """
+    priors = scene.views.priors
+    if all(isinstance(prior, LightPrior) or prior.undistorted for prior in priors):
+        return scene
+    lenses: dict[str, Lens | None] = dict.fromkeys(scene.views.names)
+    lenses |= dict(zip(scene.views.names, scene.lenses, strict=False))
+    placed: tuple[Prior, ...] = tuple(
+        prior if isinstance(prior, LightPrior) or prior.undistorted else _undistorted(prior, lenses)
+        for prior in priors
+    )
+    return scene.replace(views=scene.views.replace(priors=placed))
+
+
+def _undistorted(prior: AnyMap, lenses: Mapping[str, Lens | None]) -> AnyMap:
+    straight = [
+        _straight(prior.take([index]), lenses[name])
+        for index, name in enumerate(prior.names)
+        if name in lenses
+    ]
+    return type(prior).cat(straight or [prior.take([])]).replace(undistorted=True)
+
+
+def _straight(one: AnyMap, lens: Lens | None) -> AnyMap:
+    """Resample one map; what lies beside it in its raster stays as it is."""
+    width, height = one.sizes_px[0].tolist()
+    grid = source_grid(lens, one.sizes_px.double(), width, height) if lens else None
+    if grid is None:
+        return one
+    field = _VALUES[type(one)]
+    before, is_normals = getattr(one, field), isinstance(one, NormalPrior)
+    raster = before.movedim(-1, 1) if is_normals else before.reshape(1, -1, *before.shape[-2:])
+    values = raster[..., :height, :width].double()
+    changes = {}
+    if isinstance(one, NormalPrior | DepthPrior | AlbedoPrior):
+        known = one.variance[:, :height, :width].double()
+        values, error, spread = _weighted(values, known, *grid)
+        values = normalize(values, dim=1) if is_normals else values
+        error = error + (spread.sum(dim=1) if is_normals else spread.mean(dim=1))
+        changes["variance"] = _filled(one.variance, error)
+    else:
+        values = torch.where(grid[1], _sampled(values[0], grid[0])[None], 0.5)  # says nothing
+    found = _filled(raster, values)
+    changes[field] = found.movedim(1, -1) if is_normals else found.reshape(before.shape)
+    return one.replace(**changes)
+
+
+def _filled(raster: Tensor, values: Tensor) -> Tensor:
+    """Put values into the upper left corner of a copy."""
+    after = raster.clone()
+    after[..., : values.shape[-2], : values.shape[-1]] = values.to(raster)
+    return after
+
+
+def _weighted(
+    values: _Raster,
+    variance: Float[Tensor, "1 height width"],
+    places: Float[Tensor, "1 height width 2"],
+    inside: Bool[Tensor, "height width"],
+) -> tuple[_Raster, Float[Tensor, "1 height width"], _Raster]:
+    """Return means by precision, one over the mean precision, and variances about the means."""
+    known = variance.isfinite()
+    precision = torch.where(known, 1 / torch.where(known, variance, 1), 0)[:, None]
+    values = torch.where(known[:, None], values, 0)
+    stacked = torch.cat([precision, precision * values, precision * values.square()], dim=1)
+    sums = _sampled(stacked[0], places)[None]
+    known = inside & (sums[:, :1] > 0)
+    weight = torch.where(known, sums[:, :1], 1)
+    mean, square = (sums[:, 1:] / weight).chunk(2, dim=1)
+    error = torch.where(known, 1 / weight, torch.inf)[:, 0]
+    return mean, error, (square - mean.square()).clamp_min(0)

@@ -18,18 +18,11 @@ from pimper_torch.sfm.model import SparseModel, select_views
 
 # How far people hold a camera from level. A choice: one turned by a quarter counts as 1 in 900.
 _ROLL = math.radians(3.0)
-_ROUNDS = 10
 
-# What y axes count against x axes, which do not lean when cameras look down. A choice: cameras 75
-# degrees above an object, along an arc of 60, are 0.7 degrees off; with 1 they are 7.
-_LEAN = 0.1
 
 # Most that a plane's normal and the cameras' up differ where the object stands on it. A choice: a
 # wall is 90 degrees off, and cameras on a turntable's arc tell up to within a degree.
 _WITHIN = math.cos(math.radians(30.0))
-
-# Views that see a point which counts for the plane.
-_FEWEST_VIEWS = 3
 
 
 def upright(model: SparseModel) -> SparseModel:
@@ -64,7 +57,7 @@ def up_direction(model: SparseModel) -> Float[Tensor, "3"]:
         first = (model.series == model.series[0]).nonzero()[:, 0]
         model = select_views(model, first.tolist())
     level = level_up(model.cam_from_world)
-    tracked = model.points_world[model.observed.sum(dim=1) >= _FEWEST_VIEWS]
+    tracked = model.points_world[model.observed.sum(dim=1) >= 3]
     eyes = invert_rigid(model.cam_from_world)[:, :3, 3]
     plane = supporting_plane(tracked, eyes, float(fixation(model.cam_from_world).distance))
     stands = plane is not None and bool(plane.normal_world @ level > _WITHIN)
@@ -79,10 +72,12 @@ def level_up(cam_from_world: Float[Tensor, "view 4 4"]) -> Float[Tensor, "3"]:
     """
     right, down = cam_from_world[:, 0, :3].double(), cam_from_world[:, 1, :3].double()
     up = normalize(-down.mean(dim=0), dim=0)
-    for _ in range(_ROUNDS):
+    for _ in range(10):
         weight = 1 / (1 + (right @ up / _ROLL) ** 2)
         across = torch.einsum("v,vi,vj->ij", weight, right, right) / _ROLL**2
-        across = across + _LEAN * weight.sum() * torch.eye(3).to(across)
+        # y axes count less than x axes, which do not lean when cameras look down: cameras 75
+        # degrees above an object, along an arc of 60, are 0.7 degrees off; alike, 7.
+        across = across + 0.1 * weight.sum() * torch.eye(3).to(across)
         up = -torch.linalg.solve(across, (weight[:, None] * down).sum(dim=0))
         up = normalize(up, dim=0)
     return up

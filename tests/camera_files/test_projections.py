@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.camera_files.projections import decompose_projections
+from pimper_torch.camera_files.posed_camera import decompose_projections
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 
 

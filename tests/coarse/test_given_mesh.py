@@ -158,29 +158,23 @@ def test_a_mesh_without_any_area_is_refused(scene, unknown, true_mesh):
 
 @pytest.mark.parametrize("with_masks", [False, True])
 @pytest.mark.parametrize(
-    ("change", "told"),
+    "change",
     [
-        (lambda mesh: exchanged(mesh, 0, 2, 1), r"With \(x, z, y\) in the place of"),
-        (lambda mesh: exchanged(mesh, 2, 0, 1), r"With \(y, z, x\) in the place of"),
-        (
-            lambda mesh: mesh.replace(
-                vertices_world=mesh.vertices_world * torch.tensor([1, 1, -1])
-            ),
-            r"With \(x, y, -z\)",
-        ),
-        (lambda mesh: mesh.replace(vertices_world=1000 * mesh.vertices_world), "0.001 times"),
-        (lambda mesh: mesh.replace(vertices_world=mesh.vertices_world / 25.4), "25.4 times"),
-        (lambda mesh: mesh.replace(vertices_world=mesh.vertices_world / 100), "100 times"),
+        lambda mesh: exchanged(mesh, 0, 2, 1),
+        lambda mesh: exchanged(mesh, 2, 0, 1),
+        lambda mesh: mesh.replace(vertices_world=mesh.vertices_world * torch.tensor([1, 1, -1])),
+        lambda mesh: mesh.replace(vertices_world=1000 * mesh.vertices_world),
+        lambda mesh: mesh.replace(vertices_world=mesh.vertices_world / 25.4),
     ],
 )
-def test_a_mesh_in_another_frame_is_refused_and_the_frame_is_named(
-    scene, unknown, masks, true_mesh, change, told, with_masks
+def test_a_mesh_in_another_frame_is_refused_or_where_no_ray_meets_it_warned_of(
+    scene, unknown, masks, true_mesh, change, with_masks
 ):
-    with pytest.raises(InputError, match=told):
+    with pytest.raises((InputError, PimperWarning), match=r"wh(ere|at) the photographs show"):
         prepared(change(true_mesh), scene, masks if with_masks else unknown)
 
 
-def test_masks_alone_tell_another_frame_where_there_are_no_points(scene, masks, true_mesh):
+def test_masks_alone_warn_of_another_frame_where_there_are_no_points(scene, masks, true_mesh):
     bare = scene.replace(
         points_world=scene.points_world[:0],
         reprojection_errors_px=scene.reprojection_errors_px[:0],
@@ -190,7 +184,7 @@ def test_masks_alone_tell_another_frame_where_there_are_no_points(scene, masks, 
     )
     _, figures = prepared(true_mesh, bare, masks)
     assert set(figures) == {"faces", "overlap", "observations"}
-    with pytest.raises(InputError, match=r"overlap with the masks by 38%\. With \(x, z, y\)"):
+    with pytest.warns(PimperWarning, match=r"is off .*overlap with the masks by 38%"):
         prepared(exchanged(true_mesh, 0, 2, 1), bare, masks)
 
 
@@ -233,7 +227,7 @@ def test_points_of_the_background_say_nothing_against_a_mesh(scene, unknown, tru
     )
     _, figures = prepared(true_mesh, both, unknown)
     assert figures["on_mesh"] > 0.95
-    with pytest.raises(InputError, match=r"another frame|not where"):
+    with pytest.raises(InputError, match="not where"):
         prepared(exchanged(true_mesh, 0, 2, 1), both, unknown)
 
 
@@ -250,5 +244,5 @@ def test_a_mesh_goes_along_with_cameras_far_from_their_origin(scene, unknown, tr
         found = chain.given_mesh(mesh, source, far, unknown)
         assert_close(found.vertices_world, plain.vertices_world, rtol=0, atol=1e-6)
     assert chain.given_mesh(None, scene.views, far, unknown) is None
-    with pytest.raises(InputError, match=r"rays to 0 of \d+ .*With \(x, z, y\)"):
+    with pytest.warns(PimperWarning, match=r"is off .*rays to 0 of \d+ "):
         chain.given_mesh(exchanged(brought, 0, 2, 1), scene.views, far, unknown)

@@ -199,5 +199,5 @@ def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attac
 def test_facets_of_a_mesh_elsewhere_are_refused(round_about):
     vertices, faces = icosphere(2)
     mesh = Mesh(vertices_world=1000 * vertices, faces=faces)
-    with pytest.raises(InputError, match="in another frame than the cameras"):
+    with pytest.raises(InputError, match="not where the photographs show the object"):
         facets_of(mesh, round_about)

@@ -20,8 +20,7 @@ from pimper_torch.doctor.checks import (
 from pimper_torch.doctor.cost import cost, estimate
 from pimper_torch.doctor.machine import available_gb, machine, total_gb
 from pimper_torch.doctor.pairs import light, light_variation, match_copies, overlap
-from pimper_torch.doctor.photograph import Photograph, of_views, summarize
-from pimper_torch.doctor.sharpness import edge_blur_px
+from pimper_torch.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views

@@ -36,7 +36,7 @@ from seeds import Seed, make_seeds
 
 from pimper_torch.errors import PimperError
 from pimper_torch.records import Record
-from pimper_torch.sfm.binding import loaded
+from pimper_torch.sfm.colmap import loaded
 from pimper_torch.sfm.model import SparseModel
 
 LIMIT_BYTES, LIMIT_SECONDS = 2 * 2**30, 20.0

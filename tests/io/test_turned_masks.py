@@ -1,13 +1,11 @@
 """Masks of the pixels that files store, and those turned already, beside turned photographs."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.errors import InputError
 from pimper_torch.io.decode import rotated
 from pimper_torch.io.photographs import load_views
 
@@ -38,56 +36,25 @@ def write_masks(folder, drawn, tags, *, turned):
         Image.fromarray(mask.astype(np.uint8) * 255).save(folder / f"{number}.png")
 
 
-@pytest.mark.parametrize("turned", [True, False])
-@pytest.mark.parametrize(
-    ("tags", "size"),
-    [
-        ([3, 3, 3, 3], (90, 60)),
-        ([1, 3, 1, 3], (90, 60)),
-        ([2, 4, 3, 1], (90, 60)),
-        ([6, 6, 8, 6], (72, 72)),
-        ([6, 3, 8, 1], (90, 60)),
-        ([5, 7, 1, 3], (72, 72)),
-    ],
-)
-def test_masks_mark_the_object_whether_they_are_drawn_before_or_after_turning(
-    tmp_path, tags, size, turned
-):
-    shown = write_photographs(tmp_path / "photos", tags, *size)
-    write_masks(tmp_path / "masks", shown, tags, turned=turned)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        views = load_views(tmp_path / "photos", masks=tmp_path / "masks")
+@pytest.mark.parametrize("tags", [[3, 3, 3, 3], [2, 4, 3, 1], [6, 3, 8, 1]])
+def test_masks_are_drawn_on_photographs_as_they_stand(tmp_path, tags):
+    shown = write_photographs(tmp_path / "photos", tags)
+    write_masks(tmp_path / "masks", shown, tags, turned=True)
+    views = load_views(tmp_path / "photos", masks=tmp_path / "masks")
     for view, tag in enumerate(tags):
         width, height = views.sizes_px[view].tolist()
         wanted = torch.from_numpy(rotated(shown, tag))
         assert torch.equal(views.masks[view, :height, :width], wanted)
     assert views.orientations.tolist() == tags
-    messages = [str(one.message) for one in told]
-    assert len(messages) == (not turned)
-    if not turned:
-        assert "drawn on the pixels that the files store" in messages[0]
 
 
-def test_masks_are_turned_in_photographs_that_are_made_smaller(tmp_path):
-    tags = [3, 3, 3]
-    shown = write_photographs(tmp_path / "photos", tags, 180, 120)
+def test_masks_whose_size_tells_that_they_are_of_stored_pixels_are_turned(tmp_path):
+    tags = [6, 8, 6]
+    shown = write_photographs(tmp_path / "photos", tags)
     write_masks(tmp_path / "masks", shown, tags, turned=False)
-    with pytest.warns(PimperWarning, match="3 of 3 masks"):
-        masks = load_views(tmp_path / "photos", masks=tmp_path / "masks", max_size_px=90).masks
-    wanted = torch.from_numpy(rotated(disc(90, 60), 3))
-    assert (masks != wanted).float().mean() < 0.01  # the outline, rounded
-
-
-def test_where_nothing_tells_masks_are_taken_as_they_are_with_a_warning(tmp_path):
-    tags = [3, 3, 3]
-    write_photographs(tmp_path / "photos", tags)
-    drawn = np.zeros((60, 90), dtype=bool)
-    drawn[:, :20] = True  # of nothing that the photographs show
-    write_masks(tmp_path / "masks", drawn, tags, turned=False)
-    with pytest.warns(PimperWarning, match="3 of 3 masks.*nothing tells"):
-        masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
-    assert torch.equal(masks, torch.from_numpy(drawn).expand(3, 60, 90))
+    views = load_views(tmp_path / "photos", masks=tmp_path / "masks")
+    for mask, tag in zip(views.masks, tags, strict=True):
+        assert torch.equal(mask, torch.from_numpy(rotated(shown, tag)))
 
 
 def test_masks_with_an_exif_of_their_own_are_turned_by_that_alone(tmp_path):

@@ -7,7 +7,7 @@ from pimper_torch.evidence.scenes.scene_cameras import FRONT, UP, arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.camera_in_place import mapped
-from pimper_torch.sfm.static_background import Pair, StaticBackground, find_static_background
+from pimper_torch.sfm.static_background import StaticBackground, find_static_background
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 
@@ -28,29 +28,29 @@ class Captured:
             self.thing.append(order)
             noise = 0.2 * torch.randn(len(order), 2, generator=generator, dtype=torch.float64)
             self.keypoints.append((view[order] + noise).float())
-        self.pairs = [
-            self._pair(first, second, generator)
+        self.pairs = {
+            (first, second): self._matches(first, second, generator)
             for second in range(len(pixels))
             for first in range(second)
-        ]
+        }
 
-    def _pair(self, first: int, second: int, generator: torch.Generator) -> Pair:
+    def _matches(self, first: int, second: int, generator: torch.Generator) -> Tensor:
         one, other = torch.nonzero(self.thing[first][:, None] == self.thing[second], as_tuple=True)
         (wrong,) = torch.nonzero(torch.rand(len(one), generator=generator) < 0.1, as_tuple=True)
         other[wrong] = other[wrong][torch.randperm(len(wrong), generator=generator)]
-        return Pair(first=first, second=second, matches=torch.stack([one, other], dim=1))
+        return torch.stack([one, other], dim=1)
 
-    def right(self, pair: Pair) -> Tensor:
+    def right(self, pair: tuple[int, int], rows: Tensor) -> Tensor:
         """Know which matches are of one thing, as a verification finds out."""
-        one, other = pair.matches.unbind(dim=1)
-        return self.thing[pair.first][one] == self.thing[pair.second][other]
+        one, other = rows.unbind(dim=1)
+        return self.thing[pair[0]][one] == self.thing[pair[1]][other]
 
     def rest(self) -> StaticBackground:
         """Find what is at rest."""
         return find_static_background(
             self.keypoints,
             self.pairs,
-            lambda pairs: [pair.matches[self.right(pair)] for pair in pairs],
+            lambda pairs: {pair: rows[self.right(pair, rows)] for pair, rows in pairs.items()},
             still_px=1.0,
             max_error_px=2.0,
             fewest=15,

@@ -10,7 +10,7 @@ pixels = np.random.default_rng(0).integers(0, 255, (400, 400, 3), dtype=np.uint8
 Image.fromarray(pixels).save({path!r})
 print("written")
 """
-COLMAP_FIRST = "from pimper_torch.sfm.binding import loaded\nloaded()\n"
+COLMAP_FIRST = "from pimper_torch.sfm.colmap import loaded\nloaded()\n"
 
 
 def test_a_png_is_written_after_colmap_was_loaded(tmp_path):

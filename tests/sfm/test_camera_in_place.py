@@ -26,14 +26,14 @@ def reference_of(scene):
 def lengths(scene, maps):
     """Give how far right matches are from still once mapped, of what turns and of the room."""
     found = [], []
-    for pair in scene.pairs:
-        first, second = pair.matches[scene.right(pair)].unbind(dim=1)
+    for pair, rows in scene.pairs.items():
+        first, second = rows[scene.right(pair, rows)].unbind(dim=1)
         ends = (
-            mapped(maps[pair.first], scene.keypoints[pair.first][first]),
-            mapped(maps[pair.second], scene.keypoints[pair.second][second]),
+            mapped(maps[pair[0]], scene.keypoints[pair[0]][first]),
+            mapped(maps[pair[1]], scene.keypoints[pair[1]][second]),
         )
         length = (ends[0] - ends[1]).norm(dim=1)
-        room = scene.thing[pair.first][first] >= 500
+        room = scene.thing[pair[0]][first] >= 500
         found[0].append(length[~room])
         found[1].append(length[room])
     return tuple(torch.cat(part) for part in found)

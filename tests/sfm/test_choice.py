@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pimper_torch.sfm.conventions.choice import far_better, standard_errors, surely_better
+from pimper_torch.sfm.conventions.choice import standard_errors, surely_better
 
 
 def test_standard_errors_of_a_mean_are_those_of_statistics(generator):
@@ -26,18 +26,3 @@ def test_noise_alone_is_not_believed(generator):
     assert not surely_better(one, other)
     assert not surely_better(other, one)
     assert surely_better(one + 0.2, other)
-
-
-@pytest.mark.parametrize(
-    ("given", "scores", "best"),
-    [
-        (0.2, [0.1, 0.7, 0.65], 1),  # leaves 0.3 of 0.8
-        (0.2, [0.1, 0.59], None),
-        (0.83, [0.97], 0),
-        (0.97, [0.98], None),
-        (1.0, [1.0], None),
-        (0.5, [], None),
-    ],
-)
-def test_the_best_candidate_leaves_less_than_half_as_much_unexplained(given, scores, best):
-    assert far_better(given, scores) == best

@@ -3,7 +3,7 @@ import torch
 
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.sfm.components import choose_component, count_spread_views
+from pimper_torch.sfm.doubt import choose_component, count_spread_views
 
 NAMES = tuple(f"{index:02d}.jpg" for index in range(20))
 

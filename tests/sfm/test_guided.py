@@ -8,24 +8,23 @@ import torch
 from torch.nn.functional import pad
 
 from pimper_torch.io.photographs import load_views
-from pimper_torch.sfm.binding import loaded, quiet
-from pimper_torch.sfm.features import find_features
-from pimper_torch.sfm.guided import (
+from pimper_torch.sfm.colmap import loaded, quiet
+from pimper_torch.sfm.features import find_features, workspace
+from pimper_torch.sfm.matching import (
     Features,
     Near,
     guided_matches,
     likeness,
     match_guided,
+    match_pairs,
 )
-from pimper_torch.sfm.matching import match_pairs
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
-from pimper_torch.sfm.workspace import workspace
 
 CONFIG = ReconstructConfig(threads=1)
 
 # Cameras side by side: epipolar lines are rows.
 ROWS = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-BESIDE = Near(ROWS, 2.0, planar=False)
+BESIDE = Near(ROWS, 2.0)
 
 
 def features(pixels, descriptors):
@@ -97,8 +96,8 @@ def test_the_two_largest_products_within_the_distance_are_found(generator, lengt
         best = torch.where(largest[:, 0] >= 0, best[:, 0], -1)
         assert (best >= 0).sum() > 0.8 * len(best)  # most have some that are near
         assert (largest[:, 1] >= 0).sum() > 0.5 * len(best)
-        assert torch.equal(alike.best, best)
-        torch.testing.assert_close(alike.products, largest, rtol=0, atol=1e-6)  # float32
+        assert torch.equal(alike[1], best)
+        torch.testing.assert_close(alike[0], largest, rtol=0, atol=1e-6)  # float32
 
 
 def test_features_without_any_near_do_not_match():

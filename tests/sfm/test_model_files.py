@@ -11,8 +11,8 @@ from torch.testing import assert_close
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.binding import loaded
 from pimper_torch.sfm.colmap import (
+    loaded,
     model_of,
     pinhole_lenses,
     read_model,
@@ -127,27 +127,22 @@ def test_camera_models_are_colmaps():
 def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(folder, name):
     for content in (b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"):
         (folder / name).write_bytes(content)
-        with pytest.raises(InputError, match=rf"{name} (says that it holds \d+|is cut short)"):
+        with pytest.raises(InputError, match=f"{name} is cut short"):
             read_model(folder)
 
 
 @pytest.mark.parametrize("count", [2**64 - 1, 10**9])
 def test_a_track_longer_than_the_file_is_refused(folder, count):
     change(folder / "points3D.bin", "<Q", 8 + 43, count)
-    with pytest.raises(InputError, match=rf"points3D.bin says that {count} features see a point"):
+    with pytest.raises(InputError, match=r"points3D\.bin is cut short"):
         read_model(folder)
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
-def test_an_image_without_a_rotation_is_left_out_and_told(folder, model, value):
+def test_an_image_without_a_rotation_is_refused_by_name(folder, value):
     change(folder / "images.bin", "<4d", image_at(folder, 1) + 4, *[value] * 4)
-    with pytest.warns(PimperWarning, match=r"1 of 4 images \(c/d.png\).*quaternion"):
-        read = read_model(folder)
-    assert read.names == (model.names[0], *model.names[2:])
-    assert_close(read.cam_from_world, model.cam_from_world[[0, 2, 3]])
-    kept = model.observation_view != 1
-    assert len(read.observation_view) == int(kept.sum())
-    assert int(read.observation_view.max()) == 2
+    with pytest.raises(InputError, match=r"c/d\.png has a pose whose quaternion"):
+        read_model(folder)
 
 
 def test_points_that_are_nowhere_are_left_out_and_counted(folder, model):
@@ -167,14 +162,13 @@ def test_points_that_are_nowhere_are_left_out_and_counted(folder, model):
 def test_cameras_that_are_none_are_the_reason_that_is_given(folder):
     for at, value, why in ((24, math.nan, "not finite"), (24, 0.0, "focal"), (24, -1.0, "focal")):
         change(folder / "cameras.bin", "<d", 8 + at, value)
-        with pytest.raises(InputError, match=f"4 of 4 images .*{why}"):
+        with pytest.raises(InputError, match=f"a b.png has a camera .*{why}"):
             read_model(folder)
 
 
 def test_poses_that_are_none_are_the_reason_that_is_given(folder):
-    for index in range(3):
-        change(folder / "images.bin", "<d", image_at(folder, index) + 4 + 32, math.nan)
-    with pytest.raises(InputError, match=r"3 of 4 images .*a pose that is not finite"):
+    change(folder / "images.bin", "<d", image_at(folder, 2) + 4 + 32, math.nan)
+    with pytest.raises(InputError, match=r"e\.png has a pose that is not finite"):
         read_model(folder)
 
 
@@ -182,7 +176,7 @@ def test_observations_of_nothing_are_left_out_and_counted(folder, model):
     first = 8 + 43 + 8
     change(folder / "points3D.bin", "<2I", first, 99, 0)
     change(folder / "points3D.bin", "<I", first + 8 + 4, 2**32 - 1)
-    with pytest.warns(PimperWarning, match=f"2 of {3 * POINTS} observations"):
+    with pytest.warns(PimperWarning, match="and 2 observations"):
         read = read_model(folder)
     assert len(read.observation_point) == 3 * POINTS - 2
     assert int((read.observation_point == 0).sum()) == 1

@@ -5,8 +5,8 @@ from torch.testing import assert_close
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Lens
 from pimper_torch.sfm.colmap import distort
+from pimper_torch.sfm.lenses import turned_lens, turned_pixels, turned_pose
 from pimper_torch.sfm.model_files import CAMERA_MODELS
-from pimper_torch.sfm.quarter_turns import turned_lens, turned_pixels, turned_pose
 
 NO_PARAMETERS = ("EQUIRECTANGULAR",)
 

@@ -3,9 +3,8 @@ import torch
 from pimper_torch.evidence.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import rigid, transform
-from pimper_torch.sfm.bundling import bundle
+from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.refine_tracks import refine_tracks
-from pimper_torch.sfm.reprojection import observation_errors
 from tests.sfm import ball
 
 

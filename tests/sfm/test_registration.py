@@ -7,14 +7,13 @@ import torch
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.sfm import registration
-from pimper_torch.sfm.agreement import Judgement
-from pimper_torch.sfm.doubt import count_views_with_depth
+from pimper_torch.sfm.doubt import Judgement, count_views_with_depth
+from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.registration import register
 from pimper_torch.sfm.static_background import StaticBackground
-from pimper_torch.sfm.workspace import Workspace
 
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 
@@ -83,7 +82,7 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
         monkeypatch.setattr(registration, "leave_out_room", leave_out)
         monkeypatch.setattr(registration, "pairs_to_match", lambda space: all_pairs(5))
-        monkeypatch.setattr(registration, "tie_series", lambda *_: (None, around))
+        monkeypatch.setattr(registration, "tie_series", lambda *_: around)
         monkeypatch.setattr(
             registration,
             "count_views_with_depth",

@@ -10,7 +10,7 @@ from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Lens
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.series import series_in, with_series
+from pimper_torch.sfm.moved_object import series_in, with_series
 from tests.sfm.moved import K, bodies, poses
 
 LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)

@@ -3,13 +3,9 @@ import torch
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import transform
-from pimper_torch.sfm.static_background import (
-    fundamental_matrix,
-    is_still,
-    moving_matches,
-    sampson_errors,
-    shared_geometry,
-)
+from pimper_torch.sfm.epipolar import fundamental_matrix, sampson_errors, shared_geometry
+from pimper_torch.sfm.matching import pixels_of
+from pimper_torch.sfm.static_background import moving_matches
 from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 
 
@@ -29,10 +25,10 @@ def test_a_room_behind_a_turntable_is_at_rest_and_what_turns_is_not(
         assert resting[thing < 500].double().mean() < 0.01
         assert resting[thing >= 500].double().mean() > 0.99
     kept = right = 0
-    for pair in scene.pairs:
-        moving = moving_matches(scene.keypoints, pair, rest, 1.0)
-        of_room = scene.thing[pair.first][pair.matches[:, 0]] >= 500
-        true = scene.right(pair)
+    for pair, rows in scene.pairs.items():
+        moving = moving_matches(scene.keypoints, pair, rows, rest, 1.0)
+        of_room = scene.thing[pair[0]][rows[:, 0]] >= 500
+        true = scene.right(pair, rows)
         assert not (moving & of_room & true).any()
         kept, right = kept + int((moving & true).sum()), right + int((~of_room & true).sum())
     assert kept > 0.98 * right > 1000
@@ -49,7 +45,8 @@ def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_s
     near = seen_of_ball(generator, 600, cameras)
     far, _ = project(far, cameras.cam_from_world, cameras.intrinsics)
     scene = Captured(generator, torch.cat([near, far], dim=1))
-    still = [is_still(scene.keypoints, pair, 1.0).sum() for pair in scene.pairs]
+    ends = [pixels_of(scene.keypoints, pair, rows) for pair, rows in scene.pairs.items()]
+    still = [((first - second).norm(dim=1) < 1).sum() for first, second in ends]
     assert min(still) > 100  # the far ones lie still
     rest = scene.rest()
     assert rest.moving_pairs == 24  # all that are verified first; they end the search

@@ -11,17 +11,15 @@ from torch.nn.functional import grid_sample
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.geometry.rigid import invert_rigid, rigid
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.agreement import pinholes_of
-from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
-from pimper_torch.sfm.conventions.by_matches import explained
+from pimper_torch.sfm.colmap import observation_errors, pinhole_of, undistort_pixels
 from pimper_torch.sfm.conventions.resized_pictures import Ways
+from pimper_torch.sfm.epipolar import explained, pinholes_of
 from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.reprojection import observation_errors
 from pimper_torch.sfm.triangulation import lacks_points, triangulate
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
 
@@ -111,29 +109,18 @@ def axes(*signs: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    "wrong",
     [
-        (invert_rigid, r"poses take points from the camera to the world.*invert them"),
-        (lambda pose: axes(1, -1, -1) @ pose, r"as in OpenGL.*diag\(1, -1, -1, 1\)"),
-        (lambda pose: invert_rigid(pose) @ axes(1, -1, -1), "as in transforms.json"),
-        (lambda pose: rigid(pose[:, :3, :3].mT, pose[:, :3, 3]), "rotations are transposed"),
-        (
-            lambda pose: rigid(pose[:, :3, :3], invert_rigid(pose)[:, :3, 3]),
-            "last column holds the camera's centre",
-        ),
-        (lambda pose: axes(-1, -1, 1) @ pose, "photographs are turned by 180 degrees"),
-        (lambda pose: pose[[3, 0, 5, 1, 4, 2]], "No usual mistake of conventions explains it"),
+        invert_rigid,
+        lambda pose: axes(1, -1, -1) @ pose,
+        lambda pose: invert_rigid(pose) @ axes(1, -1, -1),
+        lambda pose: pose[[3, 0, 5, 1, 4, 2]],
     ],
 )
-def test_cameras_that_photographs_contradict_are_refused_with_what_would_fit(
-    views, bare, wrong, told
-):
+def test_cameras_that_photographs_contradict_are_refused(views, bare, wrong):
     model = bare.replace(cam_from_world=wrong(bare.cam_from_world))
-    with pytest.raises(
-        InputError, match=r"The model: these cameras.*needed: at least 50%"
-    ) as refusal:
+    with pytest.raises(InputError, match=r"The model: these cameras.*at least 50%.*x right"):
         triangulate(views, Ways([model]), SETTINGS, "The model")
-    assert refusal.match(told)
 
 
 def test_photographs_without_texture_give_no_points_and_a_warning(views, bare):

@@ -13,9 +13,7 @@ from pimper_torch.records import (
     NormalPrior,
     SilhouettePrior,
 )
-from pimper_torch.sfm.quarter_turns import turned_views
-from pimper_torch.sfm.undistort import photograph_pixels
-from pimper_torch.sfm.undistort_priors import with_undistorted_priors
+from pimper_torch.sfm.undistort import photograph_pixels, with_undistorted_priors
 
 SIZE = 60, 40
 BARREL = Lens(camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40)
@@ -187,11 +185,3 @@ def test_gradients_reach_values_and_variances(scene):
     resampled(broken, hole)[0].sum().backward()
     assert broken.grad.isfinite().all()
     assert (broken.grad[0, 2, 3] == 0).all()
-
-
-def test_turned_photographs_carry_no_priors(scene):
-    ones = torch.ones(1, 4, 4)
-    prior = SilhouettePrior(names=("a.png",), sizes_px=torch.tensor([[4, 4]]), inside=ones)
-    views = scene.views.replace(priors=(prior,))
-    assert turned_views(views, [0, 0, 0]).priors == (prior,)
-    assert turned_views(views, [1, 0, 0]).priors == ()

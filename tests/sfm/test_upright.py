@@ -7,8 +7,8 @@ from torch.testing import assert_close
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
 from pimper_torch.sfm.colmap import pinhole_lenses
+from pimper_torch.sfm.lenses import turned_pose
 from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.quarter_turns import turned_pose
 from pimper_torch.sfm.upright import level_up, upright
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.camera_files.projections import decompose_projections
+from pimper_torch.camera_files.posed_camera import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.raster import nearest
 from pimper_torch.evidence.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
-from pimper_torch.camera_files.projections import decompose_projections
+from pimper_torch.camera_files.posed_camera import decompose_projections
 from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_torch.evidence.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_torch.geometry.rigid import rigid

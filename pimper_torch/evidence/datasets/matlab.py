@@ -163,7 +163,7 @@ def read_toolbox_projections(
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         taken as it stands: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.camera_files.projections.decompose_projections` settles.
+        :func:`~pimper_torch.camera_files.posed_camera.decompose_projections` settles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]

@@ -19,8 +19,8 @@ from pimper_torch.numpy_files import read_npz
 from pimper_torch.progress import track
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Capture, Truth, Views
-from pimper_torch.sfm.agreement import pinholes_of
 from pimper_torch.sfm.colmap import read_model
+from pimper_torch.sfm.epipolar import pinholes_of
 
 _KIND = "a rendered scene (`pimper render`)"
 _PICTURES = ("photos", "masks")

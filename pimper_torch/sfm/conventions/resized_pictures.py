@@ -1,47 +1,38 @@
 """Photographs as resized, turned or cropped versions of the pictures that cameras are of.
 
 COLMAP works on the pixels of files, which EXIF may say are to be turned; photographs are turned
-when they are read. Sizes tell a quarter turn, but not which, and not a half; nor do they tell a
-crop from a resize, nor camera raw, whose margins JPEG leaves out. Points tell: what is round a
-point in one photograph is round it in the others that observe it, if each is taken the way the
-model has it, and less so beside it.
+when they are read. Sizes tell a quarter turn, but not a half; nor do they tell a crop from a
+resize, nor camera raw, whose margins JPEG leaves out. Points tell: what is round a point in one
+photograph is round it in the others that observe it, if each is taken the way the model has it,
+and less so beside it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import grid_sample, normalize, one_hot
 
 from pimper_torch.errors import InputError, caution, some
+from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
+from pimper_torch.sfm import colmap
 from pimper_torch.sfm.colmap import pinhole_of
-from pimper_torch.sfm.conventions.choice import ERRORS, standard_errors, surely_better
-from pimper_torch.sfm.conventions.correlation import others_of, sampled
+from pimper_torch.sfm.conventions.choice import surely_better
+from pimper_torch.sfm.lenses import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.model import SparseModel, longest_tracks
-from pimper_torch.sfm.quarter_turns import (
-    QUARTERS,
-    cropped_lens,
-    turned_pixels,
-    turned_size,
-    turned_vectors,
-)
 
 Size = tuple[int, int]
-Turns = Int[Tensor, " view"]
 
-# Points of each view that are looked at for turns, those with the longest tracks: a choice.
-_POINTS = 40
-# Correlation below which nothing agrees, and observations that it takes to warn of it: choices.
-_LEAST, _TELLING = 0.05, 200
-# Times that every view is tried anew beside the others: a choice.
-_SWEEPS = 5
-# Points of each view that must agree less where photographs are shifted by so much. Of photographs
-# of potatoes, mug, jar and balls (8 and 12 views of 240x180 and 320x240) that were cropped to 0.95
-# to 0.5 of their size, of the shifts about a resize one at least is worse by 1.5 standard errors at
-# most; about the truth all are by 4.9 and more.
-_POINTS_BESIDE, REACHES = 400, (4.0, 8.0)
+# Photographs are shifted by so much for comparison. Of photographs of potatoes, mug, jar and balls
+# (8 and 12 views of 240x180 and 320x240) that were cropped to 0.95 to 0.5 of their size, of the
+# shifts about a resize one at least is worse by 1.5 standard errors at most; about the truth all
+# are by 4.9 and more.
+REACHES = (4.0, 8.0)
 
 
 class Ways(NamedTuple):
@@ -66,56 +57,63 @@ def resize_fits(whole: Size, width: int, height: int) -> bool:
     return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
 
 
-def allowed_turns(model: SparseModel, views: Views) -> Bool[Tensor, "view 4"]:
-    """Find the turns by which a resize leads from the model's pictures to the photographs."""
-    fits = [
-        [
-            resize_fits((lens.width, lens.height), *turned_size(width, height, quarters))
-            for quarters in range(4)
-        ]
-        for lens, (width, height) in zip(model.lenses, views.sizes_px.tolist(), strict=True)
-    ]
-    return torch.tensor(fits).reshape(-1, 4)
-
-
 def possible_turns(model: SparseModel, views: Views) -> list[tuple[int, ...]]:
-    """List the turns that pictures may have which no points tell of, as :func:`find_turns`."""
-    ways = _upright_and_stored(_exif_turns(views), allowed_turns(model, views))
-    return list(dict.fromkeys(tuple(way.tolist()) for way in ways))
+    """List the clockwise quarters by which a model's pictures may be turned in the photographs.
+
+    Pictures are the photographs as they stand, then as their files store them; without repetition,
+    and none where no resize leads to a photograph's shape.
+
+    Raises:
+        InputError: A shape tells a quarter turn, and EXIF does not tell which.
+    """
+    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
+    upright, stored = [], []
+    for name, lens, (width, height), tag in zip(
+        model.names, model.lenses, views.sizes_px.tolist(), tags, strict=True
+    ):
+        allowed = [
+            quarters
+            for quarters in range(4)
+            if resize_fits((lens.width, lens.height), *turned_size(width, height, quarters))
+        ]
+        if not allowed:
+            return []
+        exif = QUARTERS.get(tag, 0)
+        if 0 not in allowed and exif not in allowed:
+            raise InputError(
+                f"{name} is {width}x{height}, but the camera for it is {lens.width}x{lens.height}, "
+                "which is another shape, and EXIF does not tell how it was turned. Give the "
+                "photographs the model was made from, resized if you like, but neither cropped "
+                "nor turned."
+            )
+        upright.append(0 if 0 in allowed else exif)
+        stored.append(exif if exif in allowed else 0)
+    return list(dict.fromkeys((tuple(upright), tuple(stored))))
 
 
-def find_turns(model: SparseModel, views: Views, where: str) -> tuple[int, ...]:
-    """Find by how many clockwise quarters each of a model's pictures is turned in the photographs.
-
-    Tried are the pixels as they are and as their file has them; then each view by itself, where
-    its neighbourhoods agree much better another way round.
+def choose_turned(ways: Sequence[SparseModel], views: Views, where: str) -> SparseModel:
+    """Choose between cameras of photographs as they stand, and as their files store them.
 
     Args:
-        model: Its views are the photographs, in their order, and have their shapes.
-        where: The model is, for messages, as a sentence starts.
+        ways: One or two models in the pixels of the photographs, which differ in turns alone.
     """
-    allowed, exif = allowed_turns(model, views), _exif_turns(views)
-    upright, stored = _upright_and_stored(exif, allowed)
-    chosen, squares = _turned_squares(model, views, allowed)
-    changed = (upright != stored)[chosen.observation_view]
-    one, other = (_agreement(squares, chosen, way)[1][changed] for way in (upright, stored))
-    errors = standard_errors(other - one)
-    turns = _each(squares, chosen, stored if errors > ERRORS else upright, allowed)
-    each, own, chance = _agreement(squares, chosen, turns)
-    _require_sides(each, chosen, views, turns, exif)
-    _tell_turns(model, turns, where)
-    if torch.equal(turns, upright) and not torch.equal(upright, stored) and abs(errors) <= ERRORS:
-        tell_open_turns(where, "points")
-    excess = (own - chance)[own != chance]
-    if len(excess) >= _TELLING and standard_errors(excess) <= ERRORS:
-        caution(
-            f"What the photographs show round the points of {_within(where)} agrees no better "
-            f"between views than by chance (correlation {float(excess.mean()):.2f} above it, of "
-            f"{len(excess)} observations). The model may be of other photographs of these names, "
-            "or of cropped ones.",
-            stacklevel=4,
-        )
-    return tuple(turns.tolist())
+    if len(ways) > 1:
+        upright, stored = (correlations(longest_tracks(model, 40), views)[0] for model in ways)
+        if surely_better(stored, upright):
+            return ways[1]
+        if not surely_better(upright, stored):
+            tell_open_turns(where, "points")
+    return ways[0]
+
+
+def tell_turned(where: str, evidence: str) -> None:
+    """Warn that cameras were turned with the photographs."""
+    caution(
+        f"{where}: its cameras are of pictures that stand otherwise than the photographs, such as "
+        f"the pixels that files store before EXIF turns them. They are turned with these, as "
+        f"{evidence} tells.",
+        stacklevel=5,
+    )
 
 
 def tell_open_turns(where: str, what: str) -> None:
@@ -134,24 +132,16 @@ def points_tell(
     """Return how well photographs agree round the points; 0 where they agree as well beside them.
 
     Args:
-        model: In the pixels of the photographs.
         changed: Numbers of those whose place is in question.
         reaches_px: How far they are shifted for comparison, one distance after the other.
     """
     if not len(model.points_world):
         return 0.0
-    chosen = longest_tracks(model, _POINTS_BESIDE)
+    chosen = longest_tracks(model, 400)
     mine = torch.isin(chosen.observation_view, torch.tensor(changed))
     for reach_px in reaches_px:
         shifts = reach_px * torch.cat([torch.zeros(1, 2), around(chosen.points_world)])
-
-        def places(
-            view: int, pixels: Tensor, sides: Tensor, steps: Tensor = shifts
-        ) -> tuple[Tensor, Tensor]:
-            return pixels + (view in changed) * steps[:, None], sides[None]
-
-        squares = sampled(chosen, views, places, len(shifts))
-        own = (squares * others_of(squares, chosen.observation_point)[0]).sum(dim=-1)
+        own = correlations(chosen, views, shifts, changed)
         own = own[:, mine & (own[0] != 0)]
         if all(surely_better(own[0], one) for one in own[1:]):
             return float(own[0].mean())
@@ -239,115 +229,103 @@ def around(like: Tensor) -> Float[Tensor, "8 2"]:
     return ring[ring.abs().sum(dim=1) > 0]
 
 
-def _exif_turns(views: Views) -> Turns:
-    """Return clockwise quarters that EXIF turned each photograph by; -1 where it mirrored it."""
-    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
-    return torch.tensor([QUARTERS.get(tag, -1) for tag in tags])
-
-
-def _upright_and_stored(exif: Turns, allowed: Bool[Tensor, "view 4"]) -> tuple[Turns, Turns]:
-    """Return the turns of a model of the photographs as they are, and as their files store them."""
-    first = allowed.long().argmax(dim=1)
-    as_stored = (exif >= 0) & allowed[torch.arange(len(exif)), exif]
-    stored = torch.where(as_stored, exif, first)
-    return torch.where(allowed[:, 0], 0, stored), stored
-
-
-def _turned_squares(
-    model: SparseModel, views: Views, allowed: Bool[Tensor, "view 4"]
-) -> tuple[SparseModel, Float[Tensor, "4 observation sample"]]:
-    """Sample what is round the points with the longest tracks, turned in all four ways.
-
-    Zero where a turn is impossible.
-    """
-
-    def places(view: int, pixels: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
-        lens, (width, height) = model.lenses[view], views.sizes_px[view].tolist()
-        centers = pixels.new_full((4, len(pixels), 2), torch.nan)
-        for quarters in allowed[view].nonzero()[:, 0].tolist():
-            before = turned_size(width, height, quarters)
-            scale = pixels.new_tensor([before[0] / lens.width, before[1] / lens.height])
-            centers[quarters] = turned_pixels(pixels * scale, *before, quarters)
-        return centers, torch.stack([turned_vectors(sides, quarters) for quarters in range(4)])
-
-    chosen = longest_tracks(model, _POINTS)
-    return chosen, sampled(chosen, views, places, 4)
-
-
-def _agreement(
-    squares: Float[Tensor, "4 observation sample"], model: SparseModel, turns: Turns
-) -> tuple[
-    Float[Tensor, "4 observation"], Float[Tensor, " observation"], Float[Tensor, " observation"]
-]:
-    """Correlate each observation with the others of its point, and with those of another.
-
-    Returns:
-        Turned each way; as the turns have it; and so, with another point.
-    """
-    rows = turns[model.observation_view], torch.arange(squares.shape[1])
-    own = squares[rows]
-    others, strangers = others_of(own, model.observation_point)
-    each = (squares * others).sum(dim=-1)
-    return each, each[rows], (own * strangers).sum(dim=-1)
-
-
-def _each(
-    squares: Float[Tensor, "4 observation sample"],
-    model: SparseModel,
-    turns: Turns,
-    allowed: Bool[Tensor, "view 4"],
-) -> Turns:
-    """Turn single views with which the others agree much better another way round."""
-    for _ in range(_SWEEPS):
-        found, (scores, *_) = turns.clone(), _agreement(squares, model, turns)
-        for view, fits in enumerate(allowed):
-            mine = scores[:, model.observation_view == view]
-            means = mine.mean(dim=1).masked_fill(~fits, -torch.inf).nan_to_num(-torch.inf)
-            best = int(means.argmax())
-            if means[best] > _LEAST and surely_better(mine[best], mine[turns[view]]):
-                found[view] = best
-        if torch.equal(found, turns):
-            break
-        turns = found
-    return turns
-
-
-def _require_sides(
-    scores: Float[Tensor, "4 observation"],
-    model: SparseModel,
-    views: Views,
-    turns: Turns,
-    exif: Turns,
-) -> None:
-    """Refuse a quarter turn that nothing tells the side of: neither EXIF nor the points."""
-    for view, turn in enumerate(turns.tolist()):
-        mine = scores[:, model.observation_view == view]
-        if turn % 2 and turn != int(exif[view]) and not surely_better(mine[turn], mine[turn - 2]):
-            lens, (width, height) = model.lenses[view], views.sizes_px[view].tolist()
-            raise InputError(
-                f"{model.names[view]} is {width}x{height}, but the COLMAP model's camera for it is "
-                f"{lens.width}x{lens.height}, which is another shape, and neither EXIF nor the "
-                "model's points tell how it was turned. Give the photographs the model was made "
-                "from, resized if you like, but neither cropped nor turned."
-            )
-
-
-def _tell_turns(model: SparseModel, turns: Turns, where: str) -> None:
-    """State which way round was taken for how many photographs."""
-    parts = []
-    for quarters in (1, 2, 3):
-        names = [model.names[view] for view in (turns == quarters).nonzero()[:, 0].tolist()]
-        if names:
-            parts.append(f"{len(names)} by {90 * quarters} degrees clockwise ({some(names, 4)})")
-    if parts:
-        caution(
-            f"{where} was made of pictures that stand otherwise than the photographs, such as the "
-            "pixels that files store before EXIF turns them. Its cameras and observations are "
-            f"turned for {int((turns > 0).sum())} of {model.num_views} photographs: "
-            f"{'; '.join(parts)}.",
-            stacklevel=5,
-        )
-
-
 def _within(where: str) -> str:
     return where.replace("The ", "the ", 1)
+
+
+# Samples to either side of a point, and pixels from one to the next.
+_REACH, _STEP_PX = 3, 1.5
+
+
+def correlations(
+    model: SparseModel,
+    views: Views,
+    shifts: Float[Tensor, "way 2"] | None = None,
+    moved: Collection[int] = (),
+) -> Float[Tensor, "way observation"]:
+    """Correlate each observation's square with the mean of its point's others.
+
+    Args:
+        model: In the pixels of the views, in their order.
+        shifts: Of some views, the way their squares are moved.
+        moved: Numbers of these views.
+
+    Returns:
+        0 where a square tells nothing.
+    """
+    shifts = torch.zeros(1, 2) if shifts is None else shifts
+    sides = _sides(model)
+    squares = torch.zeros(len(shifts), len(sides), (2 * _REACH + 1) ** 2)
+    for view, (width, height) in enumerate(views.sizes_px.tolist()):
+        here = (model.observation_view == view).nonzero()[:, 0]
+        picture = views.images[view, :, :height, :width]
+        centers = model.observation_pixels[here] + (view in moved) * shifts[:, None]
+        squares[:, here] = squares_in(picture, centers, sides[here][None])
+        drop_pages()
+    point = model.observation_point
+    count = int(point.max()) + 1 if len(point) else 0
+    sums = squares.new_zeros(len(shifts), count, squares.shape[-1]).index_add(-2, point, squares)
+    others = normalize(sums[..., point, :] - squares, dim=-1)
+    return (squares * others).sum(dim=-1)
+
+
+def _sides(model: SparseModel) -> Float[Tensor, "observation 2 2"]:
+    """Compute the sides of each observation's square, a step long, in pixels."""
+    axes = _axes(model)
+    sides = model.points_world.new_empty(len(model.observation_view), 2, 2)
+    for view, lens in enumerate(model.lenses):
+        here = model.observation_view == view
+        points = model.observation_point[here]
+        ends = torch.cat([model.points_world[points, None], axes[points]], dim=1)
+        rays = transform(model.cam_from_world[view], ends.reshape(-1, 3))
+        pixels = colmap.distort(lens, rays).reshape(-1, 3, 2)
+        sides[here] = pixels[:, 1:] - pixels[:, :1]
+    return sides
+
+
+def squares_in(
+    picture: Float[Tensor, "channel height width"],
+    centers: Float[Tensor, "*way observation 2"],
+    sides: Float[Tensor, "*#way observation 2 2"],
+) -> Float[Tensor, "*way observation sample"]:
+    """Sample squares along two sides, without their mean and with unit length.
+
+    Returns:
+        Float32; zero where a square reaches beyond the picture or shows nothing.
+    """
+    height, width = picture.shape[1:]
+    along = torch.arange(-_REACH, _REACH + 1, dtype=centers.dtype)
+    raster = torch.cartesian_prod(along, along)
+    grid = grid_from_pixels(centers[..., None, :] + raster @ sides, width, height)
+    places = grid.reshape(1, 1, -1, 2).to(picture)
+    found = grid_sample(picture[None].detach(), places, align_corners=False)[0, :, 0].mean(dim=0)
+    found = found.cpu().clamp_min(0).sqrt().reshape(grid.shape[:-1])
+    inside = ((grid.abs() <= 1).all(dim=-1)).all(dim=-1, keepdim=True)  # false for NaN
+    found = torch.where(inside, found, 0)
+    patterns = found - found.mean(dim=-1, keepdim=True)
+    told = patterns.norm(dim=-1, keepdim=True) > 1e-3 * found.norm(dim=-1, keepdim=True)
+    return torch.where(told, normalize(patterns, dim=-1), 0).float()
+
+
+def _axes(model: SparseModel) -> Float[Tensor, "point 2 3"]:
+    """Return, of each point, the ends of two steps across its mean viewing direction.
+
+    On average over its views a step is as long as samples are apart in the photographs.
+    """
+    point, view = model.observation_point, model.observation_view
+    pose = model.cam_from_world[view]
+    points = model.points_world[point]
+    depth = (pose[:, 2, :3] * points).sum(dim=1) + pose[:, 2, 3]
+    centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
+    towards = normalize(points - centers, dim=1)
+    count = len(model.points_world)
+    mean = towards.new_zeros(count, 3).index_add(0, point, towards)
+    focal = torch.stack([colmap.pinhole_of(lens)[0, 0] for lens in model.lenses])
+    length = towards.new_zeros(count).index_add(0, point, depth.abs() / focal[view])
+    length = length / torch.bincount(point, minlength=count).clamp_min(1)
+    mean = normalize(mean, dim=1)
+    least = one_hot(mean.abs().argmin(dim=1), 3).to(mean)
+    first = normalize(torch.linalg.cross(mean, least), dim=1)
+    second = torch.linalg.cross(mean, first)
+    steps = _STEP_PX * length[:, None, None] * torch.stack([first, second], dim=1)
+    return model.points_world[:, None] + steps
