@@ -40,7 +40,7 @@ from pimper_torch.reporting import Observer
 from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.sound_views import with_views
+from pimper_torch.sfm.sparse_scene import with_views
 from pimper_torch.silhouettes.contours import Contours, TraceContours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig

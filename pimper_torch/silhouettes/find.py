@@ -13,7 +13,6 @@ from pimper_torch.mapped import by_view
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.sfm.poses import OneAPose
 from pimper_torch.sfm.sparse_scene import with_views
-from pimper_torch.silhouettes.contours import box_round
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import Cuts, cut_in_iterations
 from pimper_torch.silhouettes.hull import box_round, margins, visual_hull

@@ -19,7 +19,7 @@ from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.mapped import stacked, zeros
 from pimper_torch.parallel import side_by_side
-from pimper_torch.radiometry.srgb import srgb_from_linear
+from pimper_torch.radiometry.response import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.silhouettes.opencv import shrunk, warped, window_means
 
