@@ -17,6 +17,11 @@ from pimper_torch.silhouettes.hull import Hull
 SPACING = 0.02
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(31)
+
+
 def sheet(generator, side=7, lift=lambda xy: 0 * xy[:, 0]):
     """A square of irregular facets, counter-clockwise from above."""
     line = torch.linspace(-1, 1, side, dtype=torch.float64)

@@ -29,6 +29,11 @@ from pimper_torch.records import Mesh
 from pimper_torch.sfm.matching import VerifiedPair
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(44)
+
+
 def photograph(**changes):
     plain = Photograph(
         name="a.jpg",

@@ -1,3 +1,4 @@
+import pytest
 import scipy.fft
 import torch
 from torch.testing import assert_close
@@ -9,6 +10,11 @@ from pimper_torch.paper.integrate import (
     integrate_steps,
     solve_poisson,
 )
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(5209)
 
 
 def random(generator, *shape):

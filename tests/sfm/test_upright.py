@@ -12,6 +12,11 @@ from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.upright import level_up, upright
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(92)
+
+
 def standing(num_views=12, span_deg=330.0, elevation_deg=25.0, **more):
     """Give cameras round an object whose up is y."""
     return arc_cameras(

@@ -18,6 +18,11 @@ from pimper_torch.sfm.undistort import undistort
 
 
 @pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(12)
+
+
+@pytest.fixture
 def paint():
     """Write a photograph of one level with a brighter top-left quarter."""
 

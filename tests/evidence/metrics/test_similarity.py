@@ -14,6 +14,11 @@ from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(81)
+
+
 def random_rotation(generator):
     Q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
     return Q * torch.linalg.det(Q)

@@ -1,6 +1,12 @@
 import pytest
+import torch
 
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(61)
 
 
 @pytest.fixture

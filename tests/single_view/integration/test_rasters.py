@@ -99,6 +99,11 @@ def method(request, monkeypatch):
     return request.param
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(6113)
+
+
 @pytest.fixture(params=["equal", "ragged", "terraced", "jumping", "strips", "empty"])
 def weighted(request, generator):
     height, width = 20, 23  # more than the dense coarsest level of a hierarchy holds

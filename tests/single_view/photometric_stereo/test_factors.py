@@ -5,6 +5,11 @@ from torch.testing import assert_close
 from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(3)
+
+
 def some(generator, sign=1.0):
     mu, nu, size = torch.randn(3, generator=generator, dtype=torch.float64)
     return BasRelief(mu=mu, nu=nu, lam=sign * size.exp())
