@@ -15,7 +15,7 @@ import time
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.photometry.bilinear import Bilinear, objective
+from pimper_torch.photometry.bilinear import Bilinear, evaluate
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factorize import SOLVERS
 from pimper_torch.photometry.light_field import harmonics
@@ -68,7 +68,7 @@ def main() -> None:
                 found = SOLVERS[name](problem, LIMITS[name], TOLERANCES[name])
                 steps += int(found.convergence.iterations.sum())
                 ended = (found.lights, found.shading, found.weight)
-                cost += float(objective(problem, *ended).sum())
+                cost += float(evaluate(problem, *ended)[0].sum())
                 limited += int((~found.convergence.converged).sum())
                 _, unit = problem.manifold.split(found.shading.mT)
                 cosine = (unit * true_normals[some]).sum(dim=2).clamp(-1, 1)

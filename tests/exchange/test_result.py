@@ -14,6 +14,7 @@ from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.geometry.projection import project
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of
+from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import Encoding
 
@@ -115,7 +116,9 @@ def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path
     scene = run.scene.replace(offset_world=far)
     about = {"photographs": str(photographs)}
     config = CoarseToFineConfig(photographs=Encoding(response="linear"))
-    results.write_result(run.replace(scene=scene), config, tmp_path / "far", about=about)
+    every = MeshFiles(faces="all")
+    moved = run.replace(scene=scene)
+    results.write_result(moved, config, tmp_path / "far", about=about, files=every)
     found = read_result(tmp_path / "far")
     assert abs(found.scene.offset_world[0] - far[0]) < 10
     seen = [

@@ -9,12 +9,14 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
+from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import write_ply
 
 
 @pytest.fixture
 def folder(reconstruction, tmp_path, small_pictures):
-    results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out")
+    every = MeshFiles(faces="all")
+    results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out", files=every)
     return tmp_path / "out"
 
 
