@@ -506,7 +506,7 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
         some = rows.seen & (predicted > 0)
         found.append(((gray - predicted).abs() / predicted.clamp_min(1e-12))[some])
-    return float(torch.cat(found).median()) if sum(map(len, found)) else math.inf
+    return float(torch.cat(found).detach().median()) if sum(map(len, found)) else math.inf
 
 
 def _excess_variance(
