@@ -4,15 +4,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pimper_torch.config import require
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.io.meshes import written_channels
 from pimper_torch.meshing.closing import Closed, closed
+from pimper_torch.meshing.simplify import simplify
 from pimper_torch.records import Mesh, Record
 from pimper_torch.sfm.colmap_surfaces import reduced
-
-# Of a sample's spacing: the most that a vertex may be off the simplified mesh. With a tenth, the
-# finest height field of a skull is lost where its shape is shaded.
-_FAITHFUL = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,8 +17,8 @@ class MeshFiles:
     """Form in which the surface is written.
 
     Attributes:
-        faces: Most that the mesh has; ``None`` for a quarter of the surface's, or more where these
-            are further than a twentieth of a sample's spacing off.
+        faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a
+            sample's spacing and 1.5 degrees.
         formats: Beside PLY and GLB, which are always written.
     """
 
@@ -61,28 +58,19 @@ def finished(mesh: Mesh, files: MeshFiles) -> Finished:
     elif files.faces == "all":
         few, whole = mesh, closed(mesh) if files.watertight else None
     else:
-        few, told["simplified"] = _simplified(mesh)
+        found = simplify(mesh, values=written_channels(mesh))
+        few = found.mesh
         whole = closed(few) if files.watertight else None
+        told["simplified"] = {
+            "vertices": len(few.vertices_world),
+            "faces": len(few.faces),
+            "spacing": found.spacing,
+            "max_spacings": found.max_spacings,
+            "max_angle_deg": found.max_angle_deg,
+        }
     if whole is not None:
         told["caps"] = _caps(whole)
     return Finished(mesh=few, closed=whole, summary=told)
-
-
-def _simplified(mesh: Mesh) -> tuple[Mesh, dict[str, int | float]]:
-    """Reduce a mesh to as few faces as tell where its vertices are.
-
-    Returns:
-        The mesh, and its size, the former mesh's median edge, and how far vertices are off in it.
-    """
-    spacing, few, off = float(side_lengths(mesh.vertices_world[mesh.faces]).median()), mesh, 0.0
-    for divisor in (4, 2):
-        fewer = reduced(mesh, max(4, len(mesh.faces) // divisor))
-        distance = NearestSurface(fewer).query(mesh.vertices_world).distance
-        if float(distance.max()) <= _FAITHFUL * spacing:
-            few, off = fewer, float(distance.max()) / spacing
-            break
-    size = {"vertices": len(few.vertices_world), "faces": len(few.faces)}
-    return few, {**size, "spacing": spacing, "max_spacings": off}
 
 
 def _few_enough(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed | None]:

@@ -76,10 +76,11 @@ def write_result(
     their origin. The PLY then has doubles, and the GLB the offset as its node's translation.
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
-    spacing of it (``summary.json`` tells how far off they are). ``files`` asks for every vertex,
-    or for fewer. The pictures show what is written, but for the caps of a mesh that shall be
-    watertight: those are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say
-    which they are.
+    spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
+    within :func:`~pimper_torch.io.meshes.written_channels` of what is blended there
+    (``summary.json`` tells how far off they are). ``files`` asks for every vertex, or for fewer.
+    The pictures show what is written, but for the caps of a mesh that shall be watertight: those
+    are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
 
     It is there whole or not at all; see :func:`pimper_torch.outputs.folders.written_whole`.
 

@@ -29,7 +29,13 @@ SFM = ("line_matches", "patch_alignment")
 COARSE = ("window_scores",)
 PHOTOMETRY = ("resampling", "lights_and_albedo", "factorization")
 SWEEP = ("sweep_costs",)
-SURFACE = ("normal_equations", "sparse_products", "vector_updates", "multigrid_levels")
+SURFACE = (
+    "normal_equations",
+    "sparse_products",
+    "vector_updates",
+    "multigrid_levels",
+    "decimation",
+)
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.

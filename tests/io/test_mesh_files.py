@@ -8,8 +8,7 @@ from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.io.finish import MeshFiles, finished
+from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.results import write_result
 from pimper_torch.radiometry import Encoding
@@ -32,22 +31,6 @@ def half_ball() -> Mesh:
         confidence=torch.ones(len(vertices)),
         expected_error=torch.full((len(vertices),), 0.01),
     )
-
-
-def test_finished_has_a_quarter_of_the_faces_or_more_where_the_surface_asks_for_them():
-    # The nearest place of a ball's vertices on a mesh of longer edges is further below.
-    counts = []
-    for level in (2, 5):
-        vertices, faces = icosphere(level)
-        mesh = Mesh(vertices_world=vertices * torch.tensor([1.0, 1.0, 0.2]), faces=faces)
-        found = finished(mesh, MeshFiles())
-        told = found.summary["simplified"]
-        off = NearestSurface(found.mesh).query(mesh.vertices_world).distance
-        assert off.max() <= 0.05 * told["spacing"] * (1 + 1e-6)
-        assert told["max_spacings"] * told["spacing"] == pytest.approx(float(off.max()), abs=1e-7)
-        counts.append(len(found.mesh.faces) / len(faces))
-    assert counts[0] == 1
-    assert counts[1] == pytest.approx(0.25, abs=0.01)
 
 
 def test_a_watertight_mesh_says_which_of_it_was_not_measured(reconstruction, tmp_path):

@@ -10,6 +10,7 @@ from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sums import total
 from pimper_torch.meshing.closing import closed
+from pimper_torch.meshing.simplify import simplify
 from pimper_torch.photometry.cone import project_to_cone
 from pimper_torch.photometry.robust import robust_variance
 from pimper_torch.records import Mesh
@@ -69,3 +70,16 @@ def test_whatever_is_missing_of_a_ball_is_closed(seed, missing):
     assert int(found.measured.sum()) == len(mesh.faces)
     corners, before = (one.vertices_world[one.faces] for one in (found.mesh, mesh))
     assert torch.equal(corners[found.measured], before)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, power=st.integers(-20, 20))
+def test_a_mesh_of_another_unit_is_simplified_to_the_same_faces(seed, power):
+    vertices, faces = icosphere(4)
+    bumps = 1 + 0.05 * torch.cos(drawn(seed, 3) * 4 * vertices.double()).sum(dim=1, keepdim=True)
+    mesh = Mesh(vertices_world=vertices.double() * bumps, faces=faces)
+    usual = simplify(mesh)
+    other = simplify(mesh.replace(vertices_world=2.0**power * mesh.vertices_world))
+    assert torch.equal(other.mesh.faces, usual.mesh.faces)
+    assert torch.equal(other.mesh.vertices_world, 2.0**power * usual.mesh.vertices_world)
+    assert len(usual.mesh.faces) < len(faces)

@@ -1,0 +1,156 @@
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.meshing.simplify import Bounds, simplify
+from pimper_torch.records import Mesh
+
+
+def square(side, height):
+    """A height field over the unit square, with random values at its vertices."""
+    generator = torch.Generator().manual_seed(3)
+    steps = torch.linspace(0, 1, side, dtype=torch.float64)
+    y, x = torch.meshgrid(steps, steps, indexing="ij")
+    vertices = torch.stack([x, y, height(x, y)], dim=-1).reshape(-1, 3)
+    first = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1)
+    lower = torch.stack([first, first + 1, first + side + 1], dim=1)
+    faces = torch.cat([lower, torch.stack([first, first + side + 1, first + side], dim=1)])
+    return Mesh(
+        vertices_world=vertices,
+        faces=faces,
+        normals_world=normalize(vertex_normals(vertices, faces), dim=1),
+        albedo=0.5 + 0.4 * torch.sin(12 * vertices),
+        confidence=torch.rand(len(vertices), generator=generator, dtype=torch.float64),
+    )
+
+
+def waves(x, y):
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(4), dtype=x.dtype)
+    return 0.1 * torch.sin(7 * x) * torch.cos(5 * y) + 2e-4 * noise
+
+
+def deviations(mesh, found, values):
+    """Distance, angle and worst channel of removed vertices against their faces."""
+    gone = (found.face >= 0).nonzero()[:, 0]
+    corners = found.mesh.faces[found.face[gone]]
+    place = closest_on_triangles(mesh.vertices_world[gone], found.mesh.vertices_world[corners])
+    triangles = found.mesh.vertices_world[corners]
+    blend = torch.linalg.lstsq(triangles.mT, place[..., None]).solution
+    normals = normalize((blend * found.mesh.normals_world[corners]).sum(dim=1), dim=1)
+    cosine = (normals * mesh.normals_world[gone]).sum(dim=1)
+    off = (blend * values[found.kept][corners]).sum(dim=1) - values[gone]
+    return (
+        (place - mesh.vertices_world[gone]).norm(dim=1),
+        cosine.clamp(-1, 1).acos().rad2deg(),
+        off.abs(),
+    )
+
+
+def test_every_former_vertex_stays_within_the_bounds():
+    mesh = square(60, waves)
+    mesh = mesh.replace(vertices_world=mesh.vertices_world + torch.tensor([3.0, -4.0, 5.0]))
+    values = 10 * mesh.albedo
+    bounds = Bounds(spacings=0.1, angle_deg=3.0)
+    found = simplify(mesh, bounds, values)
+    assert len(found.kept) < 0.5 * len(mesh.vertices_world)
+    assert len(found.kept) + int((found.face >= 0).sum()) == len(mesh.vertices_world)
+    distance, angle, off = deviations(mesh, found, values)
+    # The kernel's places are float32.
+    assert distance.max() <= 0.1 * found.spacing * (1 + 1e-3)
+    assert angle.max() <= 3.0 + 1e-2
+    assert off.max() <= 1 + 1e-3
+    assert found.max_spacings == pytest.approx(float(distance.max()) / found.spacing, rel=1e-2)
+    assert found.max_angle_deg == pytest.approx(float(angle.max()), rel=1e-2)
+    nearest = NearestSurface(found.mesh).query(mesh.vertices_world).distance
+    assert nearest.max() <= 0.1 * found.spacing * (1 + 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "channel"),
+    [
+        (Bounds(spacings=0.001, angle_deg=180.0), None),
+        (Bounds(spacings=100.0, angle_deg=0.05), None),
+        (Bounds(spacings=100.0, angle_deg=180.0), 1e3),
+    ],
+)
+def test_each_bound_alone_keeps_vertices(bounds, channel):
+    mesh = square(40, waves)
+    values = None if channel is None else channel * mesh.albedo
+    loose = simplify(mesh, Bounds(spacings=100.0, angle_deg=180.0))
+    found = simplify(mesh, bounds, values)
+    assert len(found.kept) > 0.9 * len(mesh.vertices_world) > 5 * len(loose.kept)
+
+
+def test_what_is_kept_is_what_it_was():
+    mesh = square(40, waves)
+    found = simplify(mesh)
+    for name in ("vertices_world", "normals_world", "albedo", "confidence"):
+        assert torch.equal(getattr(found.mesh, name), getattr(mesh, name)[found.kept])
+    border = ((mesh.vertices_world[:, :2] == 0) | (mesh.vertices_world[:, :2] == 1)).any(dim=1)
+    assert torch.isin(border.nonzero()[:, 0], found.kept).all()
+    assert found.mesh.expected_error is None
+
+
+def test_a_plane_keeps_its_border_and_little_more():
+    mesh = square(40, lambda x, _: 0.0 * x)
+    found = simplify(mesh)
+    assert len(found.kept) < 4 * 39 + 40
+    area = torch.linalg.cross(
+        *(
+            found.mesh.vertices_world[found.mesh.faces[:, k]]
+            - found.mesh.vertices_world[found.mesh.faces[:, 0]]
+            for k in (1, 2)
+        )
+    )
+    assert (area[:, 2] > 0).all()  # no face is turned over
+    assert_close(area[:, 2].sum() / 2, torch.tensor(1.0, dtype=torch.float64))
+
+
+def test_a_closed_surface_stays_closed_and_oriented():
+    vertices, faces = icosphere(5)
+    vertices = vertices.double()
+    found = simplify(Mesh(vertices_world=vertices, faces=faces)).mesh
+    count = len(found.vertices_world)
+    assert count < len(vertices) / 4
+    edges = torch.cat([found.faces[:, [0, 1]], found.faces[:, [1, 2]], found.faces[:, [2, 0]]])
+    assert len(torch.unique(edges, dim=0)) == len(edges)  # each once in each direction
+    assert set(map(tuple, edges.tolist())) == set(map(tuple, edges.flip(1).tolist()))
+    assert count - len(edges) // 2 + len(found.faces) == 2
+    volume = torch.linalg.det(found.vertices_world[found.faces]).sum() / 6
+    assert 0.97 * 4.18879 < volume < 4.18879
+
+
+def test_the_number_of_threads_changes_nothing():
+    mesh, before = square(50, waves), torch.get_num_threads()
+    faces = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            faces.append(simplify(mesh).mesh.faces)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*faces)
+
+
+def test_the_values_of_what_is_kept_carry_gradients():
+    mesh = square(20, waves)
+    vertices = mesh.vertices_world.clone().requires_grad_()
+    found = simplify(mesh.replace(vertices_world=vertices))
+    found.mesh.vertices_world.sum().backward()
+    assert set(vertices.grad.sum(dim=1).tolist()) == {0.0, 3.0}
+
+
+def test_meshes_that_nothing_can_be_taken_from_come_back():
+    corners = torch.eye(4, 3, dtype=torch.float64)
+    tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    crowded = torch.cat([tetrahedron[:1], tetrahedron[:1], tetrahedron[:1]])  # no manifold
+    for faces in (tetrahedron, crowded):
+        mesh = Mesh(vertices_world=corners, faces=faces)
+        found = simplify(mesh, Bounds(spacings=100.0, angle_deg=180.0))
+        assert torch.equal(found.mesh.faces, faces)
+    cloud = Mesh(vertices_world=corners, faces=torch.zeros(0, 3, dtype=torch.long))
+    assert simplify(cloud).mesh is cloud
