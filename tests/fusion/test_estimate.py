@@ -1,11 +1,12 @@
 import pytest
 import torch
+from derivatives import check_derivatives
 from torch.testing import assert_close
 from twins import using
 
 from pimper_torch.errors import PimperWarning
 from pimper_torch.fusion.equations import Equations
-from pimper_torch.fusion.estimate import fuse_like, fuse_terms
+from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.prepared import SingularSystemError
 
@@ -152,3 +153,46 @@ def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kern
     assert stuck
     assert_close(found.heights, expected.heights)
     assert_close(torch.stack(found.factors), torch.stack(expected.factors))
+
+
+@pytest.mark.parametrize("outliers", [0, 1000])
+def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
+    square = 9.0 * drawn(generator, 1.0, 20000).square()
+    square[:outliers] = 1e6
+    assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)
+
+
+def test_gradients_go_through_the_noise_that_is_estimated(generator):
+    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.02)
+    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.1)
+
+    def answer(x):
+        kinds = [
+            noisy.replace(coefficients=x["coefficients"]),
+            kind.replace(targets=x["targets"], information=x["information"]),
+        ]
+        return {"heights": fused(kinds, 3).heights}
+
+    inputs = {
+        "coefficients": noisy.coefficients,
+        "targets": kind.targets,
+        "information": kind.information,
+    }
+    for check in check_derivatives(answer, inputs, generator).values():
+        assert check.smooth.any()
+        assert check.spread < 1e-3
+
+
+def test_gradients_go_through_the_weights_of_the_other_solve(generator):
+    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.1)
+    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.2)
+
+    def answer(x):
+        kinds = [noisy, kind.replace(targets=x["targets"], information=x["information"])]
+        common = [with_common_errors(noisy, 8.0), kinds[1]]
+        return {"heights": fuse_like(fused(kinds, 3), common, torch.zeros(COUNT).double()).heights}
+
+    inputs = {"targets": kind.targets, "information": kind.information}
+    for check in check_derivatives(answer, inputs, generator).values():
+        assert check.smooth.any()
+        assert check.spread < 1e-3

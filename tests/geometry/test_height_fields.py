@@ -108,3 +108,19 @@ def test_a_ray_along_the_height_field_misses():
     points, hit = intersect_height_field(depth, depth == 0, origin, spacing, start, along)
     assert not hit.any()
     assert points.isfinite().all()
+
+
+def test_intersections_follow_the_height_field_by_the_implicit_function(generator):
+    x, y, origin, spacing = raster(0.5)
+    depth = (0.1 * x * x + 0.05 * y * x).requires_grad_()
+    starts, along = oblique_rays(6, generator, spread=0.3)
+    starts[..., :2] *= 0.9
+    starts.requires_grad_()
+    along.requires_grad_()
+    valid = torch.ones_like(x, dtype=torch.bool)
+
+    def meet(depth, starts, along):
+        points, hit = intersect_height_field(depth, valid, origin, spacing, starts, along, steps=12)
+        return points[hit]
+
+    assert torch.autograd.gradcheck(meet, (depth, starts, along), atol=1e-6)

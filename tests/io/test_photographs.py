@@ -392,3 +392,19 @@ def test_two_folders_inside_are_no_poses(tmp_path, pixels):
     save(tmp_path / "c" / "1.tif", pixels)
     with pytest.raises(InputError, match=r"c: 1.png and 1.tif differ only in their suffix"):
         load_views(tmp_path)
+
+
+def test_orientation_and_focal_length_come_from_exif(photos, pixels):
+    exif = Image.Exif()
+    exif[274] = 6
+    exif.get_ifd(0x8769)[0xA405] = 50
+    save(photos / "2.png", pixels, exif=exif)
+    views = load_views(photos)
+    assert views.sizes_px.tolist()[1] == [8, 12]
+    upright = np.rot90(pixels, -1).copy()
+    assert_close(views.images[1, :, :12, :8], linear_from_srgb(as_planes(upright)))
+    assert views.focals_px[1].item() == pytest.approx(5000 / 3600 * 12)
+
+
+def as_planes(array):
+    return torch.from_numpy(array.astype(np.float32) / 255).permute(2, 0, 1)

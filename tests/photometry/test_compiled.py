@@ -135,3 +135,25 @@ def test_lights_fitted_to_known_normals_resist_outliers(generator, model):
     off = torch.cosine_similarity(found.point_light_at(x)[:, told], away[:, told], dim=2)
     assert torch.rad2deg(torch.acos(off.clamp(-1, 1))).median() < 1
     assert (found.point_light[4] == 0).all()
+
+
+def test_views_and_samples_without_data_make_no_difference(problem, generator):
+    given = noisy(problem, generator, patches=1, views=12, samples=80, missing=0.2)
+    weight = given.weight.clone()
+    weight[:, 3] = 0
+    weight[:, :, 50:] = 0
+    given = given.replace(weight=weight, radiance=weight * given.radiance)
+    keep = torch.arange(12) != 3
+    small = given.replace(
+        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "regularization")},
+        radiance=given.radiance[:, keep, :50].contiguous(),
+        weight=given.weight[:, keep, :50].contiguous(),
+        shading=given.shading[..., :50].contiguous(),
+        prior=given.prior[..., :50].contiguous(),
+    )
+    found = solve(given, "numba")
+    alone = solve(small, "torch")
+    assert_close(found.lights[:, keep], alone.lights, rtol=0, atol=2e-3)
+    assert_close(found.lights[:, 3], given.anchor[:, 3])
+    assert_close(found.shading[..., 50:], given.shading[..., 50:])
+    assert (found.weight[:, 3] == 0).all()

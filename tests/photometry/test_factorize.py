@@ -324,3 +324,28 @@ def test_unknown_ways_are_refused(field):
     object.__setattr__(config, field, "random")  # past the type checker of the tests
     with pytest.raises(ConfigError, match=f"factorize.{field}"):
         config.__post_init__()
+
+
+def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
+    true = scene()
+    first = true.seen.buckets[0]
+    valid = first.valid.clone()
+    valid[1, 3:] = False
+    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
+    with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
+        found = Factorize()(seen).buckets[0]
+    assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
+    assert (found.lights_patch[1, 3:] == 0).all()
+    assert found.convergence.residual.isfinite().all()
+
+
+def test_a_view_that_sees_nothing_has_no_light(scene):
+    true = scene()
+    buckets = tuple(
+        each.replace(valid=each.valid & (torch.arange(12) != 4)[:, None, None])
+        for each in true.seen.buckets
+    )
+    found = Factorize()(true.seen.replace(buckets=buckets))
+    assert (found.buckets[0].lights_patch[:, 4] == 0).all()
+    assert (found.buckets[0].lights_patch[:, 5] != 0).any()
+    assert found.buckets[0].valid.any()

@@ -56,3 +56,12 @@ def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(genera
     found = median_deviation(torch.where(seen, noise, 1e6), seen)
     assert_close(found, torch.tensor(3.0, dtype=torch.float64), rtol=0.01, atol=0)
     assert median_deviation(noise, torch.zeros_like(seen)) == 0
+
+
+def test_the_spread_scales_with_the_residuals(generator):
+    noise = drawn(generator, 3, 400)
+    seen = torch.rand(3, 400, generator=generator) > 0.2
+    once = robust_deviation(noise, seen)
+    assert_close(robust_deviation(7 * noise, seen), 7 * once)
+    # What is not seen does not matter.
+    assert_close(robust_deviation(torch.where(seen, noise, 1e6), seen), once)

@@ -157,3 +157,14 @@ def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it
     slope = (there[0] - there[1]) / (2 * step)
     assert_close(radiance.grad[0, 5, 3], slope, rtol=0.05, atol=1e-4)  # Gauss-Newton's part
     assert (radiance.grad[0, :, :3] == 0).all()
+
+
+def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
+    given, _, shading = problem()
+    weight = torch.ones_like(given.weight)
+    for view in range(20):  # each view misses another contiguous half, as occlusion does
+        away = (torch.arange(150) - 7 * view) % 150 < 75
+        weight[:, view, away] = 0
+    given = given.replace(weight=weight, radiance=weight * given.radiance)
+    found = solve_projection(given, 800, 1e-8)
+    assert error(found.shading, shading, weight) < 1e-3

@@ -1,10 +1,13 @@
 """Models that are kept from run to run."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from pimper_torch.errors import PimperWarning, caution
-from pimper_torch.ledger import leave_out
+from pimper_torch.failures import collecting
+from pimper_torch.ledger import leave_out, left_out_of
 from pimper_torch.sfm import reconstruct
 from pimper_torch.sfm.reconstruct import Reconstruct, find_model
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
@@ -72,3 +75,19 @@ def test_photographs_that_ask_for_gradients_are_another_run_every_time(views, ru
         find_model(tracked, ReconstructConfig(), Store(folder=tmp_path))
     assert len(runs) == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_guards_left_out_is_entered_again(views, runs, tmp_path):
+    store, told = Store(folder=tmp_path), []
+    for _ in range(2):
+        with collecting() as entries:
+            find_model(views, ReconstructConfig(), store)
+        told.append([(entry.guard, entry.count, entry.total) for entry in left_out_of(entries)])
+    assert told == [[("sfm.tracks", 1, 9)]] * 2
+
+
+def test_a_folder_that_cannot_be_written_ends_nothing(views, runs, tmp_path):
+    Path(tmp_path / "file").write_text("")
+    with pytest.warns(PimperWarning, match="cannot be kept there"):
+        model, _ = find_model(views, ReconstructConfig(), Store(folder=tmp_path / "file" / "new"))
+    assert model.num_views == 5

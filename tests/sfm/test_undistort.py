@@ -206,3 +206,11 @@ def test_the_last_coefficient_alone_makes_a_lens_bend():
     for model in (name for name, count in (FISHEYES | STRAIGHT).items() if count):
         plain = without_coefficients(model, 36.0)
         assert not is_pinhole(plain.replace(params=(*plain.params[:-1], 0.05))), model
+
+
+def test_a_photograph_without_distortion_stays_bit_for_bit():
+    views = ramp_views([(50, 40)])
+    plain = Lens(camera=1, model="PINHOLE", params=(60.0, 61.0, 20.0, 22.0), width=50, height=40)
+    undistorted, _ = undistort(views, (plain,))
+    assert torch.equal(undistorted.images, views.images)
+    assert undistorted.masks is None

@@ -115,3 +115,27 @@ def _but_first(depths):
 def _only_valid(depths, valid):
     first, *rest = depths.buckets
     return depths.replace(buckets=(first.replace(valid=valid), *rest))
+
+
+def test_a_single_facet_is_handed_back(facets_over, height_fields):
+    patches = facets_over(lambda x, y: 0 * x, side=2)
+    mesh = patches.coarse.mesh
+    first = patches.buckets[0]
+    lone = patches.replace(
+        coarse=patches.coarse.replace(mesh=mesh.replace(faces=mesh.faces[first.facet[:1]])),
+        buckets=(_one_template(first),),
+    )
+    depths = height_fields(lone, lambda points, _: 0.1 * points[..., 0] ** 2)
+    assert Align()(depths) is depths
+
+
+def _one_template(templates):
+    return templates.replace(
+        facet=torch.tensor([0]),
+        patch_from_world=templates.patch_from_world[:1],
+        origin=templates.origin[:1],
+        spacing=templates.spacing[:1],
+        depth=templates.depth[:1],
+        barycentric=templates.barycentric[:1],
+        inside=templates.inside[:1],
+    )

@@ -90,11 +90,12 @@ def test_cast_shadows_lose_weight():
     assert found.determined
 
 
-def test_highlights_beside_black_shadows_move_gamma_by_more_than_it_says_but_not_far():
+@pytest.mark.parametrize("seed", [8, 9, 10])
+def test_highlights_beside_black_shadows_move_gamma_by_more_than_it_says_but_not_far(seed):
     # Of four per cent outliers half are bright: the rule that believes bright entries is misled,
-    # by 0.15 on this draw, with a standard error of 0.04.
+    # by 0.15, 0.12 and 0.01 on these draws, with standard errors of 0.03 to 0.05.
     encoded = noisy(shaded(samples=150) ** (1 / 2.2), 0.003)
-    drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(8))
+    drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(seed))
     spoilt = torch.where(drawn < 0.02, 0.02, encoded)
     spoilt = torch.where(drawn > 0.98, (encoded + 0.15).clamp_max(1), spoilt)
     found = estimate_gamma(spoilt, everywhere(spoilt), rank=3)
@@ -177,3 +178,10 @@ def test_what_cannot_be_estimated_from_is_refused(change, rank, told):
     encoded = change(shaded())
     with pytest.raises(InputError, match=told):
         estimate_gamma(encoded, everywhere(encoded), rank=rank)
+
+
+def test_gains_of_views_are_absorbed_by_the_lights():
+    gain = torch.linspace(0.6, 1, 10, dtype=torch.float64)[:, None]
+    encoded = gain * shaded() ** (1 / 1.8)
+    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
+    assert_close(found.gamma, 1.8, rtol=1e-3, atol=0)

@@ -404,3 +404,10 @@ def test_normals_of_another_convention_are_refused(change, told):
     normals, mask, _ = dome(40)
     with pytest.raises(InputError, match=told):
         integrate_normal_map(change(normals), mask)
+
+
+def test_float32_normals_give_float32_depth():
+    normals, z = bumps(20)
+    found = integrate_normal_map(normals.float(), spacing=(0.1, 0.1))
+    assert found.depth.dtype == torch.float32
+    assert misfit(found, z.float()) < 3e-3

@@ -289,3 +289,12 @@ def test_cuda_gives_what_the_cpu_gives(weighted, generator):
     moved = [part.cuda() for part in (weighted.right, weighted.down, weighted.anchor)]
     found = RasterSystem(*moved).solve(source.cuda())
     assert_close(found.cpu(), expected, atol=1e-5, rtol=0)
+
+
+def test_a_quarter_turn_of_the_raster_turns_the_answer(method, generator):
+    weighted = masked(terraced(30, 22, drop=1e-4), ragged(30, 22))
+    source = random(generator, 30, 22)
+    found = system(weighted).solve(source)
+    # A turn by 90 degrees makes steps down of steps to the right and reverses the others.
+    rotated = RasterSystem(weighted.down.rot90(), weighted.right.rot90())
+    assert_close(rotated.solve(source.rot90()), found.rot90(), rtol=1e-6, atol=1e-6)
