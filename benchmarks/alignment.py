@@ -116,7 +116,7 @@ def sphere_patches(facets: int, side: int) -> PatchSet:
 
 
 def bumpy_height_field(templates: Templates) -> Tensor:
-    """Give the near side of a unit sphere with bumps, along each patch's z, by Newton's steps."""
+    """Return the near side of a unit sphere with bumps, along each patch's z, by Newton's steps."""
     world_from_patch = invert_rigid(templates.patch_from_world.double())
     flat = templates.points_patch.double().flatten(1, 2)
     along = world_from_patch[:, None, :3, 2]
@@ -136,7 +136,7 @@ def bumpy_height_field(templates: Templates) -> Tensor:
 def with_height_field(
     patches: PatchSet, height_field: Callable[[Templates], Tensor]
 ) -> DepthPatches:
-    """Give every patch its height field, and photometry that says nothing."""
+    """Return every patch its height field, and photometry that says nothing."""
     height_fields, photometry = [], []
     for templates in patches.buckets:
         depth = height_field(templates)
@@ -205,24 +205,24 @@ def add_waves(depths: DepthPatches, amplitude: float, generator: torch.Generator
 
 
 def error(found: DepthPatches, truth: DepthPatches) -> float:
-    """Give the root mean square error, as a fraction of the height field's own."""
+    """Return the root mean square error, as a fraction of the height field's own."""
     pairs = zip(found.buckets, truth.buckets, strict=True)
     square = torch.cat([(a.depth - b.depth)[b.valid].square() for a, b in pairs])
     return float(square.mean().sqrt()) / rms(truth)
 
 
 def rms(depths: DepthPatches) -> float:
-    """Give the root mean square of the height fields about each patch's mean plane's height."""
+    """Return the root mean square of the height fields about each patch's mean plane's height."""
     return float(torch.cat([b.depth[b.valid].square() for b in depths.buckets]).mean().sqrt())
 
 
 def scales(depths: DepthPatches) -> Tensor:
-    """Give ``h_z`` of every patch, in the order of the buckets."""
+    """Return ``h_z`` of every patch, in the order of the buckets."""
     return torch.cat([height_field.transform[:, 2] for height_field in depths.buckets])
 
 
 def peak_mb() -> float:
-    """Give the highest resident memory of the process so far."""
+    """Return the highest resident memory of the process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 

@@ -48,14 +48,14 @@ RESOLVERS: dict[str, Resolver] = {
 
 
 def error_deg(shading: Tensor, normals: Tensor, known: Tensor) -> float:
-    """Give the mean angle over the pixels that have a vector."""
+    """Return the mean angle over the pixels that have a vector."""
     cross = torch.linalg.cross(shading, normals, dim=0).norm(dim=0)
     angle = torch.rad2deg(torch.atan2(cross, (shading * normals).sum(dim=0)))
     return float(angle[known].mean())
 
 
 def paint(name: str, size: int, generator: torch.Generator) -> Tensor:
-    """Give albedo: five colours, five greys, or one grey."""
+    """Return albedo: five colours, five greys, or one grey."""
     if name == "one":
         return torch.full((size, size, 3), 0.6, dtype=torch.float64)
     colours = regions(size, generator)

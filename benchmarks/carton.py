@@ -53,7 +53,7 @@ class Arrays(pickle.Unpickler):
     """Reads arrays and nothing else: a pickle may hold any program."""
 
     def find_class(self, module: str, name: str) -> object:
-        """Give what arrays are made of."""
+        """Return what arrays are made of."""
         if module.split(".")[0] == "numpy" and name in ("_reconstruct", "ndarray", "dtype"):
             return super().find_class(module, name)
         raise InputError(f"{module}.{name} in a pickle; needed: an array of numbers alone.")
@@ -167,7 +167,7 @@ def on_object(cloud: Float[Tensor, "point 3"], capture: Capture) -> Bool[Tensor,
 def carton_scene(
     folder: Path, capture: Capture, reference: str = "", num_views: int = 0
 ) -> SparseScene:
-    """Give known cameras, and the cloud with predicted tracks, as the chain takes them.
+    """Return known cameras, and the cloud with predicted tracks, as the chain takes them.
 
     Args:
         folder: Of the set.
@@ -230,7 +230,7 @@ def write_colmap_model(scene: SparseScene, folder: Path) -> None:
 
 
 def cameras_of(capture: Capture) -> Cameras:
-    """Give the cameras, which an LLFF set always has."""
+    """Return the cameras, which an LLFF set always has."""
     assert capture.cameras is not None
     return capture.cameras
 

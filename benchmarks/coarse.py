@@ -165,7 +165,7 @@ class Judge:
         self._surface = TrueSurface(capture, samples=50_000)
 
     def __call__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> str:
-        """Give a row's figures."""
+        """Return a row's figures."""
         mesh = Mesh(vertices_world=vertices.double(), faces=faces)
         seen = compare_along_rays(transfer(mesh, self._truth_from_world), self._maps, 0)
         moved = transform(self._truth_from_world, mesh.vertices_world)

@@ -177,7 +177,7 @@ def _border(
     beside: Int[Tensor, "cell 4"],
     full: Bool[Tensor, " cell"] | np.ndarray,
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Give the facets between full and empty cells, outward."""
+    """Return the facets between full and empty cells, outward."""
     full = torch.as_tensor(full)
     other = torch.where(beside >= 0, full[beside.clamp_min(0)], False)
     cell, slot = torch.nonzero(full[:, None] & ~other, as_tuple=True)

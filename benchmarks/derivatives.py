@@ -155,7 +155,7 @@ def _differences(
     steps: tuple[float, float],
     centre: Tensors,
 ) -> tuple[dict[str, Tensor], dict[str, Bool[Tensor, " element"]]]:
-    """Give central differences of all outputs along a path, and the elements that jump or bend."""
+    """Return central differences of all outputs along a path, and elements that jump or bend."""
 
     def at(step: float) -> dict[str, Tensor]:
         found = function(_leaves({**inputs, name: inputs[name] + step * path}))

@@ -129,7 +129,7 @@ def compressed(case: str, side: int) -> csr_array:
 
 
 def solver(name: str, case: str, side: int) -> tuple[Callable[[], object], Callable[..., tuple]]:
-    """Give what prepares, and what solves with the prepared for solution and iterations."""
+    """Return what prepares, and what solves with the prepared for solution and iterations."""
     if name in ("spsolve", "cg", "cg, diagonal"):
         matrix = compressed(case, side)
         scale = 1 / matrix.diagonal()

@@ -90,7 +90,7 @@ def integrate(one: NormalMap, method: str) -> IntegratedMap:
 
 
 def depth_error(one: NormalMap, depth: Tensor) -> float:
-    """Give the mean absolute error after the scale of the median ratio."""
+    """Return the mean absolute error after the scale of the median ratio."""
     assert one.depth is not None
     known = one.mask & depth.isfinite() & one.depth.isfinite()
     ours, true = depth[known].double(), one.depth[known].double()
@@ -104,7 +104,7 @@ def with_true_weights(one: NormalMap) -> Tensor:
 
 
 def true_bias(one: NormalMap) -> list[float]:
-    """Give the mean residual of steps to the right and down at the true depth, jumps apart."""
+    """Return the mean residual of steps to the right and down at the true depth, jumps apart."""
     _, apart, weights = at_the_truth(one)
     return [
         float((weight * residual).sum() / weight.sum())
@@ -113,7 +113,7 @@ def true_bias(one: NormalMap) -> list[float]:
 
 
 def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
-    """Give the steps wanted, by how many pixels the true depth leaves them, and weights."""
+    """Return the steps wanted, by how many pixels the true depth leaves them, and weights."""
     assert one.depth is not None
     assert one.intrinsics is not None
     steps = perspective_steps(one.normals.double(), one.mask, one.intrinsics)
@@ -159,7 +159,7 @@ def without_depth(folders: list[Path], figure: Path | None) -> None:
 
 
 def rotated_by(one: NormalMap, found: IntegratedMap) -> Tensor:
-    """Give the angle between the normals given and those of the surface, by its own steps."""
+    """Return the angle between the normals given and those of the surface, by its own steps."""
     depth, K = found.depth, one.intrinsics
     unknown = depth if K is None else torch.where(one.mask, depth, 1).log()
     if K is None:

@@ -89,7 +89,7 @@ def main() -> None:
 def draw(
     patches: int, views: int, samples: int, missing: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Give radiance, what is seen, starting lights, and normals: the facet's and the true."""
+    """Return radiance, what is seen, starting lights, and normals: the facet's and the true."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -137,7 +137,7 @@ def pose(
 
 
 def measure_bandwidth() -> float:
-    """Give GB/s of reading a tensor that no cache holds."""
+    """Return GB/s of reading a tensor that no cache holds."""
     large = torch.ones(64_000_000)
     best = 0.0
     for _ in range(5):

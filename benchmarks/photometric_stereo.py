@@ -188,7 +188,7 @@ def best_relief(normals: Tensor, true: Tensor) -> BasRelief:
 
 
 def angles_deg(one: Tensor, other: Tensor) -> Tensor:
-    """Give angles between columns."""
+    """Return angles between columns."""
     chord = (normalize(one, dim=0) - normalize(other, dim=0)).norm(dim=0)
     return torch.rad2deg(2 * torch.asin((chord / 2).clamp_max(1)))
 

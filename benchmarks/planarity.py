@@ -267,7 +267,7 @@ def _measured(
 
 
 def _rectangle(hull: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> tuple[float, float]:
-    """Give the sides of the smallest rectangle about a convex polygon: one lies along an edge."""
+    """Return the sides of the smallest rectangle about a convex polygon: one lies along an edge."""
     steps = np.roll(hull, -1, axis=0) - hull
     along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)

@@ -357,7 +357,7 @@ def _probe(paths: _Paths, function: Callable[..., Any], arguments: tuple[Any, ..
 
 
 def _tensors(value: Any, path: str) -> list[Tensor]:  # noqa: ANN401 - records and tuples of them
-    """Give the tensors at a path; none where it ends in ``None``."""
+    """Return the tensors at a path; none where it ends in ``None``."""
     found = [value]
     for name in path.split("."):
         inner: list[Any] = []
@@ -388,7 +388,7 @@ def _flat(tensors: list[Tensor]) -> Float[Tensor, " value"]:
 
 
 def _length(arguments: tuple[Any, ...]) -> float:
-    """Give the median edge of a surface, or of the coarse mesh of a scene; else the spacing."""
+    """Return the median edge of a surface, or of the coarse mesh of a scene; else the spacing."""
     for one in arguments:
         if isinstance(one, Surface):
             return _edge(one.vertices_world, one.faces)
@@ -399,13 +399,13 @@ def _length(arguments: tuple[Any, ...]) -> float:
 
 
 def _edge(vertices: Float[Tensor, "vertex 3"], faces: Tensor) -> float:
-    """Give the median length of the faces' edges."""
+    """Return the median length of the faces' edges."""
     ends = vertices.detach()[faces]
     return float((ends[:, 1] - ends[:, 0]).norm(dim=1).median())
 
 
 def _pixel_angle(arguments: tuple[Any, ...]) -> float:
-    """Give the angle of a pixel, the unit of the cameras' motion."""
+    """Return the angle of a pixel, the unit of the cameras' motion."""
     first = arguments[0]
     cameras = first.cameras if isinstance(first, SparseScene) else arguments[1]
     return 1 / float(cameras.intrinsics[:, 0, 0].median())

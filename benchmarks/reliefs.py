@@ -58,7 +58,7 @@ class WavyPlane:
 def ball(
     size: int, rim_deg: float = 75.0
 ) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"]]:
-    """Give the normals of a ball that fills a square image, orthographic, and its mask.
+    """Return the normals of a ball that fills a square image, orthographic, and its mask.
 
     Args:
         size: Of the image.
@@ -74,7 +74,7 @@ def ball(
 def bumps(
     size: int, generator: torch.Generator, steepest: float = 1.0, count: int = 8
 ) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"]]:
-    """Give the normals of a field of Gaussian bumps and hollows, orthographic, and a full mask.
+    """Return the normals of a field of Gaussian bumps and hollows, orthographic, and a full mask.
 
     Args:
         size: Of the image.
@@ -95,7 +95,7 @@ def bumps_in_perspective(
     steepest: float = 1.0,
     count: int = 8,
 ) -> tuple[Float[Tensor, "size size 3"], Bool[Tensor, "size size"], Float[Tensor, "3 3"], Tensor]:
-    r"""Give a field of bumps as a pinhole sees it.
+    r"""Return a field of bumps as a pinhole sees it.
 
     Depth is :math:`z = e^{f(x, y)}` over the normalised image plane; the normal of
     :math:`z\,(x, y, 1)` is along :math:`(f_x, f_y, -1 - x f_x - y f_y)`.

@@ -191,7 +191,7 @@ def estimate_of(scene: SparseScene) -> Estimate:
 
 
 def rotation_errors_deg(scene: SparseScene, reference: Path) -> Tensor:
-    """Give the angle between each view's rotation and the reference's, after alignment."""
+    """Return the angle between each view's rotation and the reference's, after alignment."""
     names, cam_from_world = reference_poses(reference)
     number = {name: index for index, name in enumerate(names)}
     shared = [index for index, name in enumerate(scene.views.names) if name in number]
@@ -215,7 +215,7 @@ def reference_poses(folder: Path) -> tuple[tuple[str, ...], Tensor]:
 
 
 def cpu_seconds() -> float:
-    """Give the processor time this process has used, all threads together."""
+    """Return the processor time this process has used, all threads together."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 

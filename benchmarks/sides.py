@@ -79,7 +79,7 @@ def far_apart(
 def square_round(
     points: Float[Tensor, "point 3"], camera: Cameras
 ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
-    """Give the corners, in pixels, of a square that a camera sees points in."""
+    """Return the corners, in pixels, of a square that a camera sees points in."""
     low, high = bounding_box(camera, points, 0.03)
     half = (high - low).max() / 2
     return (low + high) / 2 - half, (low + high) / 2 + half

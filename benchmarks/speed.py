@@ -85,7 +85,7 @@ class Cost:
     floor_seconds: float = math.nan
 
     def __sub__(self, earlier: "Cost") -> "Cost":
-        """Give the cost since an earlier reading of the clocks."""
+        """Return the cost since an earlier reading of the clocks."""
         return replace(
             self,
             seconds=self.seconds - earlier.seconds,
@@ -94,7 +94,7 @@ class Cost:
         )
 
     def cells(self, cores: int) -> list[str]:
-        """Give the columns of the table."""
+        """Return the columns of the table."""
         return [
             f"{self.seconds:.1f}",
             f"{self.cpu_seconds:.1f}",
@@ -220,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def photographs(target: str, renderings: Path) -> str:
-    """Give the folder of the photographs, rendered if need be, or ``demo``."""
+    """Return the folder of the photographs, rendered if need be, or ``demo``."""
     if target in SCENES and not Path(target).is_dir():
         folder = renderings / target
         if not folder.is_dir():
@@ -356,7 +356,7 @@ def product_flops_per_s(batch: int = 600, samples: int = 235, views: int = 24) -
 
 
 def quickest(work: Callable[[], object], times: int = 5) -> float:
-    """Give the seconds of the quickest of a few runs."""
+    """Return the seconds of the quickest of a few runs."""
     taken = []
     for _ in range(times):
         began = time.perf_counter()
@@ -402,7 +402,7 @@ def costs_of(found: Mapping[str, Any]) -> list[Cost]:
 
 
 def rows_of(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
-    """Give the stages, all of them, and all after structure from motion."""
+    """Return the stages, all of them, and all after structure from motion."""
     costs = costs_of(found)
     names = [cost.stage for cost in costs]
     after = costs[names.index("reconstruct") + 1 :] if "reconstruct" in names else costs

@@ -73,7 +73,7 @@ def row(
 
 
 def center_errors(scene: SparseScene, names: tuple[str, ...], true: Cameras) -> torch.Tensor:
-    """Give each camera centre's distance from the true one, in radii of the circle."""
+    """Return each camera centre's distance from the true one, in radii of the circle."""
     rows = [names.index(name) for name in scene.views.names]
     same = true.replace(
         intrinsics=true.intrinsics[rows],

@@ -190,12 +190,12 @@ def largest(step: pt.Step) -> int:
 
 
 def photograph(views: Views, view: int) -> Image.Image:
-    """Give a photograph as it is looked at."""
+    """Return a photograph as it is looked at."""
     return picture(views.images[view].movedim(0, -1).clamp(0, 1) ** (1 / 2.2))
 
 
 def silhouette(step: pt.Step, view: int) -> Image.Image:
-    """Give a photograph with what is not the object left white."""
+    """Return a photograph with what is not the object left white."""
     shown = step.scene.views.images[view].movedim(0, -1).clamp(0, 1) ** (1 / 2.2)
     inside = step.silhouettes.inside[view] > 0.5
     return picture(torch.where(inside[..., None], shown, torch.ones_like(shown)))

@@ -41,12 +41,12 @@ def read(path: Path) -> NotebookNode:
 
 
 def code_cells(notebook: NotebookNode) -> list[NotebookNode]:
-    """Give the cells that run."""
+    """Return the cells that run."""
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
 def digest(notebook: NotebookNode) -> str:
-    """Give a name to the source of all cells that run."""
+    """Return a name to the source of all cells that run."""
     source = "\0".join(cell.source for cell in code_cells(notebook))
     return hashlib.sha256(source.encode()).hexdigest()
 
@@ -72,7 +72,7 @@ def executed(notebook: NotebookNode) -> NotebookNode:
 
 
 def texts(cell: NotebookNode) -> str:
-    """Give what a cell printed and returned; a stream comes in any number of pieces."""
+    """Return what a cell printed and returned; a stream comes in any number of pieces."""
     said = ""
     for output in cell.outputs:
         if output.output_type == "stream":
@@ -83,7 +83,7 @@ def texts(cell: NotebookNode) -> str:
 
 
 def pictures(cell: NotebookNode) -> list[Image.Image]:
-    """Give the pictures that a cell drew."""
+    """Return the pictures that a cell drew."""
     drawn = [output.get("data", {}).get("image/png") for output in cell.outputs]
     return [Image.open(io.BytesIO(base64.b64decode(one))) for one in drawn if one]
 
@@ -121,7 +121,7 @@ def alike(before: str, after: str, tolerance: float) -> bool:
 
 
 def unit(number: str) -> float:
-    """Give the value of one in the last digit of a number as it is written; 0 of an integer."""
+    """Return the value of one in the last digit of a number as it is written; 0 of an integer."""
     mantissa, _, exponent = number.lower().partition("e")
     _, point, decimals = mantissa.partition(".")
     return float(10.0 ** (int(exponent or 0) - len(decimals))) if point else 0.0

@@ -25,7 +25,7 @@ _DAMPING, _LESS, _MORE, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
 
 @compiled(fast=True)
 def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Return radiance of albedo 1, by the harmonics and the point light, if there is one."""
+    """Compute radiance of albedo 1, by the harmonics and the point light, if there is one."""
     terms = _soft_terms(geometry, lights[0])
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
@@ -62,7 +62,7 @@ def _direction(light: Doubles) -> tuple[float, float, float, float]:
 
 @compiled(fast=True)
 def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
-    """Return the derivatives of a view's shading by its light's parameters, for one tile."""
+    """Compute the derivatives of a view's shading by its light's parameters, for one tile."""
     terms = _soft_terms(geometry, light)
     samples = slice(first, first + TILE)
     for j in range(terms):

@@ -215,7 +215,7 @@ def inverse_factor(m: Six) -> Six:
 
 @compiled(fast=True)
 def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
-    """Return the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
+    """Compute the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
 
     Args:
         vectors: Becomes 12 rows: three vectors of four.

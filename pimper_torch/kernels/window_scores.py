@@ -21,7 +21,7 @@ def _project(
     shift: float,
     shift_depth: float,
 ) -> None:
-    """Return one coordinate of a row of pixels in a source view."""
+    """Compute one coordinate of a row of pixels in a source view."""
     tiny, min_ratio, zero = np.float32(np.finfo(np.float32).tiny), np.float32(1e-6), np.float32(0)
     half, behind = np.float32(0.5), np.float32(-1e9)  # left of every picture
     for x in range(len(coordinates)):
