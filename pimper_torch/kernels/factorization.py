@@ -18,11 +18,14 @@ from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 from pimper_torch.kernels.twin_constants import (
+    CAUCHY,
     DAMPING_DECREASE,
     DAMPING_INCREASE,
+    GEMAN_MCCLURE,
     INITIAL_DAMPING,
     MIN_DEVIATION,
     SHADING_STEPS,
+    SQUARES,
     ZERO_ROUNDINGS,
 )
 
@@ -93,7 +96,8 @@ class Patch(NamedTuple):
         num_views: Omitted views included.
         num_scale: The residual deviation is estimated from so many samples, the first.
         level: Minimum deviation of residuals.
-        scale: Of Cauchy's loss, in deviations; 0 for squares.
+        loss: Code of the loss.
+        scale: Of the loss, in deviations.
     """
 
     radiance: Floats
@@ -108,6 +112,7 @@ class Patch(NamedTuple):
     num_views: int
     num_scale: int
     level: float
+    loss: int
     scale: float
 
 
@@ -160,6 +165,7 @@ def _packed(
     views: Integers,
     samples: Integers,
     num_scale: int,
+    loss: int,
     scale: float,
 ) -> Patch:
     num_views, num_samples = len(views), len(samples)
@@ -203,6 +209,7 @@ def _packed(
         num_views=len(regularization),
         num_scale=num_scale,
         level=MIN_DEVIATION * size / max(count, 1.0),
+        loss=loss,
         scale=scale,
     )
 
@@ -255,7 +262,7 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
             _overwrite(lights, new_lights)
             _overwrite(shading, new_shading)
             slope, new_slope, cost = new_slope, slope, after
-            if patch.scale > 0:
+            if patch.loss != SQUARES:
                 scale_start = _robust_weights(patch, lights, shading, scale_start)
                 cost = _evaluate(patch, lights, shading, slope)
         if exact or small >= small_steps:
@@ -279,7 +286,7 @@ def _overwrite(target: Floats, source: Floats) -> None:
 @compiled(fast=True)
 def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
     """Update the robust weights; return the scale that the next call starts from."""
-    if patch.scale == 0:
+    if patch.loss == SQUARES:
         return 0.0
     squares = np.empty(patch.radiance.shape[0] * patch.num_scale, np.float32)
     count = 0
@@ -294,9 +301,18 @@ def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: 
     one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
     for f in range(len(lights)):
         residual_row, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
-        for k in range(len(residual_row)):
-            relative = residual_row[k] * inverse
-            weight[k] = given[k] / (one + relative * relative)
+        if patch.loss == CAUCHY:
+            for k in range(len(residual_row)):
+                relative = residual_row[k] * inverse
+                weight[k] = given[k] / (one + relative * relative)
+        elif patch.loss == GEMAN_MCCLURE:
+            for k in range(len(residual_row)):
+                relative = residual_row[k] * inverse
+                root = one / (one + relative * relative)
+                weight[k] = given[k] * root * root
+        else:
+            for k in range(len(residual_row)):
+                weight[k] = given[k] / max(one, abs(residual_row[k] * inverse))
     return scale
 
 
@@ -488,12 +504,18 @@ def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[fl
 
 @compiled(annotated=True)
 def solve_on_cone(
-    problem: ConeProblem, scale: float, stride: int, limits: Limits, solution: ConeSolution
+    problem: ConeProblem,
+    loss: int,
+    scale: float,
+    stride: int,
+    limits: Limits,
+    solution: ConeSolution,
 ) -> None:
     """Factorize a batch of patches, one after the other.
 
     Args:
-        scale: Of Cauchy's loss, in standard deviations; 0 for squares.
+        loss: Its code.
+        scale: Of the loss, in standard deviations.
         stride: The deviation is estimated from every ``stride``-th sample.
         solution: Its lights and shading are the start.
     """
@@ -511,6 +533,7 @@ def solve_on_cone(
             views,
             samples,
             num_scale,
+            loss,
             scale,
         )
         light = np.empty((len(views), 4), np.float32)

@@ -1,8 +1,11 @@
 """Constants that a kernel of the photometry and its twin in torch have in common."""
 
-# Scale of Cauchy's loss in standard deviations, at which it is 95 % efficient on Gaussian noise
-# (Holland & Welsch, 1977).
-CAUCHY_TUNING = 2.385
+# Codes of the losses.
+SQUARES, CAUCHY, GEMAN_MCCLURE, HUBER = range(4)
+
+# Their scales in standard deviations, at which they are 95 % efficient on Gaussian noise (Holland &
+# Welsch, 1977, of the first and the last; checked in `test_robust.py`).
+CAUCHY_TUNING, GEMAN_MCCLURE_TUNING, HUBER_TUNING = 2.385, 3.787, 1.345
 
 # The M-estimate of scale of unit Gaussian noise: the root of its equation's expectation, checked in
 # `test_robust.py`.

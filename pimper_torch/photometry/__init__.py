@@ -10,7 +10,7 @@ from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig, Illumination
 from pimper_torch.photometry.lights import thinned
-from pimper_torch.photometry.robust import Cauchy, Squares
+from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 __all__ = [
@@ -20,7 +20,10 @@ __all__ = [
     "Factorize",
     "FactorizeConfig",
     "Factors",
+    "GemanMcClure",
+    "Huber",
     "Illumination",
+    "Loss",
     "Solver",
     "Squares",
     "differentiable",

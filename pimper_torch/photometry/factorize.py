@@ -40,7 +40,7 @@ from pimper_torch.photometry.light_field import (
     rotate_lights,
 )
 from pimper_torch.photometry.lights import light_of_mesh
-from pimper_torch.photometry.robust import Cauchy, Loss, Squares
+from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.sample_estimates import (
     Rows,
     fit_albedo,
@@ -83,9 +83,11 @@ SOLVERS: dict[str, Solver] = {
     "balm": solve_balm,
 }
 
-LOSSES: dict[str, Callable[[float], Loss]] = {
-    "squares": lambda _: Squares(),
+LOSSES: dict[str, Callable[..., Loss]] = {
+    "squares": Squares,
     "cauchy": Cauchy,
+    "huber": Huber,
+    "geman-mcclure": GemanMcClure,
 }
 
 # Iterations at most, and tolerance, where gradients are required: from there Newton's method
@@ -116,11 +118,12 @@ class FactorizeConfig:
             units of the patch's own data; 0 leaves them free, 1e6 fixes them.
         geometry_weight: Weight of the prior of normals, whose mean is the coarse ones, in units
             of one view.
-        loss: ``"cauchy"``, by which highlights and shadows lose weight, or ``"squares"``.
+        loss: ``"cauchy"``, by which highlights and shadows lose weight; ``"geman-mcclure"``, by
+            which they lose it faster; ``"huber"``, more slowly; or ``"squares"``.
         shadows: Whether samples in cast shadow are left out. Needs a surface that is nearly
             right.
-        loss_scale: Of Cauchy's loss, in standard deviations of the patch's residuals; the weight
-            there is a half.
+        loss_scale: Of the loss, in standard deviations of the patch's residuals; 0 for that at
+            which it is 95 % efficient on Gaussian noise.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
             and the lights take their share.
         min_light_variation: Minimum third singular value of a patch's lights, over the first;
@@ -136,10 +139,8 @@ class FactorizeConfig:
     solver: Literal["variable-projection", "balm"] = "variable-projection"
     light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
     geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
-    loss: Literal["squares", "cauchy"] = "cauchy"
-    loss_scale: Annotated[float, Range(above=0, most=1e12)] = (
-        2.385  # 95 % efficient on Gaussian noise
-    )
+    loss: Literal["squares", "cauchy", "huber", "geman-mcclure"] = "cauchy"
+    loss_scale: Annotated[float, Range(least=0, most=1e12)] = 0.0
     shadows: bool = True
     min_views: Annotated[int, Range(least=3, most=100_000)] = 4
     min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
@@ -436,7 +437,7 @@ class Factorize(Stage):
             regularization=light_weight.clamp_min(1e-6) * unit,
             prior=prior,
             manifold=cone,
-            loss=LOSSES[config.loss](config.loss_scale),
+            loss=LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else [])),
             stride=max(1, raster // 512),  # some 500 samples tell the residuals' deviation
         )
         for each in known:

@@ -1,67 +1,163 @@
 """Robust losses, and robust estimates of scale."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
-from pimper_torch.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
 from pimper_torch.kernels.twin_constants import (
+    CAUCHY,
     GAUSSIAN_SCALE,
+    GEMAN_MCCLURE,
+    GEMAN_MCCLURE_TUNING,
+    HUBER,
+    HUBER_TUNING,
     LONGEST_NEWTON_STEP,
     NEWTON_STEPS,
+    SQUARES,
 )
+from pimper_torch.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
 from pimper_torch.linalg.sums import along_last
 
 
-@dataclass(frozen=True, slots=True)
-class Squares:
-    """Plain least squares."""
+class Loss(ABC):
+    r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, by which outliers lose weight.
+
+    A loss of one's own defines :meth:`rho` and :meth:`weight`.
+
+    Attributes:
+        scale: ``s`` in standard deviations of the residuals.
+        code: Number of the loss in compiled kernels; without one, solvers run in torch.
+    """
+
+    scale: float
+    code: ClassVar[int | None] = None
+
+    @abstractmethod
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the loss of squared residuals, both in units of the squared scale."""
+
+    @abstractmethod
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the derivative of :meth:`rho`, the weight of iteratively reweighted squares."""
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the derivative of :meth:`weight`, by autograd."""
+        with torch.enable_grad():
+            at = square.detach().requires_grad_()
+            (found,) = torch.autograd.grad((self.weight(at) + 0 * at).sum(), at)
+        return found
 
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Return weights for iteratively reweighted least squares: 1."""
-        return torch.ones_like(residual)
+        """Return the weight of each residual; that of a zero residual where the deviation is 0."""
+        return self.weight(_relative_square(residual, self.scale * deviation))
 
     def curvatures(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*batch"]:
-        """Return the second derivative of the loss."""
-        return torch.ones_like(residual)
+        """Return the second derivative of the loss by the residual, negative for some outliers."""
+        square = _relative_square(residual, self.scale * deviation)
+        return self.weight(square) + 2 * square * self.slope(square)
 
 
 @dataclass(frozen=True, slots=True)
-class Cauchy:
-    r"""Cauchy's loss :math:`\tfrac{s^2}{2} \log(1 + (r / s)^2)`: outliers keep a small influence.
+class Squares(Loss):
+    r"""Plain least squares, :math:`\rho = u`."""
 
-    Attributes:
-        scale: ``s`` in standard deviations of the residuals.
-    """
+    code: ClassVar[int | None] = SQUARES
+    scale: float = 1.0
 
-    scale: Annotated[float, Range(above=0, most=1e12)] = CAUCHY_TUNING
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the squares themselves."""
+        return square
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return 1."""
+        return torch.ones_like(square)
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return 0."""
+        return torch.zeros_like(square)
+
+
+@dataclass(frozen=True, slots=True)
+class _Robust(Loss):
+    scale: Annotated[float, Range(above=0, most=1e12)]
 
     def __post_init__(self) -> None:
         require_ranges(self)
 
-    def weights(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
-        """Return weights for iteratively reweighted least squares; 1 for a zero residual."""
-        return cauchy_weights(residual, self.scale * deviation)
 
-    def curvatures(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
-        """Return the second derivative of the loss, negative for outliers."""
-        weight = self.weights(residual, deviation)
-        return weight * (2 * weight - 1)
+@dataclass(frozen=True, slots=True)
+class Cauchy(_Robust):
+    r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence."""
+
+    code: ClassVar[int | None] = CAUCHY
+    scale: float = CAUCHY_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the logarithm."""
+        return square.log1p()
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`1 / (1 + u)`."""
+        return 1 / (1 + square)
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`-1 / (1 + u)^2`."""
+        return -1 / (1 + square).square()
 
 
-Loss = Squares | Cauchy
+@dataclass(frozen=True, slots=True)
+class GemanMcClure(_Robust):
+    r"""Geman and McClure's loss, :math:`\rho = u / (1 + u)`: outliers lose all influence.
+
+    Source: Geman & McClure, Bulletin of the International Statistical Institute 52(4), 1987.
+    """
+
+    code: ClassVar[int | None] = GEMAN_MCCLURE
+    scale: float = GEMAN_MCCLURE_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`u / (1 + u)`."""
+        return square / (1 + square)
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`1 / (1 + u)^2`."""
+        return 1 / (1 + square).square()
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`-2 / (1 + u)^3`."""
+        return -2 / (1 + square) ** 3
+
+
+@dataclass(frozen=True, slots=True)
+class Huber(_Robust):
+    r"""Huber's loss, :math:`\rho = u` up to 1 and :math:`2 \sqrt u - 1` beyond: convex.
+
+    Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
+    """
+
+    code: ClassVar[int | None] = HUBER
+    scale: float = HUBER_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return squares of small residuals, and sizes of large ones."""
+        return torch.where(square <= 1, square, 2 * square.clamp_min(1).sqrt() - 1)
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return 1, and :math:`1 / \sqrt u` beyond."""
+        return square.clamp_min(1).rsqrt()
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return 0, and :math:`-u^{-3/2} / 2` beyond."""
+        return torch.where(square > 1, -0.5 * square.clamp_min(1) ** -1.5, 0)
 
 
 def median_deviation(
@@ -162,5 +258,12 @@ def cauchy_weights(
 
     Source: Holland & Welsch, Communications in Statistics 6(9), 1977.
     """
+    return 1 / (1 + _relative_square(residual, scale))
+
+
+def _relative_square(
+    residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch"]:
+    """Return squared residuals in units of the squared scale; 0 where the scale is 0."""
     relative = torch.where(scale > 0, residual / torch.where(scale > 0, scale, 1), 0)
-    return 1 / (1 + relative * relative)
+    return relative * relative

@@ -263,11 +263,12 @@ def _is_free(problem: Bilinear) -> bool:
 
 
 def _has_kernel(problem: Bilinear) -> bool:
-    """Return whether the compiled kernel applies: first-order light in float32."""
+    """Return whether the compiled kernel applies: first-order light in float32, a loss it knows."""
     return (
         compiled_for(problem.radiance)
         and problem.radiance.dtype == torch.float32
         and isinstance(problem.manifold, Cone)
+        and problem.loss.code is not None
     )
 
 
@@ -280,7 +281,8 @@ def _solve_by_kernel(
 ) -> Factors:
     from pimper_torch.kernels import factorization
 
-    J, prior = problem.radiance, problem.prior
+    J, prior, code = problem.radiance, problem.prior, problem.loss.code
+    assert code is not None  # the caller asks
     if prior is None:
         prior = J.new_zeros(len(J), 10, J.shape[2])
     lights, shading = (
@@ -294,7 +296,8 @@ def _solve_by_kernel(
     results = lights, shading, weight, taken, residual, cause
     factorization.solve_on_cone(
         factorization.ConeProblem(*map(as_array, data)),
-        0.0 if isinstance(problem.loss, Squares) else problem.loss.scale,
+        code,
+        problem.loss.scale,
         problem.stride,
         factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
         factorization.ConeSolution(*(each.numpy() for each in results)),

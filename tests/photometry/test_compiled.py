@@ -1,5 +1,7 @@
 """The compiled solver against the torch module that it stands in for."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -7,9 +9,10 @@ from torch.testing import assert_close
 from twins import using
 
 from pimper_torch.errors import PimperWarning
+from pimper_torch.photometry.bilinear import residual_deviation
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.lights import fit_light_field, thinned
-from pimper_torch.photometry.robust import Cauchy, Squares
+from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 
@@ -33,7 +36,7 @@ def noisy(problem, generator, **settings):
     ).to(torch.float32)
 
 
-@pytest.mark.parametrize("loss", [Squares(), Cauchy()])
+@pytest.mark.parametrize("loss", [Squares(), Cauchy(), GemanMcClure(), Huber()])
 @pytest.mark.parametrize("missing", [0.0, 0.6])
 def test_solutions_are_those_of_the_reference(problem, generator, missing, loss):
     given = noisy(problem, generator, patches=3, views=14, samples=90, missing=missing)
@@ -48,6 +51,28 @@ def test_solutions_are_those_of_the_reference(problem, generator, missing, loss)
     assert_close(found.weight, expected.weight, rtol=0, atol=2e-2)
     assert_close(found.convergence.residual, expected.convergence.residual, rtol=1e-3, atol=0)
     assert (found.lights - given.lights).abs().max() > 0.02  # they moved
+
+
+@dataclass(frozen=True)
+class Welsch(Loss):
+    """A loss of one's own, which no kernel knows."""
+
+    scale: float = 2.985
+
+    def rho(self, square):
+        return -torch.expm1(-square)
+
+    def weight(self, square):
+        return torch.exp(-square)
+
+
+def test_a_loss_of_ones_own_is_solved_for_as_it_is(problem, generator):
+    given = noisy(problem, generator, patches=2, views=10, samples=60)
+    found, cauchy = (solve(given.replace(loss=loss), "numba") for loss in (Welsch(), Cauchy()))
+    residual = given.radiance - found.lights @ found.shading
+    deviation = residual_deviation(given, residual)[:, None, None]
+    assert_close(found.weight, given.weight * Welsch().weights(residual, deviation))
+    assert (found.lights - cauchy.lights).abs().max() > 1e-3
 
 
 def test_light_without_pull_keeps_its_size(problem):

@@ -1,7 +1,19 @@
+import math
+
+import pytest
 import torch
+from scipy.optimize import least_squares
 from torch.testing import assert_close
 
-from pimper_torch.photometry.robust import Cauchy, median_deviation, robust_deviation
+from pimper_torch.photometry.robust import (
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    Loss,
+    Squares,
+    median_deviation,
+    robust_deviation,
+)
 
 
 def drawn(generator, *shape):
@@ -37,17 +49,63 @@ def test_the_spread_has_the_gradient_of_its_differences(generator):
     assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)
 
 
-def test_weights_and_curvatures_are_derivatives_of_the_loss(generator):
+# Names of the losses in SciPy, and each of ours; those that it lacks are of one's own there.
+LOSSES = {"linear": Squares(), "cauchy": Cauchy(), "huber": Huber(), None: GemanMcClure()}
+
+
+@pytest.mark.parametrize("loss", LOSSES.values())
+def test_weights_and_curvatures_are_derivatives_of_the_loss(generator, loss):
     residual = drawn(generator, 60).requires_grad_()
     deviation = torch.tensor(0.4, dtype=torch.float64)
-    loss = Cauchy()
     width = loss.scale * deviation
-    value = (width**2 / 2 * torch.log1p((residual / width) ** 2)).sum()
+    value = (width**2 / 2 * loss.rho((residual / width) ** 2)).sum()
     (slope,) = torch.autograd.grad(value, residual, create_graph=True)
     assert_close(slope, loss.weights(residual, deviation) * residual)
     (bend,) = torch.autograd.grad(slope.sum(), residual)
     assert_close(bend, loss.curvatures(residual.detach(), deviation))
-    assert (bend < 0).any()  # of outliers
+    square = residual.detach().square()
+    assert_close(Loss.slope(loss, square), loss.slope(square))  # by autograd
+
+
+@pytest.mark.parametrize(("name", "loss"), LOSSES.items())
+def test_reweighted_squares_find_what_scipy_finds(generator, name, loss):
+    design, noise = drawn(generator, 80, 3), 0.1 * drawn(generator, 80)
+    noise[::9] += 2
+    target = design @ torch.tensor([1.0, -2.0, 0.5]).double() + noise
+
+    def rho(square):
+        u = torch.from_numpy(square)
+        rows = loss.rho(u), loss.weight(u), loss.slope(u)
+        return torch.stack(rows).numpy()
+
+    found = torch.linalg.lstsq(design, target).solution
+    deviation = torch.tensor(0.1, dtype=torch.float64)
+    for _ in range(200):
+        weight = loss.weights(target - design @ found, deviation)[:, None]
+        found = torch.linalg.solve(
+            design.mT @ (weight * design), design.mT @ (weight[:, 0] * target)
+        )
+    expected = least_squares(
+        lambda x: target.numpy() - design.numpy() @ x,
+        torch.linalg.lstsq(design, target).solution.numpy(),
+        loss=name or rho,
+        f_scale=loss.scale * 0.1,
+        gtol=1e-14,
+        ftol=1e-14,
+        xtol=1e-14,
+    )
+    # SciPy stops where the objective does, and that is known to the root of rounding.
+    assert_close(found, torch.from_numpy(expected.x), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("loss", [Cauchy(), Huber(), GemanMcClure()])
+def test_each_loss_is_95_percent_efficient_on_gaussian_noise(loss):
+    x = torch.linspace(-9, 9, 20_001, dtype=torch.float64)
+    density = torch.exp(-0.5 * x.square()) / math.sqrt(2 * math.pi) * (x[1] - x[0])
+    one = torch.ones((), dtype=torch.float64)
+    bend, slope = loss.curvatures(x, one), loss.weights(x, one) * x
+    efficiency = (bend * density).sum() ** 2 / (slope.square() * density).sum()
+    assert efficiency == pytest.approx(0.95, abs=2e-4)  # of scales to four digits
 
 
 def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(generator):
