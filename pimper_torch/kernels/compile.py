@@ -37,6 +37,9 @@ SURFACE = (
     "decimation",
 )
 
+# Of gradients alone: compiled where a run first asks for them.
+GRADIENTS = ("factor_adjoint",)
+
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "arcp", "nsz"}

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.arrays import Floats1, Floats2, Floats3, Integers1
-from pimper_torch.kernels.cholesky import solve_damped
+from pimper_torch.kernels.arrays import ConeProblem, Floats1, Floats3, Integers1
 from pimper_torch.kernels.compile import compiled
+from pimper_torch.kernels.dense_systems import solve_damped
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 from pimper_torch.kernels.twin_constants import (
@@ -41,16 +41,6 @@ _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 # Row and column of each entry of a packed matrix.
 _ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
 _COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
-
-
-class ConeProblem(NamedTuple):
-    """A batch of problems: see ``photometry.bilinear``; ``given`` are the weights."""
-
-    radiance: Floats3
-    given: Floats3
-    anchor: Floats3
-    regularization: Floats2
-    prior: Floats3
 
 
 class Limits(NamedTuple):
@@ -134,7 +124,7 @@ def _views_that_count(
 
 
 @compiled()
-def _samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
+def samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
     """List the samples with data, those that estimate the deviation first, and count the latter."""
     seen = np.zeros(given.shape[1], np.bool_)
     for f in range(len(given)):
@@ -523,7 +513,7 @@ def solve_on_cone(
     lights, shading, weight, iterations, residual, cause = solution
     for p in range(len(radiance)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
-        samples, num_scale = _samples_that_count(given[p], stride)
+        samples, num_scale = samples_that_count(given[p], stride)
         patch = _packed(
             radiance[p],
             given[p],

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.cholesky import solve_damped
 from pimper_torch.kernels.compile import compiled
+from pimper_torch.kernels.dense_systems import solve_damped
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
 

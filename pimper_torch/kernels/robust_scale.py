@@ -1,6 +1,7 @@
 """Robust scale of residuals: twin of ``photometry.robust.robust_variance``."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from pimper_torch.kernels.twin_constants import (
     NEWTON_STEPS,
 )
 
-Floats = NDArray[np.float32]
+Floats = NDArray[Any]
 
 # The step at which they end.
 _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
@@ -28,6 +29,7 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
     Returns:
         The variance, 0 where half of the squares are, and the squared scale.
     """
+    kind = squares.dtype.type
     half = 0.5 * len(squares)
     total, num_positive = 0.0, 0
     for i in range(len(squares)):
@@ -37,21 +39,22 @@ def robust_variance(squares: Floats, guess: float) -> tuple[float, float]:
         return 0.0, 0.0
     scale = guess if guess > 0 else total / len(squares)
     for _ in range(NEWTON_STEPS):
-        fraction, slope = _fractions(squares, np.float32(1 / scale))
+        fraction, slope = _fractions(squares, kind(1 / scale))
         step = (fraction - half) / max(slope, 1e-7)
         scale *= math.exp(min(max(step, -LONGEST_NEWTON_STEP), LONGEST_NEWTON_STEP))
         if abs(step) < _CLOSE:
             break
-    fraction, slope = _fractions(squares, np.float32(1 / scale))
+    fraction, slope = _fractions(squares, kind(1 / scale))
     correction = (fraction - half) / slope if slope > 0 else 0.0
     return max(scale * (1 + correction), 0.0) / GAUSSIAN_SCALE**2, scale
 
 
 @compiled(fast=True)
-def _fractions(squares: Floats, inverse: np.float32) -> tuple[float, float]:
+def _fractions(squares: Floats, inverse: float) -> tuple[float, float]:
     """Sum ``r^4 / (r^4 + t^4)``, and its derivative by the logarithm of ``t^2``, negated."""
-    one, most = np.float32(1), np.float32(1e9)
-    fraction, square = np.float32(0), np.float32(0)
+    kind = squares.dtype.type
+    one, most = kind(1), kind(1e9)
+    fraction, square = kind(0), kind(0)
     for i in range(len(squares)):
         ratio = min(squares[i] * inverse, most)
         ratio *= ratio

@@ -98,10 +98,14 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
 
 
 def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
-    """Return lengths, 1 for zero vectors, and which vectors are not zero."""
+    """Return lengths, 1 for zero vectors, and which vectors are not zero.
+
+    So are vectors whose directions have no derivative in the dtype's range: of 3e-10 and less in
+    single precision.
+    """
     x, y, z = vector
     square = x * x + y * y + z * z
-    directed = square > 0
+    directed = square > torch.finfo(square.dtype).tiny ** 0.5
     # The root has no gradient at zero.
     return torch.where(directed, square, 1).sqrt(), directed
 

@@ -11,11 +11,14 @@ eliminated, as in :mod:`~pimper_torch.photometry.variable_projection`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from pimper_torch.kernels.arrays import ConeProblem, as_array
 from pimper_torch.photometry.bilinear import (
     Bilinear,
     Factors,
@@ -32,6 +35,7 @@ from pimper_torch.photometry.quadratics import (
     unpacked,
 )
 from pimper_torch.photometry.robust import Squares
+from pimper_torch.photometry.variable_projection import has_kernel
 from pimper_torch.records import Record
 
 
@@ -50,8 +54,20 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
         Lights, shading, weights and residuals at the optimum, with gradients, those through the
         robust weights and their scale included.
 
-    Checked against the solvers in ``test_factor_gradients.py``. The Hessian is in float64.
+    Checked against the solvers in ``test_factor_gradients.py``. The Hessian is in float64. Where
+    the solver is compiled, so are refinement and adjoint
+    (:mod:`~pimper_torch.kernels.factor_adjoint`), which is differentiable once.
     """
+    if has_kernel(problem.detach()):
+        prior = problem.prior
+        if prior is None:
+            prior = problem.radiance.new_zeros(len(problem.radiance), 10, problem.radiance.shape[2])
+        data = problem.radiance, problem.weight, problem.anchor, problem.regularization, prior
+        lights, shading, weight, residual = _Compiled.apply(  # type: ignore[no-untyped-call]
+            problem.detach(), factors, *data
+        )
+        convergence = factors.convergence.replace(residual=residual)
+        return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
     factors = _newton_refined(problem, factors)
     L, N = factors.lights.detach().double(), factors.shading.detach().double()
     hessian = _hessian(problem, L, N)
@@ -66,6 +82,62 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
         weight=robust_weights(problem, lights, shading),
         convergence=convergence.replace(residual=root_mean_square(problem, lights, shading)),
     )
+
+
+class _Compiled(torch.autograd.Function):
+    """Solution of a problem, as a function of its data, by the kernel and its adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401 - saved tensors and more
+        problem: Bilinear,
+        factors: Factors,
+        *data: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Refine the solution; return lights, shading, weights and residuals."""
+        from pimper_torch.kernels import factor_adjoint
+
+        lights, shading = (
+            each.detach().to(torch.float64, copy=True, memory_format=torch.contiguous_format)
+            for each in (factors.lights, factors.shading)
+        )
+        weight, residual = torch.zeros_like(data[0]), torch.zeros_like(data[0][:, 0, 0])
+        code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
+        assert code is not None  # the caller asks
+        ctx.loss = code, scale, stride
+        ctx.save_for_backward(lights, shading, *data)
+        factor_adjoint.refine(
+            ConeProblem(*map(as_array, data)),
+            code,
+            scale,
+            stride,
+            *(each.numpy() for each in (lights, shading, weight, residual)),
+        )
+        return lights.to(weight), shading.to(weight), weight, residual
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,  # noqa: ANN401
+        *cotangents: Tensor,
+    ) -> tuple[Tensor | None, ...]:
+        """Return gradients of the data."""
+        from pimper_torch.kernels import factor_adjoint
+
+        lights, shading, *data = ctx.saved_tensors
+        code, scale, stride = ctx.loss
+        found = [torch.zeros_like(each, memory_format=torch.contiguous_format) for each in data]
+        factor_adjoint.pull_back(
+            ConeProblem(*map(as_array, data)),
+            code,
+            scale,
+            stride,
+            as_array(lights),
+            as_array(shading),
+            factor_adjoint.Cotangents(*map(as_array, cotangents)),
+            factor_adjoint.DataGradients(*(each.numpy() for each in found)),
+        )
+        return None, None, *found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -220,8 +292,8 @@ def _hessian(
     diagonal = own.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
     eye = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
     # A sample without data does not move.
-    own = torch.where((diagonal > 0)[..., None, None], own, eye)
-    inverse = torch.linalg.inv_ex(own).inverse
+    moves = (diagonal > 0)[..., None, None]
+    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, own, eye)).inverse, 0)
     found = Hessian(
         lights=L,
         shading=N,

@@ -4,6 +4,7 @@ By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the 
 with Cauchy's loss; gradients by the implicit function theorem at the optimum.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,13 +14,16 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.kernels.twin_constants import MIN_DEVIATION
-from pimper_torch.linalg.implicit import implicit_solution, newton_solution
 from pimper_torch.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's
 # method converges to rounding (`tests/photometry/test_factor_gradients.py`).
 _MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
+
+# Newton's steps at most, the smallest fraction of one in the line search, and the step, over the
+# unknowns, that ends them: choices; near the solution every step doubles the correct digits.
+_NEWTON_STEPS, _MIN_STEP, _CLOSE = 12, 0.05, 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,90 +109,145 @@ def _minimize(
 def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
     """Make the fit differentiable in photographs and geometry, if gradients are required.
 
-    By the implicit function theorem, at the nearest stationary point. Light and albedo share a
-    free factor: the largest parameter of the lights is fixed, and so are parameters at a bound
-    or without data.
+    By the implicit function theorem, at the nearest stationary point: a Newton step from there, of
+    constant derivatives, has length zero and the gradient. Light and albedo share a free factor:
+    the largest parameter of the lights is fixed, and so are parameters at a bound or without data.
     """
     if not _requires_grad(found.model, samples):
         return found
-    model, count = found.model, found.lights.numel()
-    start = torch.cat([found.lights.flatten(), found.albedo])
-
-    def gradient(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        lights, albedo = at[:count].reshape(found.lights.shape), at[count:]
-        shading = model.shade(lights)
-        residual = samples.residual(albedo, shading)
-        weighted = samples.weights(residual, samples.scale(residual)) * residual
-        by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.jacobian(lights))
-        return torch.cat([by_lights.flatten(), (weighted * shading).sum(dim=1)])
-
+    model = found.model
     with torch.no_grad():
-        shading = model.shade(found.lights)
-        residual = samples.residual(found.albedo, shading)
-        weight = samples.weights(residual, samples.scale(residual))
-        by_lights = found.albedo[:, None, None] * model.jacobian(found.lights)
-        solve = _gauss_newton(shading, by_lights, weight)
-        observed = (weight * shading**2).sum(dim=1) > 0
-        fixed = ~torch.cat([model.inside_bounds(found.lights).flatten(), observed])
-        flat = found.lights.abs().flatten()
-        fixed[torch.where(fixed[:count], 0, flat).argmax()] = True
-
-    def equations(at: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        return torch.where(fixed, start - at, gradient(at))
-
-    def precondition(side: Float[Tensor, " unknown"]) -> Float[Tensor, " unknown"]:
-        inner = torch.where(fixed, 0, side)
-        lights, albedo = solve(inner[:count].reshape(found.lights.shape), inner[count:])
-        return -torch.where(fixed, side, torch.cat([lights.flatten(), albedo]))
-
-    solution = newton_solution(equations, start, precondition)
-    answer = implicit_solution(equations, solution, precondition)
+        fixed = ~model.inside_bounds(found.lights)
+        largest = torch.where(fixed, 0, found.lights.abs()).argmax()
+        fixed = fixed.flatten().index_fill(0, largest, value=True).reshape(fixed.shape)
+        lights, albedo, solve = found.lights, found.albedo, None
+        on_lights, on_albedo = _descent(model, samples, lights, albedo)
+        fraction = 1.0
+        for _ in range(_NEWTON_STEPS):
+            solve = solve or _newton_matrix(model, samples, lights, albedo, fixed)
+            by_lights, by_albedo = solve(on_lights, on_albedo)
+            trial = lights + fraction * by_lights, albedo + fraction * by_albedo
+            after = _descent(model, samples, *trial)
+            # In units of the unknowns, as bounds and missing data leave some of the gradient.
+            if _length(solve(*after)) < _length((by_lights, by_albedo)):
+                (lights, albedo), (on_lights, on_albedo) = trial, after
+                solve, fraction = None, min(1.0, 2 * fraction)
+                if _length((by_lights, by_albedo)) <= _CLOSE * _length((lights, albedo)):
+                    break
+            elif (fraction := fraction / 2) < _MIN_STEP:
+                break
+        solve = _newton_matrix(model, samples, lights, albedo, fixed)
+    by_lights, by_albedo = solve(*_descent(model, samples, lights, albedo))
     return LightFit(
         model=model,
-        lights=answer[:count].reshape(found.lights.shape),
-        albedo=answer[count:],
+        lights=lights + (by_lights - by_lights.detach()),
+        albedo=albedo + (by_albedo - by_albedo.detach()),
     )
 
 
-def _gauss_newton(
-    shading: Float[Tensor, "sample view"],
-    jacobian: Float[Tensor, "sample view parameter"],
-    weight: Float[Tensor, "sample view"],
-) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Factor Gauss-Newton's equations of lights and albedos, these eliminated (Schur).
+Unknowns = tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]
+
+
+def _length(step: Unknowns) -> float:
+    return math.hypot(*(float(part.norm()) for part in step))
+
+
+def _descent(
+    model: LightModel,
+    samples: ImageSamples,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+) -> Unknowns:
+    """Return minus half the gradient of the objective."""
+    shading = model.shade(lights)
+    residual = samples.residual(albedo, shading)
+    weighted = samples.weights(residual, samples.scale(residual)) * residual
+    by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.jacobian(lights))
+    return by_lights, (weighted * shading).sum(dim=1)
+
+
+def _newton_matrix(
+    model: LightModel,
+    samples: ImageSamples,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+    fixed: Bool[Tensor, "view parameter"],
+) -> Callable[[Tensor, Tensor], Unknowns]:
+    """Factor the exact derivative of :func:`_descent`, negative; albedos are eliminated (Schur).
+
+    Each view's scale depends on its residuals, which adds a matrix of a rank of one a view
+    (Woodbury's formula).
 
     Args:
-        shading: Radiance of albedo 1, which is the derivative by the albedos.
-        jacobian: The derivatives by the parameters of the lights.
+        fixed: Parameters that do not move.
 
     Returns:
-        The solution by right-hand sides of lights and albedos.
+        Newton's step by right-hand sides of lights and albedos, differentiable in these.
     """
-    damping = 1e-6  # the free factor of light and albedo makes them singular
-    _, num_views, size = jacobian.shape
-    heavy = weight[..., None] * jacobian
-    blocks = heavy.permute(1, 2, 0) @ jacobian.transpose(0, 1)
-    diagonal = blocks.diagonal(dim1=1, dim2=2)
-    # A view without data keeps its light: a unit block and a zero right-hand side. So does a
-    # parameter without data.
-    floor = 1e-9 * diagonal.sum(dim=1, keepdim=True)
-    floor = torch.where(floor > 0, floor, 1)
-    damped = blocks + torch.diag_embed(damping * diagonal + floor)
-    own_block = (weight * shading**2).sum(dim=1) * (1 + damping)
-    inverse = torch.where(own_block > 0, 1 / torch.where(own_block > 0, own_block, 1), 0)
-    cross = (heavy * shading[..., None]).flatten(1)
-    view = torch.arange(num_views, device=jacobian.device)
-    blocks_of_views = damped.new_zeros(num_views, size, num_views, size)
-    blocks_of_views[view, :, view, :] = damped
-    schur = blocks_of_views.reshape(size * num_views, -1) - cross.mT @ (inverse[:, None] * cross)
+    num_views, size = lights.shape
+    shading, jacobian = model.shade(lights), model.jacobian(lights)
+    residual = samples.residual(albedo, shading)
+    with torch.enable_grad():
+        at = residual.detach().requires_grad_()
+        scale = samples.scale(at)
+        by_residual = torch.zeros_like(at)
+        if scale.requires_grad:
+            (by_residual,) = torch.autograd.grad(scale.sum(), at)
+    weight, scale = samples.weights(residual, scale.detach()), scale.detach()
+    weighted, bend = weight * residual, weight * (2 * weight - 1)
+    slope = albedo[:, None, None] * jacobian
+    blocks = (bend[..., None] * slope).permute(1, 2, 0) @ slope.transpose(0, 1)
+    blocks = blocks - _second_derivatives(model, lights, weighted * albedo[:, None])
+    own = (bend * shading**2).sum(dim=1)
+    cross = ((bend * shading)[..., None] * slope - weighted[..., None] * jacobian).flatten(1)
+    # A weight depends on the residual over the scale alone.
+    by_scale = (weighted - bend * residual) / torch.where(scale > 0, scale, 1)
+    sides = []
+    for field in (by_scale, by_residual):
+        on_view = torch.einsum("sv,svp->vp", field, slope)
+        by_view = torch.diag_embed(on_view.mT).movedim(0, 1)
+        sides.append((by_view.flatten(0, 1), field * shading))
+    known = (bend * shading.square()).abs().sum(dim=1)
+    free = ~fixed & (blocks.diagonal(dim1=1, dim2=2).abs() > 0)
+    moves, samples_move = free.flatten()[:, None], (own > 1e-9 * known)[:, None]
+    cross = torch.where(samples_move & moves.mT, cross, 0)
+    inverse = torch.where(samples_move[:, 0], 1 / torch.where(samples_move[:, 0], own, 1), 0)
+    whole = blocks.new_zeros(num_views, size, num_views, size)
+    whole[torch.arange(num_views), :, torch.arange(num_views)] = blocks
+    schur = whole.flatten(2).flatten(0, 1) - cross.mT @ (inverse[:, None] * cross)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
-    factor = torch.linalg.lu_factor(schur + ridge)
+    schur = torch.where(moves & moves.mT, schur + ridge, torch.eye(len(schur)).to(schur))
+    factor = torch.linalg.lu_factor(schur)
 
-    def solve(
-        on_lights: Float[Tensor, "view parameter"], on_albedo: Float[Tensor, " sample"]
-    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
-        rhs = on_lights.flatten() - cross.mT @ (inverse * on_albedo)
-        step = torch.linalg.lu_solve(*factor, rhs[:, None])[:, 0]
-        return step.reshape(on_lights.shape), inverse * (on_albedo - cross @ step)
+    def apply(on_lights: Tensor, on_albedo: Tensor) -> tuple[Tensor, Tensor]:
+        on_lights, on_albedo = torch.where(moves, on_lights, 0), inverse[:, None] * on_albedo
+        step = torch.linalg.lu_solve(*factor, on_lights - cross.mT @ on_albedo)
+        return step, on_albedo - inverse[:, None] * (cross @ step)
+
+    (q_lights, q_albedo), (p_lights, p_albedo) = sides
+    y_lights, y_albedo = apply(q_lights, q_albedo)
+    p_lights, p_albedo = torch.where(moves, p_lights, 0), torch.where(samples_move, p_albedo, 0)
+    small = torch.eye(num_views).to(schur) + p_lights.mT @ y_lights + p_albedo.mT @ y_albedo
+
+    def solve(on_lights: Tensor, on_albedo: Tensor) -> Unknowns:
+        step, others = apply(on_lights.reshape(-1, 1), on_albedo[:, None])
+        factors = torch.linalg.solve(small, p_lights.mT @ step + p_albedo.mT @ others)
+        step, others = step - y_lights @ factors, others - y_albedo @ factors
+        return step.reshape(num_views, size), others[:, 0]
 
     return solve
+
+
+def _second_derivatives(
+    model: LightModel,
+    lights: Float[Tensor, "view parameter"],
+    weight: Float[Tensor, "sample view"],
+) -> Float[Tensor, "view parameter parameter"]:
+    """Sum the second derivatives of the samples' shading, by each view's parameters."""
+    if model.normals is None:
+        return lights.new_zeros(*lights.shape, lights.shape[1])
+    with torch.enable_grad():
+        at = lights.detach().requires_grad_()
+        summed = torch.einsum("sv,svp->pv", weight, model.jacobian(at)).sum(dim=1)
+        rows = [torch.autograd.grad(each, at, retain_graph=True)[0] for each in summed]
+    return torch.stack(rows, dim=1)

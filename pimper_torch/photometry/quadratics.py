@@ -45,14 +45,13 @@ def apply_packed(
     packed: Float[Tensor, "*batch packed item"], vectors: Float[Tensor, "*batch size item"]
 ) -> Float[Tensor, "*batch size item"]:
     """Multiply each packed matrix with its vector."""
-    size = vectors.shape[-2]
-    rows, columns = _triangle(size)
-    total = [torch.zeros_like(vectors[..., 0, :] * packed[..., 0, :]) for _ in range(size)]
-    for slot, (row, column) in enumerate(zip(rows, columns, strict=True)):
-        entry = packed[..., slot, :]
-        total[row] = torch.addcmul(total[row], entry, vectors[..., column, :])
+    entries, parts = packed.unbind(dim=-2), vectors.unbind(dim=-2)
+    rows, columns = _triangle(len(parts))
+    total = [torch.zeros_like(parts[0] * entries[0])] * len(parts)
+    for entry, row, column in zip(entries, rows, columns, strict=True):
+        total[row] = torch.addcmul(total[row], entry, parts[column])
         if row != column:
-            total[column] = torch.addcmul(total[column], entry, vectors[..., row, :])
+            total[column] = torch.addcmul(total[column], entry, parts[row])
     return torch.stack(total, dim=-2)
 
 
@@ -78,8 +77,8 @@ def combination(
 ) -> Float[Tensor, "*batch size item"]:
     """Return ``B c`` for matrices ``B`` given by their columns."""
     total = torch.zeros_like(columns[0])
-    for slot, column in enumerate(columns):
-        total = total + column * weights[..., slot : slot + 1, :]
+    for column, weight in zip(columns, weights.unbind(dim=-2), strict=True):
+        total = total + column * weight[..., None, :]
     return total
 
 
@@ -105,18 +104,20 @@ def solve_packed(
 class PackedCholesky:
     """Factors ``A = C C^T`` of many small symmetric positive matrices, in float64.
 
-    Pivots below 1e-12 of the matrix's trace are raised to that, so that solutions of singular
-    systems stay finite; a zero matrix gives zero for a zero right-hand side. Differentiable.
+    Pivots below rounding of the matrix's trace are raised to that, 1e-12 of it in float64, so that
+    solutions of singular systems stay finite. A zero matrix, or one whose trace underflows, is
+    taken for the identity. Differentiable.
     """
 
     def __init__(self, packed: Float[Tensor, "*batch packed item"], size: int) -> None:
         rows, columns = _triangle(size)
         entries = {
-            (column, row): packed[..., slot, :].double()
-            for slot, (row, column) in enumerate(zip(rows, columns, strict=True))
+            (column, row): entry.double()
+            for entry, row, column in zip(packed.unbind(dim=-2), rows, columns, strict=True)
         }
-        trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0)
-        floor = (1e-12 * trace.detach()).clamp_min(torch.finfo(torch.float64).tiny ** 0.5)
+        trace = torch.stack([entries[i, i] for i in range(size)]).sum(dim=0).detach()
+        kind = torch.finfo(packed.dtype)
+        floor = torch.where(trace > kind.tiny / kind.eps, max(1e-12, kind.eps) * trace, 1)
         self._size, self._lower = size, dict[tuple[int, int], Tensor]()
         lower = self._lower
         for i in range(size):

@@ -175,10 +175,13 @@ def _information(
         unit[:, angle] = 1
         robust_deviation = robust_deviation + solve_packed(curvature, unit)[:, angle]
     albedo, _ = problem.manifold.split(factors.shading.mT)
-    determined = (albedo > 0) & (robust_deviation > 0) & variance.isfinite()
-    error = (
-        torch.where(determined, variance * robust_deviation, 1)
-        / torch.where(determined, albedo, 1) ** 2
+    square = albedo**2
+    # Beyond these the derivative is not in the dtype's range.
+    kind = torch.finfo(square.dtype)
+    error = variance * robust_deviation / square
+    determined = (robust_deviation > 0) & (square > kind.tiny**0.5) & (error < kind.max**0.5)
+    error = torch.where(determined, variance * robust_deviation, 1) / torch.where(
+        determined, square, 1
     )
     # Without residuals a normal is known to single precision.
     return torch.where(determined, 1 / error.clamp_min(1e-7**2), 0)

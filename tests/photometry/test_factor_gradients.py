@@ -10,7 +10,7 @@ from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.quadratics import outer
-from pimper_torch.photometry.robust import Cauchy, Squares
+from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import Free
 
@@ -104,6 +104,38 @@ def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generato
     for check in check_derivatives(answer, inputs, generator, directions=1).values():
         assert check.smooth.all()
         assert check.spread < 1e-4
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+@pytest.mark.parametrize("loss", [Squares(), Cauchy(), GemanMcClure(), Huber()])
+def test_the_compiled_adjoint_is_that_of_the_reference(noisy, generator, loss, stride):
+    single = noisy(Cone(), loss, samples=40).replace(stride=stride)
+    weight = single.weight.clone()
+    weight[:, 3], weight[:, :, 5] = 0, 0  # a view and a sample without data
+    single = single.replace(weight=weight, radiance=weight * single.radiance).to(torch.float32)
+    start = solved(single.to(torch.float64))
+    names = "radiance", "weight", "anchor", "regularization", "prior"
+    outputs, slopes = [], []
+    for given in (single, single.to(torch.float64)):
+        leaves = {name: getattr(given, name).clone().requires_grad_() for name in names}
+        found = differentiable(given.replace(**leaves), start.to(given.radiance.dtype))
+        parts = found.lights, found.shading, found.weight, found.convergence.residual
+        probes = torch.Generator().manual_seed(5)
+        total = sum(
+            (torch.randn(part.shape, generator=probes, dtype=torch.float64) * part).sum()
+            for part in parts
+        )
+        outputs.append(parts)
+        slopes.append(torch.autograd.grad(total, leaves.values()))
+    counts = (weight > 0).any(dim=1)[:, None]
+    for one, other in zip(*outputs, strict=True):
+        some = counts if one.ndim == 3 and one.shape[2] == 40 else torch.ones(())
+        # Rounding of float32, as what both return is of that type.
+        assert_close(some * one.double(), some * other, rtol=0, atol=1e-5)
+    for name, one, other in zip(names, *slopes, strict=True):
+        some = {"weight": weight > 0, "prior": counts}.get(name, torch.ones(()))
+        expected = some * other
+        assert_close(some * one.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
 def test_a_solution_that_stopped_early_is_taken_to_rest(noisy):

@@ -64,3 +64,38 @@ def solve_damped(matrix: Doubles, ridge: float, rhs: Doubles, factor: Doubles) -
 def _subtract(target: Doubles, row: Doubles, by: float, first: int) -> None:
     for j in range(first, len(row)):
         target[j] -= by * row[j]
+
+
+@compiled(fast=True)
+def eliminate(matrix: Doubles, rhs: Doubles) -> bool:
+    """Solve ``matrix x = rhs`` by elimination with partial pivoting; both are overwritten.
+
+    Args:
+        rhs: Becomes the solution, a column each.
+
+    Returns:
+        Whether the matrix is regular; if not, ``rhs`` is undefined.
+    """
+    size, columns = rhs.shape
+    for i in range(size):
+        pivot = i
+        for r in range(i + 1, size):
+            if abs(matrix[r, i]) > abs(matrix[pivot, i]):
+                pivot = r
+        if not abs(matrix[pivot, i]) > 0:
+            return False
+        for j in range(i, size):
+            matrix[i, j], matrix[pivot, j] = matrix[pivot, j], matrix[i, j]
+        for j in range(columns):
+            rhs[i, j], rhs[pivot, j] = rhs[pivot, j], rhs[i, j]
+        for r in range(i + 1, size):
+            factor = matrix[r, i] / matrix[i, i]
+            if factor != 0:
+                _subtract(matrix[r], matrix[i], factor, i + 1)
+                _subtract(rhs[r], rhs[i], factor, 0)
+    for i in range(size - 1, -1, -1):
+        for r in range(i + 1, size):
+            _subtract(rhs[i], rhs[r], matrix[i, r], 0)
+        for j in range(columns):
+            rhs[i, j] /= matrix[i, i]
+    return True

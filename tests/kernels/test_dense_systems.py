@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.kernels.cholesky import solve_damped
+from pimper_torch.kernels.dense_systems import eliminate, solve_damped
 
 
 def test_damped_systems_are_solved_as_lapack_solves_them():
@@ -26,3 +26,15 @@ def test_matrices_that_are_not_positive_are_told():
     assert solve_damped(matrix.numpy(), 1.5, side.clone().numpy(), space.numpy())
     matrix[2, 2] = torch.nan
     assert not solve_damped(matrix.numpy(), 1.5, side.clone().numpy(), space.numpy())
+
+
+def test_elimination_pivots_and_finds_singular_matrices():
+    generator = torch.Generator().manual_seed(3)
+    matrix = torch.randn(12, 12, generator=generator, dtype=torch.float64)
+    matrix[0, 0] = 0
+    sides = torch.randn(12, 2, generator=generator, dtype=torch.float64)
+    found, space = sides.clone(), matrix.clone()
+    assert eliminate(space.numpy(), found.numpy())
+    assert_close(matrix @ found, sides)
+    matrix[7] = 0
+    assert not eliminate(matrix.numpy(), sides.numpy())
