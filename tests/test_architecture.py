@@ -197,7 +197,7 @@ CHANGELOG = ROOT / "CHANGELOG.md"
 def test_the_newest_heading_of_the_changelog_is_the_version():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     headings = re.findall(r"^## (.+)$", CHANGELOG.read_text(), flags=re.MULTILINE)
-    version, _, day = headings[0].partition(" - ")
+    version, _, day = next(one for one in headings if one != "Unreleased").partition(" - ")
     assert version == f"[{project['version']}]"
     assert date.fromisoformat(day)
 

@@ -250,11 +250,14 @@ def _fit_room(
     slope = basis[:, 1:] * albedo[:, None]
     own = (weight * shading**2).sum(dim=1).clamp_min(1e-300)
     cross = slope * ((weight * shading) @ ambient)[:, None]
-    matrix = slope.mT @ (slope * (weight @ ambient**2)[:, None]) - cross.mT @ (cross / own[:, None])
+    whole = slope.mT @ (slope * (weight @ ambient**2)[:, None])
+    matrix = whole - cross.mT @ (cross / own[:, None])
     side = slope.mT @ ((weight * residual) @ ambient)
     side = side - cross.mT @ ((weight * residual * shading).sum(dim=1) / own)
-    floor = 1e-6 * matrix.diagonal().mean().clamp_min(1e-300)
-    step = torch.linalg.solve(matrix + floor * torch.eye(8).to(matrix), side)
+    # Under one light for all views the albedo explains the room, and the matrix is rounding alone:
+    # 1e-16 of what was subtracted.
+    floor = torch.maximum(1e-6 * matrix.diagonal().mean(), 1e-12 * whole.diagonal().mean())
+    step = torch.linalg.solve(matrix + floor.clamp_min(1e-300) * torch.eye(8).to(matrix), side)
     return room + pad(step, (1, 0))
 
 

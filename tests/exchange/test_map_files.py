@@ -61,5 +61,6 @@ def test_sixteen_bits_of_a_normal_tell_it_to_half_a_level(result, tmp_path):
     maps = view_maps(result.mesh, result.scene.cameras, 1)
     found = (2 * png.samples - 1).movedim(0, -1)[maps.seen]
     expected = torch.from_numpy(with_axes(maps.normals_cam, "opengl"))[maps.seen]
-    assert_close(found, expected, rtol=0, atol=1.01 / 65535)
+    # Half a level of 65,535 for two units, and float32's rounding on the way there and back.
+    assert_close(found, expected, rtol=0, atol=1.02 / 65535)
     assert (png.samples[:, ~maps.seen] == 0).all()

@@ -31,7 +31,9 @@ def test_every_system_of_a_batch_is_solved(systems):
     found, steps, converged = solve(*systems)
     assert converged
     assert 0 < steps < 200
-    assert_close(found, torch.linalg.solve(*systems), rtol=1e-9, atol=0)
+    exact = torch.linalg.solve(*systems)
+    # Of each system's own size; the second one's solution is zero.
+    assert ((found - exact).norm(dim=1) <= 1e-9 * exact.norm(dim=1)).all()
 
 
 def test_the_exact_preconditioner_takes_one_step(systems):

@@ -4,8 +4,10 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.geometry.rigid import rigid, rotate
-from pimper_torch.photometry.light_field import harmonics, rotate_lights
-from pimper_torch.photometry.lights import fit_light_field
+from pimper_torch.photometry.light_field import harmonics, rotate_lights, second_harmonics
+from pimper_torch.photometry.light_fit import LightFit
+from pimper_torch.photometry.light_models import ImageSamples, LightModel
+from pimper_torch.photometry.lights import _fit_room, fit_light_field
 
 
 def data(generator, samples=800, views=9):
@@ -49,6 +51,20 @@ def test_a_view_without_samples_has_no_light_and_disturbs_none(generator):
     assert (found[3] == 0).all()
     scale = lights[others].norm(dim=1).median()
     assert_close(found[others], lights[others] / scale, rtol=1e-5, atol=1e-5)
+
+
+def test_one_light_for_all_views_leaves_the_room_to_the_albedo(generator):
+    _, n, _, rho = data(generator)
+    model = LightModel(basis=harmonics(n)[:, :1], normals=n, points=n)
+    lights = torch.tensor([0.6, 0.1, 0.2, -0.8, 0.0]).double().expand(9, 5)
+    J = rho[:, None] * model.shade(lights)
+    J = J + 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
+    samples = ImageSamples(radiance=J, seen=torch.ones_like(J) > 0)
+    basis = torch.cat([harmonics(n), second_harmonics(n)], dim=1)
+    room = torch.eye(9, dtype=torch.float64)[:1]
+    found = _fit_room(LightFit(model=model, lights=lights, albedo=rho), samples, basis, room)
+    # Both sides of its equations are zero but for rounding, whose quotient is of any size.
+    assert_close(found, room, rtol=0, atol=1e-3)
 
 
 def test_shading_is_the_same_in_every_frame(generator):

@@ -56,7 +56,8 @@ def test_every_kind_of_file_holds_the_same_mask(views, tmp_path, name, write, er
     assert prior.names == ("b.jpg",)
     assert prior.sizes_px.tolist() == [[24, 16]]
     assert not prior.undistorted
-    assert (prior.inside[0] - torch.from_numpy(SOFT)).abs().max() <= error
+    off = (prior.inside[0] - torch.from_numpy(SOFT)).abs().max()
+    assert off <= error + 1e-6  # float32
 
 
 def test_labels_and_what_is_not_known(views, tmp_path):

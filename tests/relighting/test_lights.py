@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -118,4 +120,6 @@ def test_cast_shadows_tell_a_light_that_shading_leaves_open(ball_over_table):
     picture = predict(ball_over_table, camera, light).nan_to_num(0)
     scene = scene_of(picture.movedim(-1, 0)[None], camera.intrinsics, camera.cam_from_world)
     found = fit_lights(ball_over_table, scene)
-    assert angles_deg(found.direction_world, direction).max() < 0.5
+    # A pixel of the table is 0.036 wide or more, and the ball's centre 1.4 from its shadow.
+    half_a_pixel_deg = math.degrees(0.018 / 1.4)
+    assert angles_deg(found.direction_world, direction).max() < half_a_pixel_deg

@@ -97,7 +97,8 @@ def test_the_two_largest_products_within_the_distance_are_found(generator, lengt
         assert (best >= 0).sum() > 0.8 * len(best)  # most have some that are near
         assert (largest[:, 1] >= 0).sum() > 0.5 * len(best)
         assert torch.equal(alike[1], best)
-        torch.testing.assert_close(alike[0], largest, rtol=0, atol=1e-6)  # float32
+        # Float32 sums of up to 128 products, of size one in all, in another order.
+        torch.testing.assert_close(alike[0], largest, rtol=0, atol=length * 6e-8)
 
 
 def test_features_without_any_near_do_not_match():
@@ -141,7 +142,7 @@ def matched():
             )
         with quiet(), pycolmap.Database.open(space.database) as stored:
             theirs, again = inliers(stored), stored.read_two_view_geometry(1, 2)
-    assert np.allclose(geometry.F, again.F, atol=0)
+    assert np.allclose(geometry.F, again.F, atol=1e-9 * abs(geometry.F).max())
     return plain, theirs, ours
 
 

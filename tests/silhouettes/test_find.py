@@ -146,7 +146,8 @@ def test_masks_that_contradict_the_others_are_not_believed(staged, kind, views):
     assert used is not None
     for view in range(12):
         if view in views:  # what the others leave: the ball, and a little where an arc ends
-            assert (used[view] | ~staged.truth[view]).float().mean() > 0.999
+            # 86 pixels may be missing, a fifth of the contour's.
+            assert (used[view] | ~staged.truth[view]).float().mean() > 0.998
             assert overlap(used[view][None], staged.truth[view][None]) > 0.85
         else:
             assert torch.equal(used[view], staged.truth[view])

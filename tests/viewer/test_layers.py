@@ -33,7 +33,7 @@ def test_a_mesh_has_the_layers_that_it_carries(ball):
 def test_every_layer_gives_colours_and_says_what_they_mean(ball, name):
     layer = painted(ball, name, frame_of_mesh(ball))
     assert layer.colors.shape == ball.vertices_world.shape
-    assert 0 <= float(layer.colors.min()) <= float(layer.colors.max()) <= 1
+    assert 0 <= float(layer.colors.min()) <= float(layer.colors.max()) <= 1 + 1e-6
     assert layer.lit == (name in ("lit", "shape"))
     assert layer.legend
 

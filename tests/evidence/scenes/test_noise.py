@@ -19,8 +19,8 @@ def test_speckle_is_a_function_of_the_position_alone_and_within_its_limits(gener
     points = 6 * torch.rand(5000, 3, generator=generator) - 3
     albedo = speckle(points)
     assert albedo.shape == (5000, 3)
-    assert albedo.min() >= 0.2
-    assert albedo.max() <= 0.7
+    assert albedo.min() >= 0.2 - 1e-6  # float32
+    assert albedo.max() <= 0.7 + 1e-6
     assert albedo.std() > 0.1
     assert_close(speckle(points[1234:1240]), albedo[1234:1240])
 

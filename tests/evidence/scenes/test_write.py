@@ -120,7 +120,8 @@ def test_lights_in_the_file_predict_what_the_photographs_show(rendering):
         # Near light falls off, and first order is exact at the target only.
         ratio = found / predicted
         assert 0.7 < ratio.median() < 1.4
-        assert torch.corrcoef(torch.stack([found, predicted]))[0, 1] > 0.9
+        # 0.74 at most with the light of another view.
+        assert torch.corrcoef(torch.stack([found, predicted]))[0, 1] > 0.85
 
 
 @pytest.mark.slow
