@@ -5,8 +5,10 @@ Pyramids are rows of pixels (see ``patches.sources``), the finest level in an ar
 """
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pimper_torch.kernels.arrays import (
     Floats5,
@@ -20,6 +22,33 @@ from pimper_torch.kernels.arrays import (
 )
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
+
+Array = NDArray[Any]
+
+
+@compiled()
+def project(m: Array, samples: Samples, patch: int, pixels: Array) -> None:
+    """Compute the pixels of a template's samples in a view: right and down."""
+    origin, spacing, depth, _ = samples
+    for row in range(pixels.shape[0]):
+        y = origin[patch, 1] + spacing[patch] * row
+        for column in range(pixels.shape[1]):
+            x = origin[patch, 0] + spacing[patch] * column
+            z = depth[patch, row, column]
+            z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            inverse_z = 1 / z_cam if z_cam != 0 else 1.0
+            pixels[row, column, 0] = inverse_z * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3])
+            pixels[row, column, 1] = inverse_z * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3])
+
+
+@compiled()
+def neighbours(index: int, count: int) -> tuple[int, int]:
+    """Return two samples next to each other; their difference is the forward one.
+
+    The last difference is repeated, and zero for a single sample.
+    """
+    first = max(0, min(index, count - 2))
+    return first, min(first + 1, count - 1)
 
 
 @compiled(annotated=True)
@@ -81,29 +110,14 @@ def register(
                 radiance[patch, view] = 0
                 valid[patch, view] = False
                 continue
+            project(m, samples, patch, pixels)
             for row in range(height):
-                y = origin[patch, 1] + spacing[patch] * row
-                for column in range(width):
-                    x = origin[patch, 0] + spacing[patch] * column
-                    z = depth[patch, row, column]
-                    z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                    inverse_z = 1 / z_cam if z_cam != 0 else 1.0
-                    pixels[row, column, 0] = inverse_z * (
-                        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-                    )
-                    pixels[row, column, 1] = inverse_z * (
-                        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-                    )
-            for row in range(height):
-                # Forward differences; the last one is repeated, and zero for a single sample.
-                above = max(0, min(row, height - 2))
-                below = min(above + 1, height - 1)
+                above, below = neighbours(row, height)
                 for column in range(width):
                     usable = False
                     if visible[row, column]:
                         u, v = pixels[row, column, 0], pixels[row, column, 1]
-                        left = max(0, min(column, width - 2))
-                        right = min(left + 1, width - 1)
+                        left, right = neighbours(column, width)
                         du_column = pixels[row, right, 0] - pixels[row, left, 0]
                         dv_column = pixels[row, right, 1] - pixels[row, left, 1]
                         du_row = pixels[below, column, 0] - pixels[above, column, 0]

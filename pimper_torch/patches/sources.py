@@ -210,6 +210,17 @@ class PriorMaps(Record):
         return own.replace(intrinsics=zoom[:, :, None] * own.intrinsics, sizes_px=self.sizes_px)
 
 
+def image_from_patch(
+    cameras: Cameras, patch_from_world: Float[Tensor, "patch 4 4"]
+) -> Float[Tensor, "patch view 3 4"]:
+    """Return the projections of patches into views, in float64; differentiable."""
+    exact = cameras.to(torch.float64)
+    # The last row is a constant, not a parameter.
+    intrinsics = torch.cat([exact.intrinsics[:, :2], exact.intrinsics[:, 2:].detach()], dim=1)
+    image_from_world = intrinsics @ exact.cam_from_world[:, :3]
+    return image_from_world @ invert_rigid(patch_from_world.double())[:, None]
+
+
 def kernel_geometry(
     cameras: Cameras,
     rows: Int[Tensor, " view"],
@@ -222,13 +233,11 @@ def kernel_geometry(
         rows: Where each camera's photograph is among the sources.
         outward: Unit normals of the samples, patch frame.
     """
-    patch_from_world = templates.patch_from_world.double()
-    exact = cameras.to(torch.float64)
-    image_from_world = exact.intrinsics @ exact.cam_from_world[:, :3]
-    image_from_patch = image_from_world @ invert_rigid(patch_from_world)[:, None]
-    centers = transform(patch_from_world, exact.centers_world)
+    centers = cameras.centers_world.to(torch.float64)
     projection = Projection(
-        as_array(rows), as_array(image_from_patch.flatten(0, 1)), as_array(centers.flatten(0, 1))
+        as_array(rows),
+        as_array(image_from_patch(cameras, templates.patch_from_world).flatten(0, 1)),
+        as_array(transform(templates.patch_from_world.double(), centers).flatten(0, 1)),
     )
     samples = Samples(
         as_array(templates.origin, torch.float64),

@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.config import Range, require, require_ranges
@@ -23,6 +24,7 @@ from pimper_torch.patches.sources import (
     LEVELS,
     PriorMaps,
     Sources,
+    image_from_patch,
     kernel_geometry,
     look_up,
     prepare,
@@ -52,35 +54,99 @@ def resampled(
 ) -> Observations:
     """Resample views on a bucket of templates, without occlusion.
 
-    Pixels are computed in float64; images are looked up in float32.
+    Pixels are computed in float64; images are looked up in float32. Differentiable once.
 
     Args:
         rows: Where each camera's photograph is among the sources.
         min_facing: Cosine of the steepest angle between a normal and the way to the camera.
         dark_level: Radiance at or below which a sample is missing.
     """
-    from pimper_torch.kernels import resampling
-
     outward = templates.normals_patch
     if outward is None:
         outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
-    shape = len(templates.facet), cameras.num_views
-    height, width = templates.depth.shape[1:]
-    radiance = torch.empty(*shape, sources.images.finest.shape[1], height, width)
-    valid = torch.empty(*shape, height, width, dtype=torch.bool)
-    resampling.register(
-        sources.images.pictures,
-        sources.unusable.fractions,
-        as_array(sources.images.table),
-        *kernel_geometry(cameras, rows, templates, outward),
-        as_array(cameras.sizes_px),
-        as_array(templates.inside),
-        min_facing,
-        dark_level,
-        as_array(radiance),
-        as_array(valid),
+    images, projection = sources.images, image_from_patch(cameras, templates.patch_from_world)
+    inputs = images.finest, images.coarser, projection, templates.origin, templates.spacing
+    geometry = kernel_geometry(cameras, rows, templates, outward)
+    call = images.pictures, as_array(images.table), *geometry
+    limits = as_array(cameras.sizes_px), as_array(templates.inside), min_facing, dark_level
+    radiance, valid = _Resampled.apply(  # type: ignore[no-untyped-call]
+        call, (sources.unusable.fractions, *limits), *inputs, templates.depth
     )
     return Observations(radiance=radiance, valid=valid)
+
+
+class _Resampled(torch.autograd.Function):
+    """Samples as a function of pictures and geometry, by a kernel and its adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
+        call: tuple[Any, ...],
+        given: tuple[Any, ...],
+        *inputs: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the samples, and which of them are valid."""
+        from pimper_torch.kernels import resampling
+
+        finest, depth, (num_patches, num_views) = inputs[0], inputs[5], inputs[2].shape[:2]
+        radiance = torch.empty(num_patches, num_views, finest.shape[1], *depth.shape[1:])
+        valid = torch.empty(num_patches, num_views, *depth.shape[1:], dtype=torch.bool)
+        pictures, levels, projection, samples = call
+        unusable, sizes_px, inside, min_facing, dark_level = given
+        resampling.register(
+            pictures,
+            unusable,
+            levels,
+            projection,
+            samples,
+            sizes_px,
+            inside,
+            min_facing,
+            dark_level,
+            as_array(radiance),
+            as_array(valid),
+        )
+        ctx.call = call
+        ctx.save_for_backward(valid, *inputs)
+        ctx.mark_non_differentiable(valid)
+        return radiance, valid
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,  # noqa: ANN401
+        on_radiance: Tensor,
+        _: Tensor,
+    ) -> tuple[Tensor | None, ...]:
+        """Return gradients of pictures and geometry."""
+        from pimper_torch.kernels import resampling_adjoint
+
+        valid, *inputs = ctx.saved_tensors
+        # Pictures take memory: they have no gradient where none is asked for.
+        of_pictures = any(ctx.needs_input_grad[2:4])
+        shapes = [(1, 1)] * 2 if not of_pictures else [each.shape for each in inputs[:2]]
+        kinds = [torch.float32] * 2 + [torch.float64] * 3 + [torch.float32]
+        shapes += [each.shape for each in inputs[2:]]
+        found = [torch.zeros(shape, dtype=kind) for shape, kind in zip(shapes, kinds, strict=True)]
+        finest, coarser, projection, *others = found
+        pictures, levels, placed, samples = ctx.call
+        resampling_adjoint.pull_back(
+            pictures,
+            levels,
+            placed,
+            samples,
+            as_array(valid),
+            as_array(on_radiance),
+            int(of_pictures),
+            resampling_adjoint.ViewGradients(
+                as_array(finest.flatten(1)),
+                as_array(coarser),
+                as_array(projection.flatten(0, 1)),
+                *map(as_array, others),
+            ),
+        )
+        given = [one.to(each) for one, each in zip(found, inputs, strict=True)]
+        return None, None, *(given if of_pictures else [None, None, *given[2:]])
 
 
 def occluded(
@@ -260,16 +326,7 @@ class Warp(Stage):
     ) -> Observations:
         """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
         images = sources.images.finest
-        fast = images.dtype == torch.float32 and compiled_for(
-            images,
-            cameras.cam_from_world,
-            cameras.intrinsics,
-            templates.depth,
-            templates.patch_from_world,
-            templates.origin,
-            templates.spacing,
-        )
-        if fast:
+        if images.dtype == torch.float32 and compiled_for(images.detach()):
             steepest = math.cos(math.radians(self.config.max_tilt_deg))
             return resampled(cameras, sources, templates, rows, steepest, dark_level)
         return self._reference(cameras, sources, rows, templates, dark_level)

@@ -1,6 +1,7 @@
 """Averages over small windows that stop at the edges of a patch."""
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -29,12 +30,35 @@ def window_mean(
     heavy = torch.cat([values * weight[:, None], weight[:, None]], dim=1)
     count, channels, height, width = heavy.shape
     flat = heavy.reshape(count * channels, 1, height, width)
-    flat = conv2d(flat, kernel.reshape(1, 1, -1, 1), padding=(reach, 0))
-    flat = conv2d(flat, kernel.reshape(1, 1, 1, -1), padding=(0, reach))
-    summed = flat.reshape(count, channels, height, width)
+    blurred: Tensor = _Blurred.apply(flat, kernel)  # type: ignore[no-untyped-call]
+    summed = blurred.reshape(count, channels, height, width)
     total = summed[:, -1:]
     some = total > torch.finfo(total.dtype).eps
     return torch.where(some, summed[:, :-1] / torch.where(some, total, 1), 0)
+
+
+class _Blurred(torch.autograd.Function):
+    """Sums over a window that is symmetric: their own adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
+        flat: Float[Tensor, "item 1 height width"],
+        kernel: Float[Tensor, " tap"],
+    ) -> Float[Tensor, "item 1 height width"]:
+        """Sum along columns, then along rows."""
+        ctx.save_for_backward(kernel)
+        reach = len(kernel) // 2
+        flat = conv2d(flat, kernel.reshape(1, 1, -1, 1), padding=(reach, 0))
+        return conv2d(flat, kernel.reshape(1, 1, 1, -1), padding=(0, reach))
+
+    @staticmethod
+    def backward(
+        ctx: Any,  # noqa: ANN401
+        upstream: Float[Tensor, "item 1 height width"],
+    ) -> tuple[Float[Tensor, "item 1 height width"], None]:
+        """Sum the gradients in the same way."""
+        return _Blurred.apply(upstream, *ctx.saved_tensors), None  # type: ignore[no-untyped-call]
 
 
 def window_size(radius: float) -> float:

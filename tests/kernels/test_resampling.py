@@ -80,6 +80,42 @@ def test_views_are_resampled_as_in_torch(photographed, finer):
         assert_close(one.radiance, other.radiance, rtol=0, atol=2e-6)
 
 
+def test_the_adjoint_of_resampling_is_that_of_torch(photographed):
+    views, cameras, lifted = photographed
+    patches = waved(lifted.seen.patches)
+    names = "depth", "spacing", "origin", "patch_from_world"
+    slopes = []
+    for how in ("numba", "torch"):
+        images, poses, intrinsics = (
+            each.clone().requires_grad_()
+            for each in (views.images, cameras.cam_from_world, cameras.intrinsics)
+        )
+        moved = [
+            bucket.replace(
+                **{name: getattr(bucket, name).clone().requires_grad_() for name in names}
+            )
+            for bucket in patches.buckets
+        ]
+        with using(how):
+            seen = Warp(WarpConfig(max_tilt_deg=60.0))(
+                views.replace(images=images),
+                cameras.replace(cam_from_world=poses, intrinsics=intrinsics),
+                patches.replace(buckets=tuple(moved)),
+            )
+        probes = torch.Generator().manual_seed(5)
+        total = sum(
+            (torch.randn(one.radiance.shape, generator=probes) * one.radiance).sum()
+            for one in seen.buckets
+        )
+        leaves = [images, poses, intrinsics]
+        leaves += [getattr(bucket, name) for bucket in moved for name in names]
+        slopes.append(torch.autograd.grad(total, leaves))
+    for one, other in zip(*slopes, strict=True):
+        assert (other != 0).any()
+        # Geometry is in float32 in torch there: sums of thousands of samples.
+        assert_close(one, other, rtol=0, atol=2e-4 * float(other.abs().max()))
+
+
 def test_heights_are_swept_as_in_torch(photographed):
     views, cameras, lifted = photographed
     sources = prepare(views)
