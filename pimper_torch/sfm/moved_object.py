@@ -81,9 +81,9 @@ def find_moved_object(
     max_error_px: float,
     fewest: int,
 ) -> MovedObject:
-    """Report photographs of two or more series apart, and what ties them together.
+    """Divide the photographs into capture sessions, linked by matches of the object.
 
-    Of the two bodies the object is the one nearer to the middle of the photographs.
+    Of the two rigid parts the object is the one nearer to the middle of the photographs.
 
     Args:
         verified: Matches of each pair that its geometry explains.
