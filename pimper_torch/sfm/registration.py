@@ -180,7 +180,6 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
 
 
 def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
-    """Grow models of the pairs that are matched."""
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}

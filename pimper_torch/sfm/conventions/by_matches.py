@@ -166,7 +166,6 @@ def _require_agreement(
 def _explained_fraction(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
 ) -> float:
-    """Return the fraction of matches that the cameras of a model explain."""
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
     return right / max(sum(pair.num_matches for pair in pairs), 1)

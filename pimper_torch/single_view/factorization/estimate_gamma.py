@@ -349,7 +349,6 @@ def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, Encode
 
 
 def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
-    """Minimize the loss between two exponents."""
     fit = start
 
     def loss(logarithm: float) -> float:

@@ -127,7 +127,6 @@ def _fit(
     weight: Float[Tensor, "view pixel"],
     rows: Float[Tensor, "view unknown"],
 ) -> Regressed:
-    """Solve the normal equations."""
     factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
     return Regressed(shading=factored.solve(rows.mT @ (weight * x)), weight=weight)
 
