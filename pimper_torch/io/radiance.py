@@ -110,10 +110,7 @@ def _refuse_padding(
 
 
 def radiance_of(
-    decoded: Decoded,
-    response: Response,
-    black: Float[Tensor, ""],
-    white: Float[Tensor, " channel"],
+    decoded: Decoded, response: Response, black: Float[Tensor, ""], white: Float[Tensor, " channel"]
 ) -> Float[Tensor, "channel height width"]:
     """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
 

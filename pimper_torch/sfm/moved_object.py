@@ -124,10 +124,7 @@ def find_moved_object(
 
 
 def object_votes(
-    keypoints: Keypoints,
-    sizes_px: Float[Tensor, "view 2"],
-    verified: Matches,
-    seconds: Matches,
+    keypoints: Keypoints, sizes_px: Float[Tensor, "view 2"], verified: Matches, seconds: Matches
 ) -> list[Float[Tensor, " _"]]:
     """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
@@ -157,10 +154,7 @@ def object_votes(
 
 
 def series_of(
-    num_views: int,
-    verified: Matches,
-    seconds: Matches,
-    votes: Sequence[Float[Tensor, " _"]],
+    num_views: int, verified: Matches, seconds: Matches, votes: Sequence[Float[Tensor, " _"]]
 ) -> Int[Tensor, " view"]:
     """Number the series of every photograph.
 

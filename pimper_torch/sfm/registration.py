@@ -18,13 +18,7 @@ from pimper_torch.errors import ReconstructionError, caution
 from pimper_torch.ledger import leave_out
 from pimper_torch.progress import report
 from pimper_torch.sfm.colmap import loaded, model_of, quiet
-from pimper_torch.sfm.doubt import (
-    FEWEST_VIEWS,
-    MOVE,
-    count_views_with_depth,
-    doubt,
-    judged,
-)
+from pimper_torch.sfm.doubt import FEWEST_VIEWS, MOVE, count_views_with_depth, doubt, judged
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,

@@ -290,10 +290,7 @@ def _sight(
 
 
 def _templates(
-    pictures: LogPictures,
-    cameras: Cameras,
-    tangents: Tangents,
-    window: _Window,
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, window: _Window
 ) -> _Templates:
     count = len(tangents.points_world)
     patches = pictures.log.new_zeros(count, window.places.shape[1])
