@@ -93,7 +93,7 @@ def leave_out(
     names: Sequence[str] = (),
     at: Places | None = None,
 ) -> None:
-    """Enter what a guard leaves out; nothing left out is an entry, too.
+    """Record what a guard leaves out; a count of zero is recorded, too.
 
     Args:
         guard: One of :data:`GUARDS`.

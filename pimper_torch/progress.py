@@ -16,7 +16,7 @@ Listener = Callable[[int, int], None]
 
 
 def report(done: int, total: int) -> None:
-    """Report the listener, if any, that ``done`` of ``total`` steps are behind us."""
+    """Inform the listener, if any, that ``done`` of ``total`` steps are finished."""
     listener = current().progress
     if listener is not None:
         listener(done, total)

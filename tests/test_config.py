@@ -148,7 +148,7 @@ def test_every_preset_of_the_package_is_found_and_read():
 
 
 def test_a_misspelt_preset_names_the_nearest():
-    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, learned, paper"):
+    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper"):
         find_config("papre")
 
 
@@ -268,3 +268,10 @@ def test_a_number_beyond_the_range_of_floats_and_a_long_text_are_refused_shortly
 @dataclass(frozen=True)
 class Rate:
     learning_rate: float = 1.0
+
+
+def test_what_went_is_refused_by_name():
+    with pytest.raises(ConfigError, match="there is no preset 'learned'"):
+        load_config("learned")
+    with pytest.raises(ConfigError, match="section `factorize` has no setting `learned`"):
+        load_config("default", {"factorize": {"learned": True}})

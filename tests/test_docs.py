@@ -1,7 +1,6 @@
-"""What the documentation shows runs: examples of docstrings, code and commands of its pages."""
+"""What the documentation shows runs: examples of docstrings, and Python of its pages."""
 
 import doctest
-import functools
 import json
 import re
 from collections.abc import Callable
@@ -12,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import tyro
 from photographs import save_photographs
 from stand_ins import CHILD
 from torch.nn.functional import normalize
@@ -21,7 +19,6 @@ import pimper_torch
 from pimper_torch.batches import task
 from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
-from pimper_torch.cli.main import main
 from pimper_torch.evidence.scenes import RenderedScene, render_shape, sparse_scene
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.render_in_memory import Sphere
@@ -288,33 +285,3 @@ def test_newcomers_are_shown_the_default():
     mine = [line for line in COMMANDS if line.startswith("reconstruct photos/")]
     assert mine
     assert not any("--preset" in line for line in mine)
-
-
-class Understood(BaseException):
-    """The command line was parsed: good news, which the command line takes for no fault."""
-
-
-def commands_of_pages() -> list[str]:
-    """List the pages' commands, each on one line and without what stands for more of the same."""
-    lines = [
-        line.replace(" ... ", " ")
-        for text in PAGES.values()
-        for line in COMMAND.findall(text.replace("\\\n", " "))
-    ]
-    return sorted({" ".join(line.split()) for line in lines})
-
-
-@pytest.mark.parametrize("line", COMMANDS + commands_of_pages())
-def test_the_commands_of_the_documentation_are_understood(line, monkeypatch):
-    understand = tyro.cli
-
-    def stop(function: Callable[..., object], **options: object) -> object:
-        @functools.wraps(function)
-        def instead(*arguments: object, **named: object) -> object:
-            raise Understood
-
-        return understand(instead, **options)
-
-    monkeypatch.setattr(tyro, "cli", stop)
-    with pytest.raises(Understood):
-        main(line.split())

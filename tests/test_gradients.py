@@ -4,9 +4,12 @@ import pytest
 import torch
 from derivatives import check_derivatives
 from probes import probes, small_scene
+from torch import nn
+from torch.nn.functional import normalize
 
 import pimper_torch as pt
-from pimper_torch.photometry.factor_priors import LearnedPrior
+from pimper_torch.photometry.factor_priors import FactorPrior, Known
+from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes
 from pimper_torch.stage import Given
 
@@ -80,13 +83,33 @@ def test_the_chain_whole_agrees_with_finite_differences(generator):
     assert_agree("chain", found, WHOLE)
 
 
+class Network(FactorPrior):
+    """Normals and inliers by a layer that all entries share, and by one of their mean."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(5)
+        self.entry, self.inlier, self.tilt = (nn.Linear(*size) for size in ((2, 4), (4, 1), (4, 3)))
+
+    def forward(self, samples):
+        predicted = samples.albedo[:, None] * (samples.lights @ harmonics(samples.normals).mT)
+        inner = self.entry(torch.stack([samples.radiance - predicted, predicted], dim=-1)).tanh()
+        shown = samples.seen[..., None]
+        mean = (inner * shown).sum(dim=1) / shown.sum(dim=1).clamp_min(1)
+        return Known(
+            normals=normalize(samples.normals + 0.1 * self.tilt(mean), dim=-1),
+            normal_weight=torch.full_like(samples.albedo, 0.5),
+            inlier=self.inlier(inner)[..., 0].sigmoid(),
+        )
+
+
 @pytest.mark.slow
 def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
     scene, coarse = small_scene(num_views=5, width=32, num_points=6)
     chain = chain_of("default", scales=[1.0])
     chain.silhouettes = Given(Silhouettes.everything(scene.views))
     chain.coarse_surface = Given(coarse)
-    prior = LearnedPrior.trained().double()
+    prior = Network().double()
     chain.factorize.priors.append(prior)
     where = f"factorize.priors.{len(chain.factorize.priors) - 1}."
     parameters = {name: value for name, value in prior.named_parameters() if "weight" in name}
@@ -99,8 +122,11 @@ def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
             for (name, own), value in zip(parameters.items(), values, strict=True)
         }
         swept = torch.func.functional_call(chain, moved, (scene,)).patches
-        normals = [bucket.normals_patch.flatten() for bucket in swept.photometric.buckets]
-        offsets = [bucket.offset.flatten() for bucket in swept.buckets]
+        normals, offsets = [], []
+        for photometric, heights in zip(swept.photometric.buckets, swept.buckets, strict=True):
+            known = photometric.valid.flatten(1).any(dim=1)  # lights of others are constants
+            normals.append(photometric.normals_patch[known].flatten())
+            offsets.append(heights.offset[known].flatten())
         return {"normals": torch.cat(normals), "offset": torch.cat(offsets)}
 
     flat = torch.cat([value.flatten() for value in parameters.values()])

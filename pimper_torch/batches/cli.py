@@ -116,7 +116,7 @@ class Lines:
 class _Job:
     """Reconstruct many objects, each as `pimper reconstruct` does.
 
-    What stands behind `--` are its options, for every object: `-- --preset fast`. An object whose
+    Arguments after `--` are passed to it for every object: `-- --preset fast`. An object whose
     result is whole is passed over, others go on from what their stages kept.
 
     Attributes:

@@ -48,10 +48,7 @@ class ExportJob:
 def run(command: str, arguments: Sequence[str], output: Output) -> None:
     """Carry out ``export``: read the result, and write all formats or none."""
     job = checked(command, arguments)
-    with (
-        output.observer(),
-        written_whole(job.out, "data set", overwrite=job.overwrite) as staging,
-    ):
+    with output.observer(), written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
         with stage("read") as told:
             result = read_result(job.result, job.photos)
             told["photographs"] = result.scene.views.num_views

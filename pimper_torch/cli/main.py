@@ -202,7 +202,6 @@ def _loaded(home: str) -> types.ModuleType:
 
 
 def _failed(output: Output, error: BaseException) -> int:
-    """Report why a command failed, and give its exit code."""
     kind = type(error).__name__
     if isinstance(error, BrokenPipeError):
         raise error

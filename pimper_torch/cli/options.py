@@ -71,12 +71,10 @@ _Bar = Annotated[ScaleBar, _three_words(_bar, ScaleBar)]
 _Distance = Annotated[CameraDistance, _three_words(_distance, CameraDistance)]
 
 ScaleBars = Annotated[
-    tyro.conf.UseAppendAction[tuple[_Bar, ...]],
-    tyro.conf.arg(metavar="A,x,y B,x,y LENGTH"),
+    tyro.conf.UseAppendAction[tuple[_Bar, ...]], tyro.conf.arg(metavar="A,x,y B,x,y LENGTH")
 ]
 CameraDistances = Annotated[
-    tyro.conf.UseAppendAction[tuple[_Distance, ...]],
-    tyro.conf.arg(metavar="A B LENGTH"),
+    tyro.conf.UseAppendAction[tuple[_Distance, ...]], tyro.conf.arg(metavar="A B LENGTH")
 ]
 Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
 
@@ -90,7 +88,7 @@ class CommonOptions:
     """Options that every command has.
 
     Attributes:
-        preset: Settings to start from: default, fast, learned, paper, or a YAML file of your own.
+        preset: Settings to start from: default, fast, paper, or a YAML file of your own.
         reference: Photograph that facets and pictures are seen from; chosen unless given.
         device: Of all after structure from motion; cuda has never been run on a GPU.
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.

@@ -111,7 +111,6 @@ def _preview(
 
 
 def _store(job: Job) -> Store:
-    """Return the folder that every stage's record is kept in."""
     common = job.common
     folder = common.cache or job.out / STAGES
     max_bytes = bytes_of(common.max_kept)
@@ -190,7 +189,6 @@ def _check_device(device: str) -> None:
 
 
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
-    """State what came out and where it is."""
     fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
     output.remark(f"{_costs(result)}\n{headline(result)}")
     if result.scene.doubt:
@@ -205,7 +203,6 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
 
 
 def _costs(result: Reconstruction) -> str:
-    """Report what every stage took, in columns."""
     return "\n".join(
         ["stage             seconds   peak MB"]
         + [

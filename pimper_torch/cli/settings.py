@@ -56,8 +56,8 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
         that differ: `pimper config paper > mine.yaml`.
 
         Args:
-            name: A preset to print (default, fast, learned, paper, or a YAML file); or a section or
-                a setting to explain, such as sweep or fuse.terms.
+            name: A preset to print (default, fast, paper, or a YAML file); or a section or a
+                setting to explain, such as sweep or fuse.terms.
         """
         is_preset = name in presets() or Path(name).suffix in (".yaml", ".yml")
         chosen = name if is_preset else preset

@@ -1,1 +1,1 @@
-"""The sparse cloud to a few hundred facets."""
+"""From the sparse cloud to a surface of a few thousand facets."""

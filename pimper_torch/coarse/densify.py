@@ -413,9 +413,7 @@ def choose_sources(
 
 
 def step_for_one_pixel(
-    pairing: Pairing,
-    pixels: Float[Tensor, "point 2"],
-    inverse_depth: Float[Tensor, " point"],
+    pairing: Pairing, pixels: Float[Tensor, "point 2"], inverse_depth: Float[Tensor, " point"]
 ) -> float:
     """Return the change of inverse depth that moves points by one pixel in the sources.
 

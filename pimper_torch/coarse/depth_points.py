@@ -205,9 +205,7 @@ def _spread(valid: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]
 
 
 def _with(
-    scene: SparseScene,
-    pixels: Float[Tensor, "point view 2"],
-    seen: Bool[Tensor, "point view"],
+    scene: SparseScene, pixels: Float[Tensor, "point view 2"], seen: Bool[Tensor, "point view"]
 ) -> SparseScene:
     """Triangulate, and put points and tracks beside the scene's own."""
     cameras = scene.cameras

@@ -300,10 +300,7 @@ def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
 
 
 def sparse_oriented(
-    scene: SparseScene,
-    index: Int[Tensor, " chosen"],
-    dense: OrientedPoints,
-    reach: float,
+    scene: SparseScene, index: Int[Tensor, " chosen"], dense: OrientedPoints, reach: float
 ) -> OrientedPoints:
     """Return the points of the sparse cloud that are far from all dense ones, with normals.
 
@@ -343,10 +340,7 @@ def sparse_oriented(
 
 
 def matched_cloud(
-    scene: SparseScene,
-    reliable: Int[Tensor, " reliable"],
-    config: DensifyConfig,
-    cell_px: float,
+    scene: SparseScene, reliable: Int[Tensor, " reliable"], config: DensifyConfig, cell_px: float
 ) -> tuple[OrientedPoints, DepthMaps, float]:
     """Match the photographs densely, and merge the depth maps and the sparse points.
 

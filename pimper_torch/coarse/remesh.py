@@ -68,12 +68,7 @@ class Remesh(Stage):
         super().__init__()
         self.config = config or RemeshConfig()
 
-    def forward(
-        self,
-        swept: SweptPatches,
-        surface: Surface,
-        contours: Contours,
-    ) -> CoarseMesh:
+    def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
         """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
 
         Lengths count in samples of these patches; the residual is their photometry's. Inside the

@@ -57,7 +57,7 @@ class CoarseSurfaceConfig:
 
 
 class CoarseSurface(Stage):
-    """Return object's surface in a few thousand facets; the result is a constant to autograd."""
+    """Compute the coarse surface of the object, a few thousand facets; not differentiable."""
 
     def __init__(
         self,

@@ -22,10 +22,7 @@ RAW_SUFFIXES = (
     *(".pef", ".srw", ".3fr", ".iiq", ".rwl"),
 )
 # Of each extra: its name for people, and the modules any of which will do.
-_EXTRAS = {
-    "heic": ("a HEIC image", ("pi_heif", "pillow_heif")),
-    "raw": ("camera raw", ("rawpy",)),
-}
+_EXTRAS = {"heic": ("a HEIC image", ("pi_heif", "pillow_heif")), "raw": ("camera raw", ("rawpy",))}
 # How files begin. Most camera raw begins as TIFF does.
 _STARTS = {
     "JPEG": rb"\xff\xd8\xff",

@@ -64,8 +64,9 @@ def read_pictures(
     """Read image files as linear radiance that is 1 where the sensor saturates.
 
     Black is taken away, values above saturation are cut off. Files whose saturation is to be
-    found are read once more if it lies below full scale; a :class:`PimperWarning` tells it. Colours
-    of other primaries than sRGB's, as a file says, are turned into those of sRGB.
+    found are read once more if it lies below full scale, which a
+    :class:`~pimper_torch.errors.PimperWarning` reports. Colours of other primaries than sRGB's, as
+    a file says, are turned into those of sRGB.
 
     Args:
         sizes_px: Width and height of each, at most those of its header.
@@ -109,10 +110,7 @@ def _refuse_padding(
 
 
 def radiance_of(
-    decoded: Decoded,
-    response: Response,
-    black: Float[Tensor, ""],
-    white: Float[Tensor, " channel"],
+    decoded: Decoded, response: Response, black: Float[Tensor, ""], white: Float[Tensor, " channel"]
 ) -> Float[Tensor, "channel height width"]:
     """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
 

@@ -63,9 +63,7 @@ def lights_report(result: Reconstruction) -> Report:
     }
 
 
-def common_lights(
-    result: Reconstruction,
-) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
+def common_lights(result: Reconstruction) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
     r"""Find the one light of every view that shades all patches most nearly as their own do.
 
     A patch that is nearly flat tells its light only along its normal, so lights are weighted

@@ -51,10 +51,7 @@ def read_curve(path: Path | str) -> Curve:
             see :func:`~pimper_torch.radiometry.response.curve_from_table`.
     """
     path = Path(path)
-    readers: Mapping[str, Callable[[Path], np.ndarray]] = {
-        ".csv": _read_csv,
-        ".npy": _read_npy,
-    }
+    readers: Mapping[str, Callable[[Path], np.ndarray]] = {".csv": _read_csv, ".npy": _read_npy}
     reader = readers.get(path.suffix.lower())
     if reader is None or not path.is_file():
         found = "no such file" if reader else f"a {path.suffix} file" if path.suffix else "no file"

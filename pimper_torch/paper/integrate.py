@@ -22,8 +22,7 @@ from pimper_torch.stage import Stage
 
 
 def fill_smoothly(
-    values: Float[Tensor, "patch channel height width"],
-    weight: Float[Tensor, "patch height width"],
+    values: Float[Tensor, "patch channel height width"], weight: Float[Tensor, "patch height width"]
 ) -> Float[Tensor, "patch channel height width"]:
     """Inpaint samples without weight from those around, through a pyramid of halved rasters.
 
@@ -146,10 +145,7 @@ class Integrate(Stage):
         buckets = []
         for templates, photometry in track(pairs):
             height_field = integrate_normals(
-                photometry.normals_patch,
-                photometry.valid,
-                templates.spacing,
-                steepest,
+                photometry.normals_patch, photometry.valid, templates.spacing, steepest
             )
             depth = through_corners(height_field, templates, photometric.patches.coarse)
             has_data = photometry.valid.flatten(1).any(dim=1)

@@ -41,9 +41,7 @@ def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 
 def assemble(
-    subdivision: Subdivision,
-    fidelity: Float[Tensor, " facet"],
-    supported: Bool[Tensor, " vertex"],
+    subdivision: Subdivision, fidelity: Float[Tensor, " facet"], supported: Bool[Tensor, " vertex"]
 ) -> tuple[
     Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"], Float[Tensor, " vertex"]
 ]:

@@ -116,10 +116,7 @@ def meet_overlaps(
 
 
 def _meet_bucket(
-    seams: Seams,
-    templates: Templates,
-    depths: Depths,
-    transforms: Float[Tensor, "patch 4"],
+    seams: Seams, templates: Templates, depths: Depths, transforms: Float[Tensor, "patch 4"]
 ) -> tuple[
     Float[Tensor, "patch 3 ray 3"], Float[Tensor, "patch 3 ray 3"], Bool[Tensor, "patch 3 ray"]
 ]:
@@ -173,9 +170,7 @@ def transformed(
     return hx * points[..., 0] + hy * points[..., 1] + hz * depth + h0
 
 
-def _by_facet(
-    patches: PatchSet,
-) -> tuple[Float[Tensor, "face 4 4"], Float[Tensor, " face"]]:
+def _by_facet(patches: PatchSet) -> tuple[Float[Tensor, "face 4 4"], Float[Tensor, " face"]]:
     order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
     frames = torch.cat([templates.patch_from_world for templates in patches.buckets])
     spacing = torch.cat([templates.spacing for templates in patches.buckets])
@@ -255,9 +250,7 @@ def curvature_along(
 
 
 def seam_stiffness(
-    curvature: Float[Tensor, "seam 2"],
-    scales: Float[Tensor, "seam 2"],
-    floor: float,
+    curvature: Float[Tensor, "seam 2"], scales: Float[Tensor, "seam 2"], floor: float
 ) -> Float[Tensor, " seam"]:
     r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`.
 

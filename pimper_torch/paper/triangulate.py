@@ -199,11 +199,7 @@ class Triangulate(Stage):
         return cameras.centers_world[reference] + rays / inverse[possible, None]
 
     def _facets(
-        self,
-        vertices: Float[Tensor, "vertex 3"],
-        views: Views,
-        cameras: Cameras,
-        reference: int,
+        self, vertices: Float[Tensor, "vertex 3"], views: Views, cameras: Cameras, reference: int
     ) -> Int[Tensor, "face 3"]:
         """Triangulate, drop bridges, and peel off the border what shows no object."""
         pixels, _ = _project(vertices, cameras, reference)

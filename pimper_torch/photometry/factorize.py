@@ -28,7 +28,6 @@ from pimper_torch.photometry.factor_priors import (
     FieldLights,
     Guesses,
     Known,
-    LearnedPrior,
     PatchSamples,
     SurfaceNormals,
 )
@@ -128,7 +127,6 @@ class FactorizeConfig:
             and the lights take their share.
         min_light_variation: Minimum third singular value of a patch's lights, over the first;
             about the smaller extent, in radians, of the light's directions.
-        learned: Whether a small trained network guesses normals, and which entries are diffuse.
         max_iterations: Of the solver.
         tolerance: Relative change at which a patch has converged: of its objective with variable
             projection, of its shading vectors with BALM.
@@ -144,7 +142,6 @@ class FactorizeConfig:
     shadows: bool = True
     min_views: Annotated[int, Range(least=3, most=100_000)] = 4
     min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
-    learned: bool = False
     max_iterations: Annotated[int, Range(least=1, most=100_000)] = 60
     tolerance: Annotated[float, Range(above=0, most=1)] = 1e-3
 
@@ -218,8 +215,7 @@ class Factorize(Stage):
         self.config = config = config or FactorizeConfig()
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
-            learned = [LearnedPrior.trained()] if config.learned else []
-            priors = [*own, Guesses(), *learned]
+            priors = [*own, Guesses()]
         for prior in priors:
             needed = "modules derived from FactorPrior"
             require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)

@@ -188,7 +188,7 @@ class Support(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CoarseMesh(Record):
-    """The few hundred facets that the pieces of the method stand on.
+    """The coarse surface, up to a few thousand facets, that patches are laid on.
 
     Attributes:
         mesh: The facets, with vertex normals smoothed over the mesh.

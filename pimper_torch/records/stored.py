@@ -88,7 +88,8 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
     The file is mapped into memory: pages are read when they are used, and writing into a tensor
     does not change the file. Fields that shared a tensor share one again. All structure, names and
     shapes are checked before a tensor's memory is touched; values are checked by the stages that
-    take the record (:meth:`Record.check`). Paths in a record are returned, never opened.
+    take the record (:meth:`~pimper_torch.records.record.Record.check`). Paths in a record are
+    returned, never opened.
 
     Returns:
         The record, on the CPU.

@@ -271,11 +271,7 @@ def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
 
 
 def bundle(
-    model: SparseModel,
-    scale_px: float,
-    *,
-    cameras: bool = True,
-    tolerance: float = 1e-6,
+    model: SparseModel, scale_px: float, *, cameras: bool = True, tolerance: float = 1e-6
 ) -> SparseModel:
     """Adjust poses, lenses and points to the observations, robustly.
 

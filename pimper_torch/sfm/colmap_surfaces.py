@@ -158,10 +158,7 @@ def _oriented(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
 
 
 def _made(
-    path: Path,
-    what: str,
-    program: Callable[..., object],
-    *arguments: object,
+    path: Path, what: str, program: Callable[..., object], *arguments: object
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """Run a program of COLMAP's that writes a mesh, and read that."""
     try:

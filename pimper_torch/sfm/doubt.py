@@ -2,9 +2,9 @@
 
 A model can be consistent with every match that it was made of, and wrong: photographs that are
 cropped round an object that turns show the room as a camera would that shifts before a wall.
-Points that move as before a camera that stays in its place are explained by any translation of the
-camera, or by none: they determine neither depth nor baseline. Those of a plane that is seen from
-round it move by homographies that shear, and do.
+Points that move as if the camera only rotated are explained by any translation of the camera, or by
+none: they determine neither depth nor baseline. Those of a plane that is seen from round it move by
+homographies that shear, and do.
 
 Where two sides of an object look alike, COLMAP can register every photograph with small
 reprojection errors, and put a part of them on the wrong side: a mapper leaves out what contradicts
@@ -130,10 +130,9 @@ def doubt(model: SparseModel, num_photographs: int) -> str:
     following = following_fraction(model)
     if following > _MOST_FOLLOWING:
         return (
-            f"The cameras are doubtful: {following:.0%} of the points move from photograph to "
-            "photograph as before a camera that stays in its place, so that nothing tells their "
-            "depth. Either all is flat, or a background that shifts was registered in the place "
-            f"of the object. {MOVE}"
+            f"The cameras are doubtful: {following:.0%} of the points move as if the camera only "
+            "rotated, so their depth is undetermined. Either all is flat, or a background that "
+            f"shifts was registered in the place of the object. {MOVE}"
         )
     wide = model.observed[wide_points(model)].sum(dim=0)
     seeing = int((wide > model.observed.sum(dim=0) / 2).sum())

@@ -23,12 +23,7 @@ from pimper_torch.sfm.conventions.resized_pictures import (
     tell_crop,
     tell_turned,
 )
-from pimper_torch.sfm.lenses import (
-    turned_lens,
-    turned_pixels,
-    turned_pose,
-    turned_size,
-)
+from pimper_torch.sfm.lenses import turned_lens, turned_pixels, turned_pose, turned_size
 from pimper_torch.sfm.model import SparseModel, match_names
 from pimper_torch.sfm.model_files import largest_model
 

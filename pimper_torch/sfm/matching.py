@@ -239,8 +239,7 @@ def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolm
     pixels = np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
     descriptors = np.array(stored.read_descriptors(image).data).astype(np.float32)
     return Features(
-        pixels=torch.from_numpy(pixels),
-        descriptors=torch.from_numpy(descriptors / 512),
+        pixels=torch.from_numpy(pixels), descriptors=torch.from_numpy(descriptors / 512)
     )
 
 

@@ -16,7 +16,7 @@ from pimper_torch.records.scene import no_maps, no_series
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseModel(Record):
-    """Observations views and the cloud that ties them together, in float64 on the CPU.
+    """Registered views and their sparse points, in float64 on the CPU.
 
     Attributes:
         lenses: One a view, before undistortion.

@@ -311,7 +311,6 @@ def sound_model(files: FileModel, folder: Path) -> SparseModel:
 
 
 def _fault(image: FileImage, lenses: dict[int, Lens]) -> str:
-    """State why an image cannot be used."""
     if not abs(float(np.linalg.norm(image.pose[:4])) - 1) <= 0.1:  # other programs round
         return "a pose whose quaternion is not of length 1"
     if not all(abs(value) < _MAX_COORDINATE for value in image.pose[4:]):

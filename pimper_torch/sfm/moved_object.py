@@ -81,9 +81,9 @@ def find_moved_object(
     max_error_px: float,
     fewest: int,
 ) -> MovedObject:
-    """Report photographs of two or more series apart, and what ties them together.
+    """Divide the photographs into capture sessions, linked by matches of the object.
 
-    Of the two bodies the object is the one nearer to the middle of the photographs.
+    Of the two rigid parts the object is the one nearer to the middle of the photographs.
 
     Args:
         verified: Matches of each pair that its geometry explains.
@@ -124,10 +124,7 @@ def find_moved_object(
 
 
 def object_votes(
-    keypoints: Keypoints,
-    sizes_px: Float[Tensor, "view 2"],
-    verified: Matches,
-    seconds: Matches,
+    keypoints: Keypoints, sizes_px: Float[Tensor, "view 2"], verified: Matches, seconds: Matches
 ) -> list[Float[Tensor, " _"]]:
     """Return how sure each feature is the object's: above 0 it is, below 0 of the surroundings.
 
@@ -157,10 +154,7 @@ def object_votes(
 
 
 def series_of(
-    num_views: int,
-    verified: Matches,
-    seconds: Matches,
-    votes: Sequence[Float[Tensor, " _"]],
+    num_views: int, verified: Matches, seconds: Matches, votes: Sequence[Float[Tensor, " _"]]
 ) -> Int[Tensor, " view"]:
     """Number the series of every photograph.
 

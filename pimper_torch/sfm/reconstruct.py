@@ -6,12 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.errors import (
-    InputError,
-    ReconstructionError,
-    caution,
-    some,
-)
+from pimper_torch.errors import InputError, ReconstructionError, caution, some
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import each
 from pimper_torch.memory import release_memory

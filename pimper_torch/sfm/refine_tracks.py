@@ -11,12 +11,7 @@ from pimper_torch.sfm import colmap
 from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS
-from pimper_torch.sfm.track_observations import (
-    TrackObservations,
-    log_pictures,
-    sight,
-    tangents,
-)
+from pimper_torch.sfm.track_observations import TrackObservations, log_pictures, sight, tangents
 from pimper_torch.sfm.undistort import pinholes_for, undistorted
 
 # Residual at which a track observation counts half, before the residuals themselves tell; then
@@ -127,10 +122,7 @@ def _photographed(
 
 
 def _adjusted(
-    model: SparseModel,
-    aligned: Bool[Tensor, " observation"],
-    *,
-    cameras: bool,
+    model: SparseModel, aligned: Bool[Tensor, " observation"], *, cameras: bool
 ) -> tuple[SparseModel, Bool[Tensor, " point"], float]:
     """Adjust points and cameras, unless held fixed, to aligned observations.
 

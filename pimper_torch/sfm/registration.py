@@ -18,13 +18,7 @@ from pimper_torch.errors import ReconstructionError, caution
 from pimper_torch.ledger import leave_out
 from pimper_torch.progress import report
 from pimper_torch.sfm.colmap import loaded, model_of, quiet
-from pimper_torch.sfm.doubt import (
-    FEWEST_VIEWS,
-    MOVE,
-    count_views_with_depth,
-    doubt,
-    judged,
-)
+from pimper_torch.sfm.doubt import FEWEST_VIEWS, MOVE, count_views_with_depth, doubt, judged
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import (
     MOST_PAIRED,
@@ -180,7 +174,6 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
 
 
 def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
-    """Grow models of the pairs that are matched."""
     verified = verified_pairs(space)
     if settings.guided_pairs:
         counts = {pair.views: pair.num_matches for pair in verified}

@@ -20,12 +20,7 @@ from torch.nn.functional import normalize
 from pimper_torch.parallel import on_one_thread
 from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import Workspace, image_ids
-from pimper_torch.sfm.matching import (
-    MOST_PAIRED,
-    PhotographPair,
-    all_pairs,
-    read_features,
-)
+from pimper_torch.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, read_features
 
 # Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
 _WORDS, _NEIGHBOURS = 128, 20

@@ -224,7 +224,6 @@ def _failure(what: str, name: str, reason: str, done: str) -> Failure:
 
 
 def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
-    """List the views that cannot be used, each with the reason."""
     masks = scene.views.masks
     for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
         lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN

@@ -159,7 +159,7 @@ def find_static_background(
     max_error_px: float,
     fewest: int,
 ) -> StaticBackground:
-    """Report features of a room at rest from those of what moves.
+    """Separate features of the static background from those of the moving object.
 
     Each pair that has both still matches and moving ones that one epipolar geometry explains
     votes: a still match says that its features rest, a moving one that they move. Features rest

@@ -83,7 +83,6 @@ def _laid(
     normals: Float[Tensor, "point 3"],
     cameras: Cameras,
 ) -> Tangents:
-    """Lay planes of known normals."""
     rays = cameras.centers_world - points_world[:, None]
     distance = rays.norm(dim=-1)
     cosine = (normalize(rays, dim=-1) * normals[:, None]).sum(dim=-1)
@@ -291,10 +290,7 @@ def _sight(
 
 
 def _templates(
-    pictures: LogPictures,
-    cameras: Cameras,
-    tangents: Tangents,
-    window: _Window,
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, window: _Window
 ) -> _Templates:
     count = len(tangents.points_world)
     patches = pictures.log.new_zeros(count, window.places.shape[1])
@@ -365,7 +361,6 @@ def _shifted(
 
 
 def _reference_pixels(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
-    """Return the points' pixels in their reference views."""
     frames = cameras.cam_from_world[tangents.reference]
     points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
     homogeneous = (cameras.intrinsics[tangents.reference] @ points[..., None])[..., 0]

@@ -160,7 +160,6 @@ def _pairs(
 
 
 def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
-    """Let COLMAP triangulate the matches in the database."""
     pycolmap = loaded()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1

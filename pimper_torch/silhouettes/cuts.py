@@ -215,9 +215,9 @@ def _cut(
 
 
 def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
-    """Find what takes part in the vote though cuts may lack it: what no light makes of the plane.
+    """Find pixels too bright or too dark for the plane, such as the inside of a vessel.
 
-    That is what is brighter or darker than the plane can be, as the inside of a vessel.
+    They count as object in the vote, even where the cuts miss them.
     """
     agreement = cues.agreement
     if agreement is None or not cues.has_points:

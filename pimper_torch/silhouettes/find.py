@@ -132,7 +132,6 @@ class FindSilhouettes(Stage):
         return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
 
     def _doubt(self, agreement: Agreement) -> str:
-        """State why silhouettes are unreliable, or nothing."""
         reliable = agreement.reliable(self.details)
         overlap = float(agreement.overlap.median())
         if overlap < self.details.min_overlap:

@@ -125,7 +125,7 @@ class Everywhere(Hull):
         )
 
     def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """State that points lie infinitely deep inside."""
+        """Return infinity: a hull without bounds excludes nothing."""
         return torch.full_like(points_world[..., 0], torch.inf)
 
     def holds(

@@ -9,7 +9,7 @@ from pimper_torch.geometry.supporting_plane import PlaneSearch
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SilhouetteConfig:
-    """Settings of :class:`FindSilhouettes`.
+    """Settings of :class:`~pimper_torch.silhouettes.find.FindSilhouettes`.
 
     Attributes:
         object: Find silhouettes and fall back to everything (``auto``), take the masks that come
@@ -34,7 +34,7 @@ class SilhouetteConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SilhouetteDetails:
-    """Values of :class:`FindSilhouettes` that all photographs share.
+    """Values of :class:`~pimper_torch.silhouettes.find.FindSilhouettes` that all photographs share.
 
     Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
 

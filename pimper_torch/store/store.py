@@ -66,7 +66,7 @@ class Store:
         """Write a record in place of one of the same key.
 
         Args:
-            record: Of any class that :func:`~pimper_torch.records.save_record` takes.
+            record: Of any class that :func:`~pimper_torch.records.stored.save_record` takes.
             about: What else is to be known of it; what JSON holds.
 
         Returns:

@@ -161,8 +161,8 @@ def show(
     """Open a surface, with cameras, photographs and points where it has some, in the viewer.
 
     Needs viser, the extra ``view``. As the last line of a notebook's cell it shows the page there;
-    elsewhere :attr:`Viewer.address` opens in a browser. The page lives as long as the process:
-    scripts end with :meth:`Viewer.wait`.
+    elsewhere :attr:`~pimper_torch.viewer.viewer.Viewer.address` opens in a browser. The page lives
+    as long as the process: scripts end with :meth:`~pimper_torch.viewer.viewer.Viewer.wait`.
 
     Args:
         result: What a chain or :func:`~pimper_torch.exchange.result.read_result` returned, a mesh,

@@ -28,10 +28,7 @@ from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.store import opened
 
 SCENES = ("mug", "jar", "balls", "potatoes")
-METHODS = {
-    "quick": ("default", "smoothed"),
-    "full": ("default", "paper", "smoothed", "openmvs"),
-}
+METHODS = {"quick": ("default", "smoothed"), "full": ("default", "paper", "smoothed", "openmvs")}
 """Methods that each scale runs by default."""
 
 

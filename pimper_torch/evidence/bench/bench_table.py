@@ -306,7 +306,7 @@ def legend(table: Table) -> list[str]:
         "shape is the surface's own. Chamfer (the mean of accuracy and completeness), accuracy, "
         "completeness and the thresholds of F are in % of the diagonal of the true bounding box, "
         "over the part of the true surface that three views or more see. "
-        f"{MISSING}: not measured, or not applicable.",
+        f"{MISSING}: not measured, or not applicable."
     ]
     if any(row.published for row in table.rows):
         sentences.append(

@@ -286,7 +286,6 @@ def _mesh_file(folder: Path, scene: str, method: str) -> Path:
 def _cell(
     scene: str, method: str, run: Method, inputs: Inputs, config: BenchConfig, staging: Path
 ) -> _Cell:
-    """Run a method and measure what it gives."""
     began = time.perf_counter()
     sfm_minutes = inputs.sfm_seconds / 60 or None
     try:
@@ -353,7 +352,6 @@ def row_of(
 
 @contextmanager
 def _shown(observer: Observer, name: str) -> Iterator[None]:
-    """Report a piece of work to the observer as a stage."""
     began = time.perf_counter()
     observer.started(name)
     progressed: Callable[[int, int], None] = observer.progressed

@@ -232,11 +232,7 @@ def write_report(
         "pimper_torch": installed_version(),
         "result": str(job.result),
         "truth": str(job.truth),
-        "settings": {
-            "truth_layout": job.truth_layout,
-            "scan": job.scan,
-            **to_mapping(job.config),
-        },
+        "settings": {"truth_layout": job.truth_layout, "scan": job.scan, **to_mapping(job.config)},
         **report(evaluation),
         "relighting": relighting,
     }

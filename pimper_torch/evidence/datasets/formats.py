@@ -188,7 +188,6 @@ def read_idr(
 
 
 def _sizes(folder: DataSetPath, names: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the sizes of photographs in their files."""
     headers = [read_header(_with_suffix(folder.inside(name))) for name in names]
     return [(header.width, header.height) for header in headers]
 

@@ -70,9 +70,7 @@ def nearest(
     return values[rows[:, None], columns]
 
 
-def intrinsics_from_indices(
-    intrinsics: Float[Tensor, "*batch 3 3"],
-) -> Float[Tensor, "*batch 3 3"]:
+def intrinsics_from_indices(intrinsics: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Move the principal point of a ``K`` that counts pixel centres from 0 to our convention."""
     moved = intrinsics.clone()
     moved[..., :2, 2] = pixels_from_indices(moved[..., :2, 2])

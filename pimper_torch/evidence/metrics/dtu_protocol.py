@@ -96,10 +96,7 @@ class DtuFigures(Record):
 
 
 def dtu_figures(
-    mesh: Mesh,
-    scan: Float[Tensor, "point 3"],
-    protocol: DtuProtocol,
-    generator: torch.Generator,
+    mesh: Mesh, scan: Float[Tensor, "point 3"], protocol: DtuProtocol, generator: torch.Generator
 ) -> DtuFigures:
     """Evaluate a result by the protocol.
 

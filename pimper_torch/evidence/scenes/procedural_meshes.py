@@ -134,8 +134,7 @@ def join(*meshes: Mesh) -> Mesh:
         offsets.append(mesh.faces + count)
         count += len(mesh.vertices_world)
     return Mesh(
-        vertices_world=torch.cat([mesh.vertices_world for mesh in meshes]),
-        faces=torch.cat(offsets),
+        vertices_world=torch.cat([mesh.vertices_world for mesh in meshes]), faces=torch.cat(offsets)
     )
 
 
@@ -213,12 +212,7 @@ def smooth_difference(
 
 
 def rounded_cylinder(
-    points: Float[Tensor, "point 3"],
-    *,
-    radius: float,
-    low: float,
-    high: float,
-    rounding: float,
+    points: Float[Tensor, "point 3"], *, radius: float, low: float, high: float, rounding: float
 ) -> Float[Tensor, " point"]:
     """Return the signed distance to an upright cylinder about the z axis with round edges."""
     # Kept off the axis, where the root has no gradient.

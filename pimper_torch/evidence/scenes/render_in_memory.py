@@ -194,11 +194,7 @@ def _views(images: Float[Tensor, "view channel height width"], cameras: Cameras)
 
 
 def potato_on_table(
-    seed: int = 0,
-    *,
-    num_views: int = 12,
-    width: int = 640,
-    height: int = 480,
+    seed: int = 0, *, num_views: int = 12, width: int = 640, height: int = 480
 ) -> RenderedScene:
     """Photograph a bumpy, textured potato under a point light that moves between photographs.
 
@@ -212,9 +208,7 @@ def potato_on_table(
     generator = torch.Generator().manual_seed(seed)
     objects = (
         SceneObject(
-            mesh=potato(generator),
-            texture=random_speckle(generator, contrast=1.5),
-            roughness=0.35,
+            mesh=potato(generator), texture=random_speckle(generator, contrast=1.5), roughness=0.35
         ),
         SceneObject(
             mesh=table(),
@@ -238,10 +232,6 @@ def potato_on_table(
         up=(0.0, 0.0, 1.0),
     )
     lights = wandering_lights(
-        num_views,
-        generator,
-        distance=6.0,
-        target=centre,
-        toward=(0.0, -0.6, 0.8),
+        num_views, generator, distance=6.0, target=centre, toward=(0.0, -0.6, 0.8)
     )
     return render_objects(objects, cameras, lights, generator)

@@ -122,7 +122,6 @@ def render_scene(
 
 
 def _render_all(scene: Scene, folder: Path, threads: int) -> None:
-    """Render all photographs and write them with their truth."""
     shared = TracedObjects(scene.objects_in(0))
 
     def take(view: int) -> None:

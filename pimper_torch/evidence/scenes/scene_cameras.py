@@ -153,9 +153,7 @@ def distance_to_fit(
 
 
 def aim_to_fit(
-    toward_world: Float[Tensor, "view 3"],
-    points_world: Float[Tensor, "point 3"],
-    **picture: float,
+    toward_world: Float[Tensor, "view 3"], points_world: Float[Tensor, "point 3"], **picture: float
 ) -> tuple[Float[Tensor, " 3"], float]:
     """Find what cameras look at, and from how far, to show all points as large as can be.
 

@@ -47,8 +47,7 @@ def sparse_scene(
     return SparseScene(
         views=scene.views.replace(images=scene.views.images.to(dtype)),
         cameras=cameras.replace(
-            intrinsics=cameras.intrinsics.to(dtype),
-            cam_from_world=cameras.cam_from_world.to(dtype),
+            intrinsics=cameras.intrinsics.to(dtype), cam_from_world=cameras.cam_from_world.to(dtype)
         ),
         points_world=points.to(dtype),
         reprojection_errors_px=((errors * seen).sum(dim=1) / seen.sum(dim=1)).to(dtype),

@@ -24,12 +24,7 @@ from pimper_torch.sfm.conventions.resized_pictures import (
     tell_open_turns,
     tell_turned,
 )
-from pimper_torch.sfm.epipolar import (
-    explained,
-    match_errors,
-    pinholes_of,
-    undistorted_pairs,
-)
+from pimper_torch.sfm.epipolar import explained, match_errors, pinholes_of, undistorted_pairs
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES
@@ -63,10 +58,7 @@ def choose_way(
 
 
 def _choose_turns(
-    models: Sequence[SparseModel],
-    verified: Sequence[VerifiedPair],
-    max_error_px: float,
-    where: str,
+    models: Sequence[SparseModel], verified: Sequence[VerifiedPair], max_error_px: float, where: str
 ) -> SparseModel:
     """Choose between cameras of photographs as they stand, and as their files store them."""
     scores = [_explained_fraction(model, verified, max_error_px) for model in models]
@@ -166,7 +158,6 @@ def _require_agreement(
 def _explained_fraction(
     model: SparseModel, verified: Sequence[VerifiedPair], max_error_px: float
 ) -> float:
-    """Return the fraction of matches that the cameras of a model explain."""
     pairs, cameras = undistorted_pairs(model, verified), pinholes_of(model)
     right = sum(int(explained(cameras, pair, max_error_px).sum()) for pair in pairs)
     return right / max(sum(pair.num_matches for pair in pairs), 1)

@@ -64,10 +64,7 @@ class EncodedFit(Record):
 
 
 def fit_encoded(
-    problem: EncodedMatrix,
-    response: Response,
-    start: EncodedFit | None,
-    iterations: int = 1,
+    problem: EncodedMatrix, response: Response, start: EncodedFit | None, iterations: int = 1
 ) -> EncodedFit:
     """Fit first-order light to encoded values through a response; constant to autograd.
 
@@ -198,10 +195,7 @@ class GammaEstimate(Record):
 
 
 def estimate_gamma(
-    encoded: Float[Tensor, "view sample"],
-    seen: Bool[Tensor, "view sample"],
-    *,
-    rank: int = 4,
+    encoded: Float[Tensor, "view sample"], seen: Bool[Tensor, "view sample"], *, rank: int = 4
 ) -> GammaEstimate:
     """Estimate gamma from the same surface samples under several lights.
 
@@ -244,10 +238,7 @@ def estimate_gamma(
 
 
 def gamma_of_photographs(
-    views: Views,
-    *,
-    mask: Bool[Tensor, "height width"] | None = None,
-    rank: int = 4,
+    views: Views, *, mask: Bool[Tensor, "height width"] | None = None, rank: int = 4
 ) -> GammaEstimate:
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
@@ -292,9 +283,7 @@ class _Minimum(Record):
 
 
 def _problem(
-    encoded: Float[Tensor, "view sample"],
-    seen: Bool[Tensor, "view sample"],
-    rank: int,
+    encoded: Float[Tensor, "view sample"], seen: Bool[Tensor, "view sample"], rank: int
 ) -> EncodedMatrix:
     """Subsample, and use entries that are neither dark nor saturated."""
     used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
@@ -349,7 +338,6 @@ def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, Encode
 
 
 def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
-    """Minimize the loss between two exponents."""
     fit = start
 
     def loss(logarithm: float) -> float:

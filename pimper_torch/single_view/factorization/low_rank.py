@@ -210,7 +210,5 @@ def factorize_from_many(
             break
     assert best is not None
     return Restarted(
-        best=best,
-        residuals=torch.tensor(residuals, dtype=torch.float64),
-        repeated=repeated,
+        best=best, residuals=torch.tensor(residuals, dtype=torch.float64), repeated=repeated
     )

@@ -49,9 +49,7 @@ def chromaticities(
     return pixel.to(radiance), bright.any(dim=0)
 
 
-def chromaticity_groups(
-    radiance: Float[Tensor, "view channel pixel"],
-) -> Int[Tensor, " pixel"]:
+def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Tensor, " pixel"]:
     """Cluster pixels of similar chromaticity.
 
     The colour with the most neighbours becomes the first cluster, its neighbours are removed, and
@@ -107,8 +105,7 @@ _CANDIDATES, _FEW_PIXELS = 200, 1000
 
 
 def resolve_by_albedo_entropy(
-    shading: Float[Tensor, "3 pixel"],
-    groups: Int[Tensor, " pixel"] | None = None,
+    shading: Float[Tensor, "3 pixel"], groups: Int[Tensor, " pixel"] | None = None
 ) -> BasRelief:
     r"""Find the bas-relief transformation of minimum albedo entropy; constant to autograd.
 

@@ -108,8 +108,7 @@ def brightness(
 
 
 def determined(
-    weight: Float[Tensor, "view pixel"],
-    lights: Float[Tensor, "view unknown"],
+    weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
 ) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
     """Find which pixels have as many samples as unknowns, and lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
@@ -127,7 +126,6 @@ def _fit(
     weight: Float[Tensor, "view pixel"],
     rows: Float[Tensor, "view unknown"],
 ) -> Regressed:
-    """Solve the normal equations."""
     factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
     return Regressed(shading=factored.solve(rows.mT @ (weight * x)), weight=weight)
 

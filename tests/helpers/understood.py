@@ -1,0 +1,169 @@
+"""Whether the command line and the loader of settings understand what documents show."""
+
+import dataclasses
+import functools
+import re
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import import_module
+from itertools import takewhile
+from unittest import mock
+
+import tyro
+
+from pimper_torch.chains.presets import load_config
+from pimper_torch.cli.arguments import REQUIRED, Option, options_of
+from pimper_torch.cli.main import _COMMANDS, _READERS
+from pimper_torch.cli.output import split
+from pimper_torch.errors import ConfigError, PimperError
+
+# What stands for something of the reader's.
+PLACEHOLDER = re.compile(r"[A-Z]+|…|\(x,y,z,x,y,z\)")
+
+
+class Stopped(BaseException):
+    """The arguments are read, and the command itself is not begun."""
+
+
+def command_line(text: str, *, whole: bool = True) -> None:
+    """Let the command line read a command, and carry nothing out.
+
+    Args:
+        whole: Whether what a command needs must be there; else it is only mentioned.
+
+    Raises:
+        ConfigError: As the command line refuses it.
+    """
+    words = [word for word in shlex.split(text, comments=True) if word != "..."]
+    words = words[1 : words.index(">")] if ">" in words else words[1:]
+    if not words or words[0].startswith("--"):
+        return  # `pimper --help` and the like
+    if words[0] not in _COMMANDS:
+        raise ConfigError(f"there is no command {words[0]}")
+    name, given = words[0], words[1:]
+    if "--" in given:  # of `pimper batch`: options for every object
+        command_line(
+            f"pimper reconstruct {shlex.join(given[given.index('--') + 1 :])}", whole=False
+        )
+    if not whole:
+        given = _with_values(options(name), given)
+        given = _completed(options(name), given)
+    _read(name, tuple(given))
+
+
+def option(text: str) -> None:
+    """Let commands read options that a sentence names, with their values if it gives any.
+
+    Raises:
+        ConfigError: No command has them, or none takes the values.
+    """
+    words = text.removeprefix("-- ").split()
+    named = {word.partition("=")[0] for word in words if word.startswith("--")}
+    if named <= {"--help", "--help-all", "--version", "--quiet", "--json", "--log-level"}:
+        return
+    commands = [name for name in _COMMANDS if name != "config"]  # which takes any text
+    having = [name for name in commands if named <= {*options(name)}]
+    if not having:
+        raise ConfigError(f"no command has {' '.join(sorted(named))}")
+    if len(words) == 1:
+        return
+    refusals: list[PimperError] = []
+    for name in having:
+        try:
+            return command_line(f"pimper {name} {text.removeprefix('-- ')}", whole=False)
+        except PimperError as error:
+            refusals.append(error)
+    raise refusals[0]
+
+
+@functools.cache
+def options(name: str) -> Mapping[str, Option]:
+    """Return the options of a command by their names, settings of both chains among them."""
+
+    def stop(command: object, **_: object) -> None:
+        raise Stopped(command)
+
+    found = {}
+    chains: list[list[str]] = (
+        [[], ["--preset", "paper"]] if name in ("reconstruct", "demo") else [[]]
+    )
+    for preset in chains:
+        with mock.patch.object(tyro, "cli", stop):
+            try:
+                _checker(name)(name, preset)
+            except Stopped as caught:
+                found |= {x: one for one in options_of(caught.args[0]) for x in one.names}
+    return found
+
+
+def _checker(name: str) -> Callable[[str, Sequence[str]], object]:
+    home = _COMMANDS[name]
+    return import_module(_READERS.get(home, home)).checked
+
+
+@functools.cache
+def _read(name: str, arguments: tuple[str, ...]) -> None:
+    read = tyro.cli
+
+    def stop(command: Callable[..., object], **how: object) -> object:
+        @functools.wraps(command)
+        def instead(*_: object, **__: object) -> object:
+            raise Stopped
+
+        return read(instead, **how)
+
+    with mock.patch.object(tyro, "cli", stop):
+        try:
+            _checker(name)(name, split(arguments)[1])
+        except Stopped:
+            pass
+        except SystemExit as ended:  # `--help`
+            if ended.code:
+                raise
+
+
+def _with_values(known: Mapping[str, Option], words: Sequence[str]) -> list[str]:
+    """Leave out options that a sentence only names, without a value or with a placeholder."""
+    groups: list[list[str]] = [[]]
+    for word in words:
+        if word in known:
+            groups.append([])
+        groups[-1].append(word)
+    told = [group for group in groups[1:] if not (len(group) == 1 and known[group[0]].value)]
+    told = [group for group in told if not any(map(PLACEHOLDER.fullmatch, group))]
+    return [word for group in groups[:1] + told for word in group]
+
+
+def _completed(known: Mapping[str, Option], given: Sequence[str]) -> list[str]:
+    """Add what a command needs and is not given."""
+    needed = [name for name, one in known.items() if one.default is REQUIRED]
+    places = [name for name in needed if not name.startswith("-")]
+    first = [*takewhile(lambda word: not word.startswith("-"), given)]
+    words = [*first, *(["x"] * (len(places) - len(first))), *given[len(first) :]]
+    for name in needed:
+        if name.startswith("--") and not {*known[name].names} & {*given}:
+            choices = re.match(r"\{(\w+)", known[name].value)
+            words += [name, choices[1] if choices else {"--format": "maps"}.get(name, "x")]
+    return words
+
+
+def setting(mapping: Mapping[str, object], preset: str = "default") -> None:
+    """Let the loader read settings.
+
+    Raises:
+        ConfigError: As the loader refuses them.
+    """
+    load_config(preset, mapping)
+
+
+@functools.cache
+def settings() -> frozenset[str]:
+    """Return the settings of both chains and their sections, such as ``sweep.steps``."""
+
+    def names(config: object, stem: str = "") -> Iterator[str]:
+        if dataclasses.is_dataclass(config):
+            for field in dataclasses.fields(config):
+                yield stem + field.name
+                yield from names(getattr(config, field.name), f"{stem}{field.name}.")
+
+    return frozenset(name for preset in ("default", "paper") for name in names(load_config(preset)))
