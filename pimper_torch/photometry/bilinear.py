@@ -275,7 +275,7 @@ RUNNING = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class State(Record):
-    """State that every solver iterates; the first axis is the patch.
+    """Iteration state shared by all solvers, batched over patches.
 
     Attributes:
         lights: ``L``.

@@ -236,7 +236,7 @@ class LightModel:
         """Return initial lights and albedo.
 
         Soft light is along the mean normal with the views' median brightness. Of ambient and a
-        point light see ``point_light_search``.
+        point light see :func:`search_point_lights`.
         """
         if self.normals is None:
             gain, albedo = samples.brightness()
