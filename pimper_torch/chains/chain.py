@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from torch import nn
 
@@ -283,6 +283,9 @@ class Chain(Stage):
             failures=(*step.failures, *distinct(entries)),
             left_out=(*step.left_out, *left_out_of(entries)),
         )
+
+    if TYPE_CHECKING:  # completion does not see through the type of a stage's call
+        __call__ = forward
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
         """Put modules in the places of stages.
