@@ -2,10 +2,13 @@
 
 import inspect
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
-from torch import nn
+import numpy as np
+from torch import Tensor, nn
 
 from pimper_torch.errors import InputError
 from pimper_torch.records.record import Record
@@ -40,7 +43,7 @@ class Stage(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_forward_pre_hook(_check, with_kwargs=True)
+        self.register_forward_pre_hook(check_handed, with_kwargs=True)
 
 
 class Given(Stage, Generic[T]):
@@ -55,7 +58,9 @@ class Given(Stage, Generic[T]):
         return self.record
 
 
-def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
+def check_handed(
+    stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object] = MappingProxyType({})
+) -> None:
     """Refuse records of other types than a stage takes, and those that cannot be used."""
     where = type(stage).__name__
     for name, value, hint in _handed(stage, args, kwargs):
@@ -64,11 +69,19 @@ def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, obje
         if records and not isinstance(value, tuple(kinds)):
             wanted = " or ".join(kind.__name__ for kind in kinds)
             raise InputError(
-                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. It comes from "
-                "whoever called the stage, in a chain the stage before."
+                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. {_source(value)}"
             )
         if isinstance(value, Record):
             value.check(f"{where}: {name}")
+
+
+def _source(value: object) -> str:
+    """Return where a record comes from that something else was given in place of."""
+    if isinstance(value, str | Path):
+        return "`load_views` reads the photographs of a folder."
+    if isinstance(value, Tensor | np.ndarray | Sequence):
+        return "`scene_of` puts images in tensors or arrays beside their cameras."
+    return "It comes from whoever called the stage, in a chain the stage before."
 
 
 def _handed(
