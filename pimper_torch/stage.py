@@ -2,15 +2,18 @@
 
 import inspect
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from torch import Tensor, nn
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, caution, held
 from pimper_torch.records.record import Record
 
 P = ParamSpec("P")
@@ -29,6 +32,10 @@ class Stage(nn.Module):
     ``nn.Module`` alone may be called with anything and gives anything. A stage of one's own that
     derives from this class is checked where it is put into a chain and wherever it is called; and
     so are the records it is handed, when it runs.
+
+    It computes on the device and in the dtype of these records: ``stage(views.to("cuda"))``.
+    ``to`` and its like move parameters, those of a network for instance, and warn where a stage has
+    none.
     """
 
     if TYPE_CHECKING:
@@ -44,6 +51,23 @@ class Stage(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_forward_pre_hook(check_handed, with_kwargs=True)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Stage":
+        """Move parameters and buffers; warn where there are none, and records are to be moved."""
+        if any(True for _ in chain(self.parameters(), self.buffers())):
+            with held():  # stages inside that have none
+                return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        probe = torch.empty(0)
+        with suppress(AssertionError, RuntimeError):  # of a device that is not there
+            moved = fn(probe)
+            if (moved.device, moved.dtype) == (probe.device, probe.dtype):
+                return self
+        caution(
+            f"{type(self).__name__} has no parameters to move: it computes on the device and in "
+            "the dtype of the records it is called with. Move these, such as `views.to('cuda')`.",
+            stacklevel=3,
+        )
+        return self
 
 
 class Given(Stage, Generic[T]):
