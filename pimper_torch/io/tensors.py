@@ -103,7 +103,7 @@ def scene_of(
         observation_pixels=pixels[view, point],
         lenses=pinhole_lenses(cameras),
         offset_world=offset,
-    )
+    ).to(pictures.device)
     scene.check("scene_of")
     return scene
 
