@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pimper_torch.errors import InputError, caution, held
-from pimper_torch.records.record import Record
+from pimper_torch.records import Record, Views
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
@@ -82,9 +81,7 @@ class Given(Stage, Generic[T]):
         return self.record
 
 
-def check_handed(
-    stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object] = MappingProxyType({})
-) -> None:
+def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
     """Refuse records of other types than a stage takes, and those that cannot be used."""
     where = type(stage).__name__
     for name, value, hint in _handed(stage, args, kwargs):
@@ -93,17 +90,18 @@ def check_handed(
         if records and not isinstance(value, tuple(kinds)):
             wanted = " or ".join(kind.__name__ for kind in kinds)
             raise InputError(
-                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. {_source(value)}"
+                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. "
+                f"{_source(value, kinds)}"
             )
         if isinstance(value, Record):
             value.check(f"{where}: {name}")
 
 
-def _source(value: object) -> str:
+def _source(value: object, kinds: list[type]) -> str:
     """Return where a record comes from that something else was given in place of."""
-    if isinstance(value, str | Path):
+    if Views in kinds and isinstance(value, str | Path):
         return "`load_views` reads the photographs of a folder."
-    if isinstance(value, Tensor | np.ndarray | Sequence):
+    if Views in kinds and isinstance(value, Tensor | np.ndarray | Sequence):
         return "`scene_of` puts images in tensors or arrays beside their cameras."
     return "It comes from whoever called the stage, in a chain the stage before."
 

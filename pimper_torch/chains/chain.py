@@ -226,7 +226,7 @@ class Chain(Stage):
         Yields:
             The records of a pass, as soon as it is done. The next one runs when it is asked for.
         """
-        check_handed(self, (views, sparse_model, mesh))
+        check_handed(self, (views, sparse_model, mesh), {})
         names = (views if isinstance(views, Views) else views.views).names
         for named in self.references():
             view_named(named, names)  # not first after structure from motion
