@@ -137,3 +137,10 @@ def test_what_is_given_in_place_of_views_is_answered_by_what_makes_them(preset, 
     for call in (chain, lambda views: next(chain.steps(views))):
         with pytest.raises(pt.InputError, match=f"^{type(chain).__name__}: {told}"):
             call(handed)
+
+
+def test_only_where_views_are_wanted_it_is_said_what_reads_them(given):
+    with pytest.raises(pt.InputError, match=r"^Warp: views is str; .* `load_views` reads"):
+        pt.Warp()("photos/", given.cameras, None)
+    with pytest.raises(pt.InputError, match=r"^Decompose: coarse is Tensor; .*It comes from whoe"):
+        pt.Decompose()(torch.zeros(3, 3), given.cameras)
