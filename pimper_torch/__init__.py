@@ -5,7 +5,8 @@
 >>> result = chain(pt.load_views("photos/"))  # doctest: +SKIP
 >>> pt.write_result(result, chain.config, "out/")  # doctest: +SKIP
 
-Photographs and cameras at hand come in by ``scene_of``. The rest is in rooms, see ``help`` of each:
+Photographs and cameras at hand come in by ``scene_of``. The rest is in rooms, which completion and
+``dir`` list:
 
 - ``records``: what goes in, what stages hand over, and what comes out, such as ``pt.records.Mesh``
 - ``stages``: what a chain is made of, to swap or to call alone, and the settings of each

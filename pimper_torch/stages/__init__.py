@@ -1,4 +1,9 @@
-"""Every stage and chain, under one name: ``pt.stages.Warp``."""
+"""Every stage and chain, under one name: ``pt.stages.Warp``.
+
+``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
+``TraceContours`` and ``CoarseSurface``; for each scale ``Decompose``, ``Warp``, ``Factorize``,
+``Sweep``, ``Fuse``, ``Repair`` and ``Remesh``; then ``Extract``.
+"""
 
 from pimper_torch.chains.chain import Chain as Chain
 from pimper_torch.chains.chain import Step as Step
