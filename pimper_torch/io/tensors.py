@@ -1,5 +1,6 @@
 """A scene from tensors or arrays at hand: photographs, cameras, and what else is known."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -121,14 +122,16 @@ def _check_radiance(images: Tensor) -> None:
     if 2 * above > lit:  # highlights of rendered images are fewer
         raise InputError(
             f"images reach {float(images.detach().max()):.6g}, {above / lit:.0%} of what is not "
-            "black is above 1; needed: linear radiance, of which 1 is where the sensor saturates. "
-            "Divide them by it, after decoding: `radiometry.linear_from_srgb(images / 255)`."
+            "black is above 1; needed: linear radiance, of which 1 is where the sensor saturates: "
+            f"divide them by it.{_DECODED}"
         )
-    levels = images.detach().flatten()[:: 1 + images.numel() // 100_000].float() * 255
+    step = math.ceil((images.numel() / 1e5) ** 0.5) or 1
+    levels = images.detach()[..., ::step, ::step].float() * 255
     if len(torch.unique(levels)) > 16 and bool(((levels - levels.round()).abs() < 1e-3).all()):
         caution(
             "images are whole 255ths, as bytes are, which hold sRGB as a rule; needed: linear "
-            "radiance. Decode them: `radiometry.linear_from_srgb(images)`."
+            "radiance. Decode them: `radiometry.linear_from_srgb(images)`.",
+            stacklevel=3,
         )
 
 

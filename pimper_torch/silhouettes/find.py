@@ -61,8 +61,7 @@ class FindSilhouettes(Stage):
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
             found = Silhouettes(
                 inside=by_view(Tensor.float, masks), reliable=reliable, source="masks"
-            )
-            found = found.to(masks.device)
+            ).to(masks.device)
             return self._agreeing(_believed(found, scene.views.names), scene)
         if config.object == "masks":
             raise InputError(
