@@ -1,16 +1,36 @@
 """Dense surfaces from photographs of many viewpoints under many unknown lights.
 
 >>> import pimper_torch as pt
->>> views = pt.load_views("photos/")  # doctest: +SKIP
->>> result = pt.load_chain("default")(views)  # doctest: +SKIP
+>>> chain = pt.load_chain("default")
+>>> result = chain(pt.load_views("photos/"))  # doctest: +SKIP
+>>> pt.write_result(result, chain.config, "out/")  # doctest: +SKIP
+
+Photographs and cameras at hand come in by ``scene_of``. The rest is in rooms, which completion and
+``dir`` list:
+
+- ``records``: what goes in, what stages hand over, and what comes out, such as ``pt.records.Mesh``
+- ``stages``: what a chain is made of, to swap or to call alone, and the settings of each
+- ``priors``, ``prior_files``: guesses of networks, in memory and in folders
+- ``size``, ``viz``: real size by markers or lengths; figures
+- ``exchange``, ``radiometry``, ``store``: folders of results; response curves; kept stages
+- ``batches``, ``single_view``: many objects; one viewpoint under many lights
+- ``errors``: all that are raised on purpose are ``PimperError``
+
+What documents call ``pt.Mesh`` or ``pt.Warp`` is that of its room.
 """
 
 import lazy_loader
 
 # Public names stand in `__init__.pyi`, for type checkers, too. What needs torch is imported when it
 # is asked for, so that the command line answers at once.
-_public, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__ += ["__version__"]
+_public, _, _names = lazy_loader.attach_stub(__name__, __file__)
+
+__all__ = [
+    *("batches", "errors", "exchange", "prior_files", "priors", "radiometry", "records"),
+    *("single_view", "size", "stages", "store", "viz"),
+    *("load_views", "scene_of", "read_mesh", "load_chain", "load_config", "find_scale", "show"),
+    *("write_result", "read_result", "PimperError", "__version__"),
+]
 
 
 def __getattr__(name: str) -> object:

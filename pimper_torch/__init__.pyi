@@ -1,5 +1,17 @@
 # Public names, which are imported when they are asked for (`__init__.py`).
 __all__: list[str]
+from . import batches as batches
+from . import errors as errors
+from . import exchange as exchange
+from . import prior_files as prior_files
+from . import priors as priors
+from . import radiometry as radiometry
+from . import records as records
+from . import single_view as single_view
+from . import size as size
+from . import stages as stages
+from . import store as store
+from . import viz as viz
 from .batches.many_objects import batch as batch
 from .batches.objects import Object as Object
 from .batches.task import Outcome as Outcome
@@ -87,3 +99,4 @@ from .viz.patch_figures import plot_in_view as plot_in_view
 from .viz.patch_figures import plot_patch as plot_patch
 
 __version__: str
+_names: list[str]

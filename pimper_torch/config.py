@@ -10,7 +10,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from enum import Enum
 from importlib import resources
 from pathlib import Path
@@ -152,7 +152,7 @@ def find_config(name_or_path: str | Path) -> Path:
         return path
     if name_or_path not in presets():
         raise ConfigError(
-            f"there is no preset {name_or_path!r}.{_nearest(name_or_path, presets())} "
+            f"there is no preset {name_or_path!r}.{nearest(name_or_path, presets())} "
             f"Presets: {', '.join(presets())}; or give the path of a YAML file."
         )
     return _preset_folder() / f"{name_or_path}.yaml"
@@ -349,14 +349,15 @@ def _cut(text: str, most: int = 200) -> str:
 def _unknown(key: object, cls: type[object], where: str, section: str, root: type[object]) -> str:
     homes = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
     elsewhere = f" Did you mean `{'` or `'.join(homes)}`?"
-    hint = elsewhere if homes else _nearest(_cut(str(key)), _names(cls))
+    hint = elsewhere if homes else nearest(_cut(str(key)), _names(cls))
     return (
         f"{where}: {'section `' + section + '`' if section else 'the top level'} has no setting "
         f"`{_cut(str(key))}`.{hint} Settings there: {', '.join(_names(cls))}."
     )
 
 
-def _nearest(key: str, valid: tuple[str, ...]) -> str:
+def nearest(key: str, valid: Sequence[str]) -> str:
+    """Ask whether another name was meant, in a sentence; nothing where none is near."""
     near = difflib.get_close_matches(key, valid, n=1, cutoff=0.5)
     return f" Did you mean `{near[0]}`?" if near else ""
 

@@ -2,13 +2,18 @@
 
 import inspect
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Generic, ParamSpec, Protocol, TypeVar, runtime_checkable
 
-from torch import nn
+import numpy as np
+import torch
+from torch import Tensor, nn
 
-from pimper_torch.errors import InputError
-from pimper_torch.records.record import Record
+from pimper_torch.errors import InputError, caution, held
+from pimper_torch.records import Record, Views
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
@@ -26,6 +31,10 @@ class Stage(nn.Module):
     ``nn.Module`` alone may be called with anything and gives anything. A stage of one's own that
     derives from this class is checked where it is put into a chain and wherever it is called; and
     so are the records it is handed, when it runs.
+
+    It computes on the device and in the dtype of these records: ``stage(views.to("cuda"))``.
+    ``to`` and its like move parameters, those of a network for instance, and warn where a stage has
+    none.
     """
 
     if TYPE_CHECKING:
@@ -40,7 +49,24 @@ class Stage(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_forward_pre_hook(_check, with_kwargs=True)
+        self.register_forward_pre_hook(check_handed, with_kwargs=True)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Stage":
+        """Move parameters and buffers; warn where there are none, and records are to be moved."""
+        if any(True for _ in chain(self.parameters(), self.buffers())):
+            with held():  # stages inside that have none
+                return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        probe = torch.empty(0)
+        with suppress(AssertionError, RuntimeError):  # of a device that is not there
+            moved = fn(probe)
+            if (moved.device, moved.dtype) == (probe.device, probe.dtype):
+                return self
+        caution(
+            f"{type(self).__name__} has no parameters to move: it computes on the device and in "
+            "the dtype of the records it is called with. Move these, such as `views.to('cuda')`.",
+            stacklevel=3,
+        )
+        return self
 
 
 class Given(Stage, Generic[T]):
@@ -55,7 +81,7 @@ class Given(Stage, Generic[T]):
         return self.record
 
 
-def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
+def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
     """Refuse records of other types than a stage takes, and those that cannot be used."""
     where = type(stage).__name__
     for name, value, hint in _handed(stage, args, kwargs):
@@ -64,11 +90,20 @@ def _check(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, obje
         if records and not isinstance(value, tuple(kinds)):
             wanted = " or ".join(kind.__name__ for kind in kinds)
             raise InputError(
-                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. It comes from "
-                "whoever called the stage, in a chain the stage before."
+                f"{where}: {name} is {type(value).__name__}; needed: {wanted}. "
+                f"{_source(value, kinds)}"
             )
         if isinstance(value, Record):
             value.check(f"{where}: {name}")
+
+
+def _source(value: object, kinds: list[type]) -> str:
+    """Return where a record comes from that something else was given in place of."""
+    if Views in kinds and isinstance(value, str | Path):
+        return "`load_views` reads the photographs of a folder."
+    if Views in kinds and isinstance(value, Tensor | np.ndarray | Sequence):
+        return "`scene_of` puts images in tensors or arrays beside their cameras."
+    return "It comes from whoever called the stage, in a chain the stage before."
 
 
 def _handed(

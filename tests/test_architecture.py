@@ -53,6 +53,7 @@ ROOMS = [
     "reporting",
     "priors",
     "chains",
+    "stages",
     "viz",
     "asset",
     "relighting",

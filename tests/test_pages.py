@@ -4,6 +4,7 @@ import ast
 import functools
 import re
 from importlib import import_module
+from inspect import ismodule
 from pathlib import Path
 
 import pytest
@@ -87,9 +88,9 @@ def documented() -> set[str]:
 
 def test_the_reference_has_the_modules_of_all_public_names():
     homes = {
-        getattr(pimper_torch, name).__module__
-        for name in pimper_torch.__all__
-        if name != "__version__"
+        value.__module__
+        for name in pimper_torch._names
+        if not ismodule(value := getattr(pimper_torch, name))
     }
     assert homes <= documented()
 

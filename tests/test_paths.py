@@ -18,7 +18,7 @@ EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 def functions() -> Iterator[typing.Any]:
     """List what users call: exported names, and the public functions of the rooms at the edge."""
-    yield from (getattr(pimper_torch, name) for name in pimper_torch.__all__)
+    yield from (getattr(pimper_torch, name) for name in pimper_torch._names)
     for name in EXPORTING:
         room = importlib.import_module(f"pimper_torch.evidence.{name}")
         yield from (getattr(room, exported) for exported in room.__all__)

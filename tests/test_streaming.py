@@ -7,7 +7,6 @@ from twins import using
 
 import pimper_torch as pt
 from pimper_torch.chains.streaming import photometry_and_heights
-from pimper_torch.errors import ConfigError
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
@@ -137,11 +136,6 @@ def test_who_watches_is_shown_cameras_and_every_pass_and_changes_nothing():
     assert [report.name for report in found.report].count("view") == 3
     assert torch.equal(found.mesh.vertices_world, expected.mesh.vertices_world)
     assert torch.equal(found.mesh.albedo, expected.mesh.albedo)
-
-
-def test_a_stage_that_the_chain_has_not_is_refused():
-    with pytest.raises(ConfigError, match=r"the stage 'factorise'.*needed: one of.*factorize"):
-        pt.load_chain("default", factorise=Given(None))
 
 
 def test_a_round_reports_its_photometry_once_and_what_each_part_takes():

@@ -1,6 +1,6 @@
 """The names that the package exports, with their first lines, as a table of links."""
 
-from inspect import getdoc
+from inspect import getdoc, ismodule
 
 from docutils import nodes
 from docutils.statemachine import StringList
@@ -13,9 +13,9 @@ import pimper_torch
 def lines() -> list[str]:
     """Write the table: a link to each name, and what it is for."""
     written = [".. list-table::", "   :widths: 30 70", ""]
-    for name in sorted(pimper_torch.__all__, key=str.lower):
-        if name != "__version__":
-            value = getattr(pimper_torch, name)
+    for name in sorted(pimper_torch._names, key=str.lower):
+        value = getattr(pimper_torch, name)
+        if not ismodule(value):
             written.append(f"   * - :py:obj:`{name} <{value.__module__}.{value.__qualname__}>`")
             written.append(f"     - {(getdoc(value) or '').splitlines()[0]}")
     return written

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from torch import nn
 
@@ -12,8 +12,8 @@ from pimper_torch.chains.running import Running
 from pimper_torch.coarse.depth_points import depth_points
 from pimper_torch.coarse.given_mesh import prepared
 from pimper_torch.coarse.reference import view_named
-from pimper_torch.config import require
-from pimper_torch.errors import InputError
+from pimper_torch.config import nearest
+from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
 from pimper_torch.kernels.compile import compile_ahead
 from pimper_torch.ledger import left_out_of
@@ -36,12 +36,13 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
+from pimper_torch.sfm.conventions.mesh_frame import refuse_other_axes
 from pimper_torch.sfm.poses import with_poses
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sparse_scene import sound
 from pimper_torch.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.sfm.undistort import with_undistorted_priors
-from pimper_torch.stage import Stage
+from pimper_torch.stage import Stage, check_handed
 from pimper_torch.store import Store
 
 
@@ -166,7 +167,9 @@ class Chain(Stage):
                 f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
                 f"{sparse_model}; needed: one of the two."
             )
-        elif mesh is None and isinstance(self.reconstruct, Reconstruct):
+        elif mesh is not None:
+            refuse_other_axes(mesh, views)
+        elif isinstance(self.reconstruct, Reconstruct):
             views = self.reconstruct.with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
@@ -223,6 +226,7 @@ class Chain(Stage):
         Yields:
             The records of a pass, as soon as it is done. The next one runs when it is asked for.
         """
+        check_handed(self, (views, sparse_model, mesh), {})
         names = (views if isinstance(views, Views) else views.views).names
         for named in self.references():
             view_named(named, names)  # not first after structure from motion
@@ -284,6 +288,9 @@ class Chain(Stage):
             left_out=(*step.left_out, *left_out_of(entries)),
         )
 
+    if TYPE_CHECKING:  # completion does not see through the type of a stage's call
+        __call__ = forward
+
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
         """Put modules in the places of stages.
 
@@ -291,6 +298,10 @@ class Chain(Stage):
             ConfigError: The chain has no stage of that name.
         """
         for name, module in stages.items():
-            known = [name for name, _ in self.named_children()]
-            require(name in known, f"the stage {name!r}", module, f"one of {', '.join(known)}")
+            known = [known for known, _ in self.named_children()]
+            if name not in known:
+                raise ConfigError(
+                    f"{type(self).__name__} has no stage `{name}`.{nearest(name, known)} Stages: "
+                    f"{', '.join(known)}."
+                )
             setattr(self, name, module)

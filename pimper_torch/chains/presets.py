@@ -25,16 +25,22 @@ def load_config(
         changes: Laid over the file, nested by stage like it.
 
     Raises:
-        ConfigError: Names the file, the section and the key, and the nearest valid one.
+        ConfigError: Names the file or `changes`, section and key, and the nearest valid one.
     """
     path = find_config(name_or_path)
-    settings = overlay(read_mapping(path), changes or {})
+    settings = read_mapping(path)
+    config = _built(settings, str(path))
+    return _built(overlay(settings, changes), "changes") if changes else config
+
+
+def _built(settings: Mapping[str, object], where: str) -> Config:
+    """Make the config of the chain that settings are for."""
     chain = settings.get("chain", CoarseToFineConfig.chain)
     found = [config for config in (CoarseToFineConfig, PublishedConfig) if config.chain == chain]
     names = f"{CoarseToFineConfig.chain} or {PublishedConfig.chain}"
-    require(len(found) == 1, f"{path}: chain", chain, names)
+    require(len(found) == 1, f"{where}: chain", chain, names)
     config: type[Config] = found[0]
-    return build(config, settings, str(path))
+    return build(config, settings, where)
 
 
 def make_chain(

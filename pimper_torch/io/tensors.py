@@ -1,5 +1,6 @@
 """A scene from tensors or arrays at hand: photographs, cameras, and what else is known."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,12 +8,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.local_frame import NO_OFFSET, local_origin, to_local
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.sfm.colmap import pinhole_lenses
 
+_DECODED = (
+    " Bytes hold sRGB as a rule: `radiometry.linear_from_srgb(images / 255)` decodes them, "
+    "`load_views` reads files."
+)
 Array = Tensor | np.ndarray | Sequence[object]
 
 
@@ -33,7 +38,7 @@ def scene_of(
 
     Args:
         images: Linear radiance, ``view channel height width``; 1 is where the sensor saturates.
-            Bytes are refused: decode them to linear radiance first.
+            Bytes, and values to 255, are refused: decode them to linear radiance first.
         intrinsics: ``K`` of every view, ``view 3 3``, or one for all, ``3 3``; in pixels, the
             centre of the top-left pixel at (0.5, 0.5).
         cam_from_world: ``view 4 4`` or ``view 3 4``, rigid; camera axes x right, y down, z forward.
@@ -52,10 +57,7 @@ def scene_of(
         InputError: A shape or a value that means nothing, or cameras that look the wrong way.
     """
     pictures = _floats(images, "images", "linear radiance, view channel height width")
-    if pictures.ndim != 4:
-        raise InputError(
-            f"images has shape {tuple(pictures.shape)}; needed: view channel height width."
-        )
+    _check_radiance(pictures)
     count, _, height, width = pictures.shape
     sizes = torch.tensor([[width, height]]).repeat(count, 1).to(pictures.device)
     views = Views(
@@ -102,9 +104,35 @@ def scene_of(
         observation_pixels=pixels[view, point],
         lenses=pinhole_lenses(cameras),
         offset_world=offset,
-    )
+    ).to(pictures.device)
     scene.check("scene_of")
     return scene
+
+
+def _check_radiance(images: Tensor) -> None:
+    """Refuse images of another layout or range; warn of those that look coded."""
+    shape = tuple(images.shape)
+    if images.ndim != 4 or shape[1] not in (1, 3):
+        last = images.ndim == 4 and shape[3] in (1, 3)
+        told = " Channels come last: call `images.permute(0, 3, 1, 2)`." if last else ""
+        raise InputError(
+            f"images has shape {shape}; needed: view channel height width, 1 or 3 channels.{told}"
+        )
+    above, lit = (int((images > bound).sum()) for bound in (1, 0))
+    if 2 * above > lit:  # highlights of rendered images are fewer
+        raise InputError(
+            f"images reach {float(images.detach().max()):.6g}, {above / lit:.0%} of what is not "
+            "black is above 1; needed: linear radiance, of which 1 is where the sensor saturates: "
+            f"divide them by it.{_DECODED}"
+        )
+    step = math.ceil((images.numel() / 1e5) ** 0.5) or 1
+    levels = images.detach()[..., ::step, ::step].float() * 255
+    if len(torch.unique(levels)) > 16 and bool(((levels - levels.round()).abs() < 1e-3).all()):
+        caution(
+            "images are whole 255ths, as bytes are, which hold sRGB as a rule; needed: linear "
+            "radiance. Decode them: `radiometry.linear_from_srgb(images)`.",
+            stacklevel=3,
+        )
 
 
 def _floats(values: Array, name: str, what: str) -> Tensor:
@@ -112,7 +140,7 @@ def _floats(values: Array, name: str, what: str) -> Tensor:
     if not tensor.is_floating_point():
         raise InputError(
             f"{name} is {str(tensor.dtype).removeprefix('torch.')}; needed: {what}, in floating "
-            "point. Photographs as bytes are decoded by `load_views`."
+            f"point.{_DECODED if name == 'images' else ''}"
         )
     return tensor
 

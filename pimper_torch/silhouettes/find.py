@@ -61,14 +61,14 @@ class FindSilhouettes(Stage):
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
             found = Silhouettes(
                 inside=by_view(Tensor.float, masks), reliable=reliable, source="masks"
-            )
+            ).to(masks.device)
             return self._agreeing(_believed(found, scene.views.names), scene)
         if config.object == "masks":
             raise InputError(
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
                 "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
             )
-        return by_series(scene, self._found)
+        return by_series(scene, self._found).to(scene.views.images.device)
 
     def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
         """Replace masks that clearly contradict the others by what the hull of these shows."""

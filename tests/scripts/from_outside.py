@@ -21,5 +21,10 @@ def main(site_packages: str) -> None:
     assert_type(chain, pt.CoarseToFine | pt.Published)
 
 
+def reconstructed(folder: str) -> pt.Mesh:
+    """Return what a checker of types has to know the type of; nothing calls it."""
+    return assert_type(pt.load_chain("default")(pt.load_views(folder)), pt.Reconstruction).mesh
+
+
 if __name__ == "__main__":
     main(sys.argv[1])

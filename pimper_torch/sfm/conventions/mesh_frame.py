@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
+from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
 
@@ -72,6 +73,40 @@ def compare_with_scene(
         "observations": fit.hits,
     }
     return {name: value for name, value in figures.items() if not math.isnan(value)}
+
+
+def refuse_other_axes(mesh: Mesh, scene: SparseScene) -> None:
+    """Refuse poses that miss a mesh, where camera-to-world or cameras of OpenGL would show it.
+
+    Raises:
+        InputError: Says which, and how to turn them into poses that are right.
+    """
+    cameras = scene.cameras
+    poses = cameras.cam_from_world.detach().double()
+    given = from_local(poses, scene.offset_world)  # where a scene is far off, it may be for this
+    inverse, flip = torch.linalg.inv(given), poses.new_tensor([1.0, -1, -1, 1]).diag()
+    used = mesh.vertices_world.detach()[mesh.faces.flatten()][:: 1 + mesh.faces.numel() // 1000]
+    others = {
+        "torch.linalg.inv(poses)": (inverse, "camera-to-world"),
+        "flip @ poses": (flip @ given, "of cameras with y up and z backward"),
+        "flip @ torch.linalg.inv(poses)": (flip @ inverse, "camera-to-world, y up, z backward"),
+    }
+
+    def showing(poses: Tensor) -> int:
+        pixels, depth = project(used.to(poses), poses, cameras.intrinsics.detach().to(poses))
+        sizes = cameras.sizes_px[:, None]
+        shown = (depth > 0) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
+        return int((shown.double().mean(dim=1) > 0.5).sum())
+
+    seen = showing(poses)
+    for code, (other, what) in others.items():
+        count = showing(other)
+        if count >= 0.9 * len(poses) and seen < 0.5 * count:
+            raise InputError(
+                f"The given mesh is in {seen} of {len(poses)} photographs by their poses, but in "
+                f"{count} by `{code}`{', with `flip = diag(1, -1, -1, 1)`' * ('flip' in code)}: "
+                f"they seem to be {what}; needed: cam_from_world, x right, y down, z forward."
+            )
 
 
 class _Fit(NamedTuple):

@@ -1,0 +1,146 @@
+"""Plausible mistakes are refused in a sentence that says what was found and what to do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from probes import small_scene
+
+import pimper_torch as pt
+from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_torch.radiometry import linear_from_srgb, to_bytes
+from tests.coarse import ball
+
+FLIP = torch.tensor([1.0, -1, -1, 1]).diag()
+
+
+@pytest.fixture(scope="module")
+def given():
+    scene, _ = small_scene(num_views=4, width=48)
+    return scene.to(torch.float32)
+
+
+def scene_of(scene, images):
+    return pt.scene_of(images, scene.cameras.intrinsics, scene.cameras.cam_from_world)
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "told"),
+    [
+        (
+            lambda linear: linear.permute(0, 2, 3, 1),
+            r"images has shape \(4, 36, 48, 3\); .*1 or 3 channels.*`images.permute\(0, 3",
+        ),
+        (
+            lambda linear: torch.cat([linear, linear[:, :1]], dim=1),
+            r"images has shape \(4, 4, 36, 48\); needed: .* 1 or 3 channels\.$",
+        ),
+        (lambda linear: linear[:, 0], r"images has shape \(4, 36, 48\); needed: view channel"),
+        (
+            lambda linear: 255 * linear,
+            r"images reach \d+.*\d% .* above 1; .*1 is where .*: divide them .*linear_from_srgb",
+        ),
+        (to_bytes, r"images is uint8; .*hold sRGB.*linear_from_srgb\(images / 255\)`.*load_views"),
+        (lambda linear: to_bytes(linear).numpy(), "images is uint8; "),
+    ],
+)
+def test_images_of_another_layout_range_or_coding_are_refused(given, mistaken, told):
+    with pytest.raises(pt.InputError, match=told):
+        scene_of(given, mistaken(given.views.images))
+
+
+def test_images_that_look_like_srgb_are_warned_of_and_not_when_decoded(given, recwarn):
+    coded = to_bytes(given.views.images) / 255
+    with pytest.warns(pt.PimperWarning, match=r"255ths.*hold sRGB.*linear_from_srgb\(images\)"):
+        scene_of(given, coded)
+    recwarn.clear()
+    scene_of(given, linear_from_srgb(coded))
+    scene_of(given, given.views.images)
+    scene_of(given, (given.views.images > 0.3).float())
+    scene_of(given, torch.where(given.views.images > 0.5, 40.0, given.views.images))  # highlights
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "told"),
+    [
+        (torch.linalg.inv, r"by `torch.linalg.inv\(poses\)`: they seem to be camera-to-world;"),
+        (lambda poses: FLIP @ poses, r"by `flip @ poses`, with `flip = .*y up and z backward"),
+        (
+            lambda poses: torch.linalg.inv(FLIP @ poses),
+            r"by `flip @ torch.linalg.inv\(poses\)`, with `flip = .*camera-to-world, y up",
+        ),
+    ],
+)
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_poses_of_another_direction_or_other_axes_are_told_by_the_mesh(preset, mistaken, told):
+    scene = ball.photographed(ball.all_round())
+    vertices, faces = icosphere(1)
+    mesh = pt.Mesh(vertices_world=vertices, faces=faces)
+    chain = pt.load_chain(preset)
+    chain.placed(chain.running(), scene, None, mesh)
+    poses = mistaken(scene.cameras.cam_from_world)
+    wrong = pt.scene_of(scene.views.images, scene.cameras.intrinsics, poses)
+    with pytest.raises(pt.InputError, match=f"^The given mesh is in .* of 12 photographs.*{told}"):
+        chain(wrong, mesh=mesh)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (
+            lambda: pt.load_chain("default", {"factorise": {"prior": "flat"}}),
+            "changes: the top level has no setting `factorise`. Did you mean `factorize`?",
+        ),
+        (
+            lambda: pt.load_chain("default", {"sweep": {"step": 7}}),
+            "changes: section `sweep` has no setting `step`. Did you mean `steps`?",
+        ),
+        (
+            lambda: pt.load_config("paper", {"scales": [1.0]}),
+            "changes: the top level has no setting `scales`",
+        ),
+        (
+            lambda: pt.load_config("paper", {"chain": "publisht"}),
+            "changes: chain is 'publisht'; needed: coarse-to-fine or published",
+        ),
+        (
+            lambda: pt.CoarseToFine(factorise=pt.Factorize()),
+            "CoarseToFine has no stage `factorise`. Did you mean `factorize`? Stages: ",
+        ),
+        (
+            lambda: pt.load_chain("paper", tryangulate=pt.Triangulate()),
+            "Published has no stage `tryangulate`. Did you mean `triangulate`?",
+        ),
+    ],
+)
+def test_a_misspelt_stage_or_setting_is_answered_by_the_nearest(call, told):
+    with pytest.raises(pt.ConfigError) as caught:
+        call()
+    assert str(caught.value).startswith(told)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize(
+    ("handed", "told"),
+    [
+        ("photos/", "views is str; needed: Views or SparseScene. `load_views` reads"),
+        (Path("photos"), "views is PosixPath; .* `load_views` reads"),
+        (torch.zeros(3, 3, 8, 8), "views is Tensor; .* `scene_of` puts images"),
+        (np.zeros((3, 3, 8, 8)), "views is ndarray; .* `scene_of` puts images"),
+        (None, "views is NoneType; .*It comes from whoever"),
+    ],
+)
+def test_what_is_given_in_place_of_views_is_answered_by_what_makes_them(preset, handed, told):
+    chain = pt.load_chain(preset)
+    for call in (chain, lambda views: next(chain.steps(views))):
+        with pytest.raises(pt.InputError, match=f"^{type(chain).__name__}: {told}"):
+            call(handed)
+
+
+def test_only_where_views_are_wanted_it_is_said_what_reads_them(given):
+    with pytest.raises(pt.InputError, match=r"^Warp: views is str; .* `load_views` reads"):
+        pt.Warp()("photos/", given.cameras, None)
+    with pytest.raises(pt.InputError, match=r"^Decompose: coarse is Tensor; .*It comes from whoe"):
+        pt.Decompose()(torch.zeros(3, 3), given.cameras)

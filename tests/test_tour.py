@@ -1,0 +1,43 @@
+"""What somebody meets who looks round in the package: names, help, completion."""
+
+import pydoc
+from inspect import ismodule
+
+import jedi
+import pytest
+
+import pimper_torch as pt
+
+
+def test_the_tour_is_one_screen():
+    assert dir(pt) == sorted(pt.__all__)
+    assert len(pt.__all__) < 30
+    assert len(pydoc.plain(pydoc.render_doc(pt))) < 20_000
+
+
+def test_a_public_name_stands_at_the_top_or_in_a_room_that_does():
+    rooms = [room for name in pt.__all__ if ismodule(room := getattr(pt, name))]
+    for name in pt._names:
+        value = getattr(pt, name)
+        assert name in pt.__all__ or any(getattr(room, name, None) is value for room in rooms), name
+    assert all(name in pt.__doc__ for name in pt.__all__ if ismodule(getattr(pt, name)))
+    with pytest.raises(AttributeError, match="wrap"):
+        _ = pt.wrap
+
+
+@pytest.mark.parametrize(
+    ("code", "offered"),
+    [
+        ('pt.load_chain("default")(pt.load_views("photos/")).', {"mesh", "scene", "report"}),
+        ('pt.load_chain("default").', {"factorize", "sweep", "steps", "config"}),
+        ('pt.CoarseToFine()(pt.load_views("photos/")).mesh.', {"vertices_world", "albedo"}),
+        ('next(pt.Published().steps(pt.load_views("photos/"))).', {"photometric", "surface"}),
+        ("pt.stages.", {"Warp", "Factorize", "Stage"}),
+    ],
+)
+def test_an_editor_and_a_notebook_offer_what_there_is(code, offered):
+    """Nothing is run for it."""
+    in_a_file = jedi.Script(f"import pimper_torch as pt\n{code}").complete()
+    assert offered <= {one.name for one in in_a_file}
+    in_a_cell = jedi.Interpreter(code, [{"pt": pt}]).complete()
+    assert offered <= {one.name for one in in_a_cell}
