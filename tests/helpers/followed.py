@@ -37,7 +37,7 @@ VARIABLES = {
     "step": Of(pt.Step),
     "views": Of(pt.Views),
 }
-_EXPORTED = {name: getattr(pt, name) for name in pt.__all__}
+_EXPORTED = {name: getattr(pt, name) for name in (*pt.__all__, *pt.stages.__all__)}
 
 
 def follow(text: str) -> None:
