@@ -37,7 +37,9 @@ VARIABLES = {
     "step": Of(pt.Step),
     "views": Of(pt.Views),
 }
-_EXPORTED = {name: getattr(pt, name) for name in (*pt.__all__, *pt.stages.__all__)}
+_EXPORTED = {name: getattr(pt.stages, name) for name in dir(pt.stages)} | {
+    name: getattr(pt, name) for name in pt.__all__
+}
 
 
 def follow(text: str) -> None:
