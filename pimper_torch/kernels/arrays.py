@@ -58,16 +58,6 @@ class Samples(NamedTuple):
     outward: Floats4
 
 
-class ConeProblem(NamedTuple):
-    """A batch of problems: see ``photometry.bilinear``; ``given`` are the weights."""
-
-    radiance: Floats3
-    given: Floats3
-    anchor: Floats3
-    regularization: Floats2
-    prior: Floats3
-
-
 def as_array(values: Tensor, dtype: torch.dtype | None = None) -> NDArray[Any]:
     """Share a tensor's memory if it has the type and is contiguous on the CPU, else copy it."""
     return values.detach().to("cpu", dtype).contiguous().numpy()

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.arrays import ConeProblem, Doubles3, Floats1, Floats2, Floats3
+from pimper_torch.kernels.arrays import Doubles1, Doubles2, Doubles3
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import eliminate
 from pimper_torch.kernels.factorization import samples_that_count
@@ -27,7 +27,6 @@ from pimper_torch.kernels.twin_constants import (
 )
 
 Doubles = NDArray[np.float64]
-Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 # Newton steps at most, the shortest fraction of one, and the step, over the unknowns, that ends
@@ -39,23 +38,23 @@ _STEPS, _SHORTEST, _CLOSE = 30, 1e-3, 1e-11
 _RIDGE = 1e-10
 
 
-class Cotangents(NamedTuple):
-    """Derivatives of a loss by the solution's parts: see ``Factors``."""
+class Solved(NamedTuple):
+    """Solutions of a batch, or derivatives by them: see ``Factors``."""
 
-    lights: Floats3
-    shading: Floats3
-    weight: Floats3
-    residual: Floats1
+    lights: Doubles3
+    shading: Doubles3
+    weight: Doubles3
+    residual: Doubles1
 
 
-class DataGradients(NamedTuple):
-    """Derivatives of a loss by the problem's parts: see ``Bilinear``."""
+class Given(NamedTuple):
+    """Data of a batch, or derivatives by them: see ``Bilinear``."""
 
-    radiance: Floats3
-    weight: Floats3
-    anchor: Floats3
-    regularization: Floats2
-    prior: Floats3
+    radiance: Doubles3
+    weight: Doubles3
+    anchor: Doubles3
+    regularization: Doubles2
+    prior: Doubles3
 
 
 class Data(NamedTuple):
@@ -106,7 +105,7 @@ class Point(NamedTuple):
 
 
 @compiled()
-def _views_with_data(given: Floats) -> Integers:
+def _views_with_data(given: Doubles) -> Integers:
     found = np.empty(len(given), np.int64)
     count = 0
     for f in range(len(given)):
@@ -118,7 +117,7 @@ def _views_with_data(given: Floats) -> Integers:
 
 @compiled()
 def _data(
-    problem: ConeProblem,
+    problem: Given,
     p: int,
     views: Integers,
     samples: Integers,
@@ -134,7 +133,7 @@ def _data(
     for f in range(len(views)):
         for k in range(len(samples)):
             radiance[f, k] = problem.radiance[p, views[f], samples[k]]
-            given[f, k] = problem.given[p, views[f], samples[k]]
+            given[f, k] = problem.weight[p, views[f], samples[k]]
             size += abs(radiance[f, k])
             count += given[f, k]
         for i in range(4):
@@ -609,8 +608,8 @@ def _pull_back(
     p: int,
     views: Integers,
     samples: Integers,
-    given: Cotangents,
-    found: DataGradients,
+    given: Solved,
+    found: Given,
 ) -> None:
     num_views, num_samples = len(views), len(samples)
     at = _point(num_views, num_samples)
@@ -696,28 +695,19 @@ def _pull_back(
 
 
 @compiled(annotated=True)
-def refine(
-    problem: ConeProblem,
-    loss: int,
-    scale: float,
-    stride: int,
-    lights: Doubles3,
-    shading: Doubles3,
-    weight: Floats3,
-    residual: Floats1,
-) -> None:
+def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solved) -> None:
     """Take a batch of solutions to rest by Newton's method, and compute weights and residuals.
 
     Args:
         loss: Its code.
         scale: Of the loss, in standard deviations.
         stride: The deviation is estimated from every ``stride``-th sample.
-        lights: Where it starts; becomes the solution, and so does ``shading``.
-        weight: Zero before.
+        solution: Lights and shading where it starts; weights and residuals are zero before.
     """
+    lights, shading, weight, residual = solution
     for p in range(len(lights)):
-        views = _views_with_data(problem.given[p])
-        samples, num_scale = samples_that_count(problem.given[p], stride)
+        views = _views_with_data(problem.weight[p])
+        samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
             continue
         data = _data(problem, p, views, samples, num_scale, loss, scale)
@@ -741,14 +731,14 @@ def refine(
 
 @compiled(annotated=True)
 def pull_back(
-    problem: ConeProblem,
+    problem: Given,
     loss: int,
     scale: float,
     stride: int,
     lights: Doubles3,
     shading: Doubles3,
-    given: Cotangents,
-    found: DataGradients,
+    given: Solved,
+    found: Given,
 ) -> None:
     """Compute derivatives by the data from those by the solution: the adjoint, at rest.
 
@@ -759,11 +749,11 @@ def pull_back(
     for p in range(len(lights)):
         for f in range(lights.shape[1]):
             # The light of a view without data is its anchor.
-            if problem.regularization[p, f] > 0 and not np.any(problem.given[p, f] > 0):
+            if problem.regularization[p, f] > 0 and not np.any(problem.weight[p, f] > 0):
                 for i in range(4):
                     found.anchor[p, f, i] = given.lights[p, f, i]
-        views = _views_with_data(problem.given[p])
-        samples, num_scale = samples_that_count(problem.given[p], stride)
+        views = _views_with_data(problem.weight[p])
+        samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
             continue
         data = _data(problem, p, views, samples, num_scale, loss, scale)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.kernels.arrays import ConeProblem, Floats1, Floats3, Integers1
+from pimper_torch.kernels.arrays import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import solve_damped
 from pimper_torch.kernels.robust_scale import robust_variance
@@ -41,6 +41,16 @@ _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 # Row and column of each entry of a packed matrix.
 _ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
 _COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
+
+
+class ConeProblem(NamedTuple):
+    """A batch of problems: see ``photometry.bilinear``; ``given`` are the weights."""
+
+    radiance: Floats3
+    given: Floats3
+    anchor: Floats3
+    regularization: Floats2
+    prior: Floats3
 
 
 class Limits(NamedTuple):

@@ -10,6 +10,7 @@ lights and shading, and the dependence of robust weights on the residuals' devia
 eliminated, as in :mod:`~pimper_torch.photometry.variable_projection`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pimper_torch.kernels.arrays import ConeProblem, as_array
+from pimper_torch.kernels.arrays import as_array
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.photometry.bilinear import (
     Bilinear,
     Factors,
@@ -27,6 +29,7 @@ from pimper_torch.photometry.bilinear import (
     robust_weights,
     root_mean_square,
 )
+from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.quadratics import (
     apply_packed,
     combination,
@@ -35,8 +38,10 @@ from pimper_torch.photometry.quadratics import (
     unpacked,
 )
 from pimper_torch.photometry.robust import Squares
-from pimper_torch.photometry.variable_projection import has_kernel
 from pimper_torch.records import Record
+
+# The step of the lights, over these, that ends Newton's method: a choice.
+_CLOSE = 1e-11
 
 
 def differentiable(problem: Bilinear, factors: Factors) -> Factors:
@@ -58,7 +63,7 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     the solver is compiled, so are refinement and adjoint
     (:mod:`~pimper_torch.kernels.factor_adjoint`), which is differentiable once.
     """
-    if has_kernel(problem.detach()):
+    if compiled_for(problem.radiance.detach()) and _has_kernel(problem):
         prior = problem.prior
         if prior is None:
             prior = problem.radiance.new_zeros(len(problem.radiance), 10, problem.radiance.shape[2])
@@ -97,23 +102,22 @@ class _Compiled(torch.autograd.Function):
         """Refine the solution; return lights, shading, weights and residuals."""
         from pimper_torch.kernels import factor_adjoint
 
-        lights, shading = (
-            each.detach().to(torch.float64, copy=True, memory_format=torch.contiguous_format)
-            for each in (factors.lights, factors.shading)
-        )
-        weight, residual = torch.zeros_like(data[0]), torch.zeros_like(data[0][:, 0, 0])
         code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
         assert code is not None  # the caller asks
-        ctx.loss = code, scale, stride
-        ctx.save_for_backward(lights, shading, *data)
-        factor_adjoint.refine(
-            ConeProblem(*map(as_array, data)),
-            code,
-            scale,
-            stride,
-            *(each.numpy() for each in (lights, shading, weight, residual)),
+        radiance = data[0].detach().double()
+        found = (
+            factors.lights.detach().to(torch.float64, copy=True).contiguous(),
+            factors.shading.detach().to(torch.float64, copy=True).contiguous(),
+            torch.zeros_like(radiance, memory_format=torch.contiguous_format),
+            radiance.new_zeros(len(radiance)),
         )
-        return lights.to(weight), shading.to(weight), weight, residual
+        given = factor_adjoint.Given(*(as_array(each, torch.float64) for each in data))
+        solution = factor_adjoint.Solved(*map(as_array, found))
+        factor_adjoint.refine(given, code, scale, stride, solution)
+        ctx.loss = code, scale, stride
+        ctx.save_for_backward(*found[:2], *data)
+        lights, shading, weight, residual = (each.to(data[0]) for each in found)
+        return lights, shading, weight, residual
 
     @staticmethod
     @once_differentiable
@@ -126,18 +130,23 @@ class _Compiled(torch.autograd.Function):
 
         lights, shading, *data = ctx.saved_tensors
         code, scale, stride = ctx.loss
-        found = [torch.zeros_like(each, memory_format=torch.contiguous_format) for each in data]
+        contiguous, exact = torch.contiguous_format, torch.float64
+        found = [torch.zeros_like(each, dtype=exact, memory_format=contiguous) for each in data]
         factor_adjoint.pull_back(
-            ConeProblem(*map(as_array, data)),
+            factor_adjoint.Given(*(as_array(each, exact) for each in data)),
             code,
             scale,
             stride,
             as_array(lights),
             as_array(shading),
-            factor_adjoint.Cotangents(*map(as_array, cotangents)),
-            factor_adjoint.DataGradients(*(each.numpy() for each in found)),
+            factor_adjoint.Solved(*(as_array(each, exact) for each in cotangents)),
+            factor_adjoint.Given(*map(as_array, found)),
         )
-        return None, None, *found
+        return None, None, *(each.to(data[0]) for each in found)
+
+
+def _has_kernel(problem: Bilinear) -> bool:
+    return isinstance(problem.manifold, Cone) and problem.loss.code is not None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -179,32 +188,32 @@ class Hessian(Record):
 @torch.no_grad()
 def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
     """Take Newton steps, patch by patch, as long as they reduce the gradient's norm."""
-    hessian = _hessian(problem, factors.lights.double(), factors.shading.double())
-    size = _gradient_size(problem, hessian)
-    fraction = torch.ones_like(size)
+    L, N = factors.lights.double(), factors.shading.double()
+    size = _gradient_size(problem, L, N)
+    fraction, step = torch.ones_like(size), _newton_step(problem, _hessian(problem, L, N))
     for _ in range(30):
-        step = _newton_step(problem, hessian)
-        L = hessian.lights + fraction[:, None, None] * step.lights
-        along_tangents = combination(hessian.columns, fraction[:, None, None] * step.along_tangents)
-        N = problem.manifold.retract((hessian.shading + along_tangents).mT).mT
-        trial = _hessian(problem, L, N)
-        trial_size = _gradient_size(problem, trial)
-        better = trial_size < size
+        moved = combination(problem.manifold.tangents(N), step.along_tangents)
+        part = fraction[:, None, None]
+        lights = L + part * step.lights
+        shading = problem.manifold.retract((N + part * moved).mT).mT
+        after = _gradient_size(problem, lights, shading)
+        better = after < size
+        at_rest = part[:, 0, 0] * step.lights.norm(dim=(1, 2)) <= _CLOSE * L.norm(dim=(1, 2))
         fraction = torch.where(better, (2 * fraction).clamp_max(1), fraction / 2)
-        if bool(better.any()):
-            keep = better[:, None, None]
-            L, N = torch.where(keep, L, hessian.lights), torch.where(keep, N, hessian.shading)
-            size = torch.where(better, trial_size, size)
-            hessian = _hessian(problem, L, N)
-        elif bool((fraction < 1e-3).all()):
+        keep = better[:, None, None]
+        L, N = torch.where(keep, lights, L), torch.where(keep, shading, N)
+        size = torch.where(better, after, size)
+        if bool((at_rest | (fraction < 1e-3)).all()):
             break
-    return factors.replace(
-        lights=hessian.lights.to(factors.lights), shading=hessian.shading.to(factors.shading)
-    )
+        if bool(better.any()):
+            step = _newton_step(problem, _hessian(problem, L, N))
+    return factors.replace(lights=L.to(factors.lights), shading=N.to(factors.shading))
 
 
-def _gradient_size(problem: Bilinear, hessian: Hessian) -> Float[Tensor, " patch"]:
-    on_lights, on_samples = _gradient(problem, hessian)
+def _gradient_size(
+    problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
+) -> Float[Tensor, " patch"]:
+    on_lights, on_samples = _gradient(problem, L, N, problem.manifold.tangents(N))
     return on_lights.square().sum(dim=(1, 2)) + on_samples.square().sum(dim=(1, 2))
 
 
@@ -215,7 +224,8 @@ def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
     adds a rank-one term to the Hessian: the gradient's derivative by :math:`d` times the
     derivative of :math:`d` by the unknowns. It is inverted by the Sherman-Morrison formula.
     """
-    step = _solved(hessian, *_gradient(problem, hessian))
+    at = hessian.lights, hessian.shading, hessian.columns
+    step = _solved(hessian, *_gradient(problem, *at))
     if isinstance(problem.loss, Squares):
         return step
     with torch.no_grad():
@@ -334,10 +344,12 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
 
 
 def _gradient(
-    problem: Bilinear, hessian: Hessian
+    problem: Bilinear,
+    L: Float[Tensor, "patch view rank"],
+    N: Float[Tensor, "patch rank sample"],
+    columns: Sequence[Float[Tensor, "patch rank sample"]],
 ) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
     """Return minus half the gradient by lights and samples, as a function of the data."""
-    L, N = hessian.lights, hessian.shading
     residual = problem.radiance.double() - L @ N
     deviation = residual_deviation(problem, residual)[:, None, None]
     weighted_residual = (
@@ -348,7 +360,7 @@ def _gradient(
     ambient = L.mT @ weighted_residual
     if problem.prior is not None:
         ambient = ambient - apply_packed(problem.prior.double(), N)
-    return on_lights, coordinates(hessian.columns, ambient)
+    return on_lights, coordinates(columns, ambient)
 
 
 def _apply_mixed(

@@ -205,7 +205,7 @@ class Factorize(Stage):
     and samples by the implicit function theorem at the optimum (see
     :mod:`~pimper_torch.photometry.factor_gradients`), to which Newton's method converges where
     gradients are required. Which samples are valid is constant, and so are colours and exposures
-    of views, and the lights of patches that light does not determine.
+    of views, and a room's harmonics over its ambient light.
     """
 
     def __init__(
@@ -365,7 +365,6 @@ class Factorize(Stage):
         determined = (status == int(PatchStatus.DETERMINED))[:, None]
         valid = estimated & determined & (estimates.normals[..., 2] < 0)
         fitted = finite & rows.seen.flatten(1).any(dim=1)
-        lights = torch.where(determined[..., None], lights, lights.detach())
         lights = torch.where(fitted[:, None, None], lights, anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
         normals = torch.where(valid[..., None], estimates.normals, rows.normals)
@@ -443,10 +442,12 @@ class Factorize(Stage):
 
     def _solve(self, problem: Bilinear) -> Factors:
         config = self.config
-        limits = config.max_iterations, config.tolerance
+        limits, dtype = (config.max_iterations, config.tolerance), problem.radiance.dtype
         if torch.is_grad_enabled() and problem.requires_grad:
             limits = max(limits[0], TO_CONVERGENCE[0]), min(limits[1], TO_CONVERGENCE[1])
-        return SOLVERS[config.solver](problem.detach(), *limits)
+            # Newton's method goes on from there in float64.
+            problem = problem.to(torch.float32)
+        return SOLVERS[config.solver](problem.detach(), *limits).to(dtype)
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.kernels.arrays import ConeProblem, as_array
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.kernels.twin_constants import (
     DAMPING_DECREASE,
@@ -87,7 +87,7 @@ def solve_variable_projection(
     solved by a compiled kernel (:mod:`pimper_torch.kernels.factorization`), with the same result
     up to rounding; there, samples without weight keep their initial values.
     """
-    if has_kernel(problem):
+    if _has_kernel(problem):
         return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
@@ -262,7 +262,7 @@ def _is_free(problem: Bilinear) -> bool:
     return problem.manifold.flat and not bool((problem.regularization > 0).any())
 
 
-def has_kernel(problem: Bilinear) -> bool:
+def _has_kernel(problem: Bilinear) -> bool:
     """Return whether the compiled kernel applies: first-order light in float32, a loss it knows."""
     return (
         compiled_for(problem.radiance)
@@ -295,7 +295,7 @@ def _solve_by_kernel(
     data = J, problem.weight, problem.anchor, problem.regularization, prior
     results = lights, shading, weight, taken, residual, cause
     factorization.solve_on_cone(
-        ConeProblem(*map(as_array, data)),
+        factorization.ConeProblem(*map(as_array, data)),
         code,
         problem.loss.scale,
         problem.stride,

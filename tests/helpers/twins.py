@@ -5,7 +5,13 @@ from contextlib import ExitStack, contextmanager
 from typing import Literal
 from unittest.mock import patch
 
-_MODULES = (*("patches.warp", "photometry.variable_projection", "sweep.costs", "fusion.estimate"),)
+_MODULES = (
+    "patches.warp",
+    "photometry.variable_projection",
+    "photometry.factor_gradients",
+    "sweep.costs",
+    "fusion.estimate",
+)
 
 
 @contextmanager
