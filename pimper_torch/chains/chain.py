@@ -113,10 +113,7 @@ class Chain(Stage):
     extract: Callable[[Surface], Mesh]
 
     def __init__(
-        self,
-        observer: Observer | None,
-        store: Store | None = None,
-        on_failure: OnFailure = "skip",
+        self, observer: Observer | None, store: Store | None = None, on_failure: OnFailure = "skip"
     ) -> None:
         super().__init__()
         self.on_failure: OnFailure = on_failure

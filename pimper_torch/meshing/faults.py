@@ -118,9 +118,7 @@ def faults(
 
 
 def facet_means(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    facet: Int[Tensor, " vertex"],
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], facet: Int[Tensor, " vertex"]
 ) -> Float[Tensor, "face 3"]:
     """Assign each face the mean normal of its facet, weighted by area, of any length."""
     one, other, last = facet[faces].unbind(dim=1)

@@ -28,9 +28,7 @@ from pimper_torch.stage import Stage
 
 
 def least_bent(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    free: Bool[Tensor, " vertex"],
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], free: Bool[Tensor, " vertex"]
 ) -> Float[Tensor, "vertex 3"]:
     r"""Move some vertices to where the surface bends least, as a thin plate clamped all round.
 

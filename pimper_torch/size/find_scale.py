@@ -85,7 +85,7 @@ def find_scale(
             caution(
                 "No marker was found that two photographs show alike. Print a sheet (`pimper "
                 "markers`), lay it flat beside the object, and photograph both sharply, not "
-                "overexposed.",
+                "overexposed."
             )
         elif found is not None:
             scales.append(found)

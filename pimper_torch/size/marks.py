@@ -9,12 +9,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid
-from pimper_torch.geometry.supporting_plane import (
-    Plane,
-    fixation,
-    supporting_plane,
-    well_tracked,
-)
+from pimper_torch.geometry.supporting_plane import Plane, fixation, supporting_plane, well_tracked
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.sfm.colmap import undistort_pixels
