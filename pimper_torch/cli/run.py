@@ -37,7 +37,7 @@ from pimper_torch.size.given import Mark, Pointer, ScaleBar, measured_in, number
 from pimper_torch.size.scale import Scale
 from pimper_torch.size.scaled import scaled
 from pimper_torch.store import Store
-from pimper_torch.viewer.show import COARSE, add_found, add_outcome
+from pimper_torch.viewer.show import COARSE, RESULT, add_found
 from pimper_torch.viewer.viewer import Viewer, opened
 from pimper_torch.viz.overview import draw_preview, headline
 
@@ -70,7 +70,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
         if viewer is not None:
-            add_outcome(viewer, result)
+            viewer.add_pass(RESULT, result.mesh)
         result = result.replace(report=(imports, *accounted()))
         with stage("write") as told:
             result, scale = sized(job, bars, result)
