@@ -222,9 +222,6 @@ def in_files(job: Job, views: Views, mark: Mark) -> Mark:
     """Return a place with the sizes of the files, whose pixels it is in.
 
     People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
-
-    Raises:
-        InputError: A pixel outside of its photograph.
     """
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
@@ -248,11 +245,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
 def sized(
     job: Job, bars: tuple[ScaleBar, ...], result: Reconstruction
 ) -> tuple[Reconstruction, Scale | None]:
-    """Scale a result to its real size, as far as anything tells it.
-
-    Raises:
-        InputError: A length cannot be found in the result.
-    """
+    """Scale a result to its real size, as far as anything tells it."""
     inputs = job.inputs
     scale = find_scale(
         result,

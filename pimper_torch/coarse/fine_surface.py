@@ -124,9 +124,6 @@ def closed_surface(
 
     Returns:
         Vertices, faces, and the contour points that the surface goes through.
-
-    Raises:
-        ReconstructionError: Too few of both.
     """
     points, normals = cloud.points_world, cloud.normals_world
     # The first time on the points, then each time on the surface before.

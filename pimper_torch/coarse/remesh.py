@@ -123,9 +123,6 @@ def remesh(
         cloud follow :func:`~pimper_torch.coarse.splitting.with_points`. Unused vertices are
         dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
-    Raises:
-        InputError: The surface is not this mesh's subdivided mesh.
-
     A surface without support anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """

@@ -32,9 +32,6 @@ def read_normals(
             ``world`` of the cameras that are given; ``auto`` finds them by the scene.
         error_deg: Root mean square of the angular error, where no file has a variance.
         undistorted: Whether they are of the photographs as a run undistorts them.
-
-    Raises:
-        InputError: A file or its name, shape or values cannot be used: says which.
     """
     maps = read_maps(folder, views, ("normal",), _vectors)
     return from_maps.normals_from(maps, axes, error_deg=error_deg, undistorted=undistorted)
@@ -71,9 +68,6 @@ def read_depth(
         error: Root mean square, where no file has a variance: relative to depth, or to the range
             of a map's values where these have an offset of their own.
         undistorted: Whether they are of the photographs as a run undistorts them.
-
-    Raises:
-        InputError: A file or its name, shape or values cannot be used: says which.
     """
     maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), single)
     return from_maps.depth_from(

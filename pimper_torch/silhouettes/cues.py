@@ -251,11 +251,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
-    """Return the region in the scene's frame.
-
-    Raises:
-        InputError: No point of the cloud is in it, and no view sees any of it.
-    """
+    """Return the region in the scene's frame."""
     low, high = torch.tensor(corners, dtype=torch.float64).reshape(2, 3)
     offset = low.new_tensor(scene.offset_world)
     box, points = torch.stack([low, high]) - offset, scene.points_world

@@ -25,11 +25,7 @@ _MIN_ANGLE_DEG = 1.0
 
 
 def view_of(name: str, scene: SparseScene) -> int:
-    """Find a photograph among those that have a camera.
-
-    Raises:
-        InputError: It has no camera, or there is none of that name, or several.
-    """
+    """Find a photograph among those that have a camera."""
     names = scene.views.names
     if number_of(name, (*names, *scene.unregistered)) >= len(names):
         raise InputError(
@@ -48,9 +44,6 @@ def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
 
     Args:
         mark: Pixels of the photographs as they were loaded: the right way up, before undistortion.
-
-    Raises:
-        InputError: Names the pixel, what is wrong with it and what to do.
     """
     views = [view_of(pointer.name, result.scene) for pointer in mark.pointers]
     rays = torch.stack(

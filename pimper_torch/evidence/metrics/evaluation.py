@@ -126,11 +126,7 @@ def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | 
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
-    """Return the indices of the views to compare in.
-
-    Raises:
-        InputError: A view that was asked for is not in the truth.
-    """
+    """Return the indices of the views to compare in."""
     names = capture.views.names
     chosen: dict[int, None] = {}
     for asked in config.views:

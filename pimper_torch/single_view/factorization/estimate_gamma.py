@@ -242,9 +242,6 @@ def gamma_of_photographs(
         views: Read with :data:`~pimper_torch.radiometry.LINEAR`; pixels that any of their masks
             leaves out are left out.
         mask: True on the object, for all photographs.
-
-    Raises:
-        InputError: As :func:`estimate_gamma`, and for unlike sizes.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
         raise InputError(

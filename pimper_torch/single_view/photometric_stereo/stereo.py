@@ -92,9 +92,6 @@ def photometric_stereo(
             known to be in shadow.
         robust: Whether shadows and highlights lose weight.
 
-    Raises:
-        InputError: Input that the method cannot use.
-
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
     >>> found = photometric_stereo(
