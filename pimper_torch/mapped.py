@@ -28,9 +28,7 @@ _lock = Lock()  # of the set, which no thread may add to while another goes thro
 
 
 def zeros(
-    shape: Sequence[int],
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
+    shape: Sequence[int], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Return zeros, in a file where they are large and on the CPU.
 

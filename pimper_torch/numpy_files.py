@@ -24,10 +24,8 @@ def read_npy(path: Path | str) -> np.ndarray:
     Raises:
         ValueError: It is none, is larger than its file or than 512 MB, or is cut short: says which.
     """
-    path = Path(path)
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        return _array(file, size)
+    _require_small(Path(path).stat().st_size)
+    return _array(Path(path).read_bytes())
 
 
 def read_npz(
@@ -43,19 +41,10 @@ def read_npz(
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            members = {
-                entry.filename.removesuffix(".npy"): entry
-                for entry in archive.infolist()
-                if wanted(entry.filename.removesuffix(".npy"))
-            }
-            whole = sum(entry.file_size for entry in members.values())
-            if whole > MAX_BYTES:
-                raise ValueError(f"its arrays would take {whole} bytes, more than {MAX_BYTES}")
-            arrays = {}
-            for name, entry in members.items():
-                with archive.open(entry) as file:
-                    arrays[name] = _array(file, entry.file_size)
-            return arrays
+            entries = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
+            entries = {name: one for name, one in entries.items() if wanted(name)}
+            _require_small(sum(one.file_size for one in entries.values()))
+            return {name: _array(archive.read(one)) for name, one in entries.items()}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         # The last two are of archives that are encrypted, or packed as none of NumPy's are.
         raise ValueError("it is no archive of arrays, or damaged") from error
@@ -63,29 +52,24 @@ def read_npz(
         raise ValueError("its list of contents is damaged") from error
 
 
-def _array(file: IO[bytes] | zipfile.ZipExtFile, size: int) -> np.ndarray:
-    head = file.read(min(size, 2**16 + 12))  # the longest header of version 1
-    buffer = io.BytesIO(head)
+def _require_small(size: int) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"its arrays would take {size} bytes, more than {MAX_BYTES}")
+
+
+def _array(data: bytes) -> np.ndarray:
+    buffer = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(buffer)
         shape, columns_first, kind = _VERSIONS[version](buffer)
     except Exception as error:  # a header is a literal of Python, whose parser raises whatever
         raise ValueError("it has no header of an array") from error
-    if kind.hasobject:
-        raise ValueError("it holds objects of Python, which are not opened")
-    if kind.kind not in "biufcSU" or kind.itemsize == 0:
+    if kind.kind not in "biufcSU" or kind.itemsize == 0:  # objects are not opened
         raise ValueError(f"it holds {kind}, which are no numbers")
     if any(side < 0 for side in shape) or len(shape) > 8:
         raise ValueError(f"it says that its shape is {shape}")
-    count = math.prod(shape)
-    needed, held = count * kind.itemsize, size - buffer.tell()
-    if needed > min(held, MAX_BYTES):
-        raise ValueError(f"it says that it holds {needed} bytes; there are {held}")
-    values = bytearray(head[buffer.tell() :][:needed])  # may be written to, as torch wants it
-    values += file.read(needed - len(values))
-    if len(values) < needed:
-        raise ValueError(f"it ends after {len(values)} of {needed} bytes")
-    array = np.frombuffer(values, kind, count)
-    if columns_first:
-        return array.reshape(shape[::-1]).T
-    return array.reshape(shape)
+    needed, at = math.prod(shape) * kind.itemsize, buffer.tell()
+    if needed > len(data) - at:
+        raise ValueError(f"it says that it holds {needed} bytes; there are {len(data) - at}")
+    values = bytearray(data[at : at + needed])  # may be written to, as torch wants it
+    return np.frombuffer(values, kind).reshape(shape, order="F" if columns_first else "C")

@@ -41,7 +41,10 @@ def header(text):
     [
         ("{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999, 99), }\n", "says that it"),
         ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }\n", "shape is"),
-        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n", "objects of Python"),
+        (
+            "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n",
+            "holds object",
+        ),
         ("{'descr': '<f8', 'fortran_order': False, 'shape': (", "no header"),
         ("(" * 9000, "no header"),
         ("{'descr': '<f8', 'fortran_order': False, 'shape': (2**9**9,), }\n", "no header"),

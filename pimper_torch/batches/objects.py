@@ -53,10 +53,6 @@ def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Ob
         given: A folder of folders, each with photographs or with a folder ``photos``; a pattern
             such as ``scans/*/photos``; a CSV file whose columns are ``photos``, ``name`` and
             options of ``pimper reconstruct`` without dashes; or several objects or folders.
-
-    Raises:
-        InputError: Nothing is there, or two objects have one name.
-        ConfigError: A table without the column ``photos``.
     """
     if not isinstance(given, Path | str):
         found = [one if isinstance(one, Object) else _in_folder(Path(one)) for one in given]

@@ -49,9 +49,6 @@ def planned_batch(
         settings: Options of ``pimper reconstruct`` for every object; its own come after them.
         limit_s: Seconds that a try may take; by the estimate unless given.
         mem_gb: Memory that a run takes; the estimate unless given.
-
-    Raises:
-        ConfigError: A setting that does not exist or has an impossible value; says of which object.
     """
     out = out.absolute()
     with absent():

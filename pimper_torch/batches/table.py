@@ -73,9 +73,7 @@ def write_table(rows: Sequence[Mapping[str, object]], out: Path) -> None:
     head = "".join(f"<th>{name.replace('_', ' ')}</th>" for name in ("", *_COLUMNS))
     body = "\n".join(f"<tr>{_picture(row, out)}{_cells(row)}</tr>" for row in rows)
     page = _PAGE.format(
-        title=f"{ended} of {len(rows)} objects",
-        sign=SIGNS[HTML],
-        rows=f"<tr>{head}</tr>\n{body}",
+        title=f"{ended} of {len(rows)} objects", sign=SIGNS[HTML], rows=f"<tr>{head}</tr>\n{body}"
     )
     for name, content in ((CSV, text.getvalue()), (HTML, page)):
         with file_written_whole(out / name) as fresh:

@@ -47,9 +47,6 @@ def read_camera_arrays(
 
     Returns:
         Without cameras of photographs that are not there.
-
-    Raises:
-        InputError: The file has other arrays, or not one camera a photograph.
     """
     file = DataSetPath(path, _KIND)
     arrays = file.read(read_npz, "an archive of numpy.savez")

@@ -64,9 +64,6 @@ def parse_without_entities(path: Path) -> ElementTree.Element:
 
     Entities need such a declaration, and with them a small file can grow without bound or
     name other files.
-
-    Raises:
-        InputError: The file declares a document type.
     """
 
     def refuse(name: str, *_: object) -> None:

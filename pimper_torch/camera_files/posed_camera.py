@@ -52,11 +52,7 @@ def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> 
 def rigid_or_refuse(
     rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
-    """Put a file's rotation and translation together, the rotation made exact.
-
-    Raises:
-        InputError: The matrix is further from a rotation than rounding explains.
-    """
+    """Put a file's rotation and translation together, the rotation made exact."""
     U, _, Vh = torch.linalg.svd(rotation)
     nearest = U @ Vh
     off = float((rotation - nearest).abs().max())

@@ -20,9 +20,6 @@ def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> l
     Args:
         photographs: Their names, for cameras that go by the order of these.
         sizes_of: Photographs that a file names, for cameras without a size.
-
-    Raises:
-        InputError: It is no such file, or describes cameras that cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":

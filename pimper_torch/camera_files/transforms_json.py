@@ -25,11 +25,7 @@ _POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL",
 
 
 def read_frames(path: Path) -> list[dict[str, object]]:
-    """Return the frames, each with what the whole file says.
-
-    Raises:
-        InputError: The file has another structure, or a frame names no photograph.
-    """
+    """Return the frames, each with what the whole file says."""
     file = DataSetPath(path, KIND)
     whole = file.read_json()
     frames = [{**whole, **frame} for frame in file.objects(whole.get("frames"), "frames")]
@@ -55,9 +51,6 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
 
     Returns:
         In the file's order; without frames whose size nothing tells.
-
-    Raises:
-        InputError: The file has another structure.
     """
     frames = read_frames(path)
     names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]

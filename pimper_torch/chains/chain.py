@@ -113,10 +113,7 @@ class Chain(Stage):
     extract: Callable[[Surface], Mesh]
 
     def __init__(
-        self,
-        observer: Observer | None,
-        store: Store | None = None,
-        on_failure: OnFailure = "skip",
+        self, observer: Observer | None, store: Store | None = None, on_failure: OnFailure = "skip"
     ) -> None:
         super().__init__()
         self.on_failure: OnFailure = on_failure
@@ -292,11 +289,7 @@ class Chain(Stage):
         __call__ = forward
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
-        """Put modules in the places of stages.
-
-        Raises:
-            ConfigError: The chain has no stage of that name.
-        """
+        """Put modules in the places of stages."""
         for name, module in stages.items():
             known = [known for known, _ in self.named_children()]
             if name not in known:

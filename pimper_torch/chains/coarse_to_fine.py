@@ -61,9 +61,6 @@ def held_apart(
 
     Returns:
         Both with the whole cloud; the first is the scene itself where no view is held out.
-
-    Raises:
-        ConfigError: Too few views are left.
     """
     names, stay = scene.views.names, set(needed)
     ordered = sorted(range(len(names)), key=names.__getitem__)

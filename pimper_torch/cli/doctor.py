@@ -13,7 +13,6 @@ from pimper_torch.cli.output import Output
 from pimper_torch.doctor.checks import examine_folder
 from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.machine import machine
-from pimper_torch.errors import InputError
 from pimper_torch.io.photographs import list_images
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.reporting import stage
@@ -23,9 +22,8 @@ from pimper_torch.reporting import stage
 class _Job:
     """Report what is installed here, and whether photographs are fit for a run, in seconds.
 
-    Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, how much the
-    light varies, and an estimate of time and memory; each with what to do. Exit code 2 where
-    a run would be refused.
+    Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, and an estimate
+    of time and memory; each with what to do. Exit code 2 where a run would be refused.
 
     Attributes:
         photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.
@@ -48,12 +46,6 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             found = examine_folder(job.photos, job.photographs, job.max_size_px)
         _tell(output, found)
         findings += found
-    errors = [one.check for one in findings if one.severity == "error"]
-    if errors:
-        raise InputError(
-            f"{job.photos or 'this machine'}: a run would be refused, see "
-            f"{', '.join(dict.fromkeys(errors))} above."
-        )
     output.result(warnings=[one.check for one in findings if one.severity == "warning"])
 
 

@@ -11,11 +11,11 @@ from PIL import Image
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.config import require
-from pimper_torch.errors import caution, some
+from pimper_torch.errors import caution
 from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.progress import report
 from pimper_torch.reporting import stage
-from pimper_torch.video.choose import blurred, chosen, scanned
+from pimper_torch.video.choose import chosen, scanned
 from pimper_torch.video.read import frame_pictures, luma_frames
 
 
@@ -47,13 +47,10 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             scan = scanned(luma_frames(job.video))
             told["frames"] = len(scan.way)
         frames = chosen(scan, job.count)
-        with (
-            stage("write") as told,
-            written_whole(job.out, "frames", overwrite=job.overwrite) as folder,
-        ):
-            for done, (number, picture) in enumerate(
-                frame_pictures(job.video, frames.tolist()), start=1
-            ):
+        written = written_whole(job.out, "frames", overwrite=job.overwrite)
+        with stage("write") as told, written as folder:
+            pictures = frame_pictures(job.video, frames.tolist())
+            for done, (number, picture) in enumerate(pictures, start=1):
                 Image.fromarray(picture).save(folder / f"{number:06d}.png")
                 report(done, len(frames))
             told["photographs"] = len(frames)
@@ -62,13 +59,6 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
             f"{job.video}: has {len(frames)} frames that differ, of {job.count} that were asked "
             "for; the others show what these do. Move the camera farther, or more slowly where "
             "the pictures jump.",
-            stacklevel=2,
-        )
-    dull = [f"{number:06d}.png" for number in blurred(scan, frames).tolist()]
-    if dull:
-        caution(
-            f"{job.out}: {some(dull)} are less than half as sharp as the others, and nothing "
-            "sharper is near them. Leave them out, or move more slowly there.",
             stacklevel=2,
         )
     output.remark(

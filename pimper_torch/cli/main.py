@@ -243,11 +243,7 @@ def _of_the_world(error: BaseException) -> str | None:
 
 
 def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
-    """Answer ``--help``, and refuse arguments, before torch is loaded.
-
-    Raises:
-        PimperError: What ``checked`` of the command's module raises.
-    """
+    """Answer ``--help``, and refuse arguments, before torch is loaded."""
     if "torch" in sys.modules:
         return
     try:

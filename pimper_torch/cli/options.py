@@ -220,9 +220,6 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
 
     The preset is read first: its settings are the defaults that other options change, and
     that ``--help-all`` shows.
-
-    Raises:
-        ConfigError: No such preset, unknown or wrong arguments, or an impossible setting.
     """
     name = _preset(arguments)
     _refuse_others(command, arguments, name)

@@ -120,9 +120,6 @@ class Output:
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
     """Take the options that every command has from its arguments.
 
-    Raises:
-        ConfigError: A level that there is not.
-
     >>> output, rest = split(["photos", "--json", "-o", "out"])
     >>> output.as_json, rest
     (True, ['photos', '-o', 'out'])

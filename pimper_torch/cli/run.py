@@ -37,7 +37,7 @@ from pimper_torch.size.given import Mark, Pointer, ScaleBar, measured_in, number
 from pimper_torch.size.scale import Scale
 from pimper_torch.size.scaled import scaled
 from pimper_torch.store import Store
-from pimper_torch.viewer.show import COARSE, add_found, add_outcome
+from pimper_torch.viewer.show import COARSE, RESULT, add_found
 from pimper_torch.viewer.viewer import Viewer, opened
 from pimper_torch.viz.overview import draw_preview, headline
 
@@ -70,7 +70,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
         if viewer is not None:
-            add_outcome(viewer, result)
+            viewer.add_pass(RESULT, result.mesh)
         result = result.replace(report=(imports, *accounted()))
         with stage("write") as told:
             result, scale = sized(job, bars, result)
@@ -222,9 +222,6 @@ def in_files(job: Job, views: Views, mark: Mark) -> Mark:
     """Return a place with the sizes of the files, whose pixels it is in.
 
     People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
-
-    Raises:
-        InputError: A pixel outside of its photograph.
     """
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
@@ -248,11 +245,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
 def sized(
     job: Job, bars: tuple[ScaleBar, ...], result: Reconstruction
 ) -> tuple[Reconstruction, Scale | None]:
-    """Scale a result to its real size, as far as anything tells it.
-
-    Raises:
-        InputError: A length cannot be found in the result.
-    """
+    """Scale a result to its real size, as far as anything tells it."""
     inputs = job.inputs
     scale = find_scale(
         result,

@@ -9,17 +9,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.coarse import trim
 from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.oriented import OrientedPoints, matched_cloud, no_points, pixel_size_at
-from pimper_torch.coarse.trim import (
-    CELL_PX,
-    FineSurfaceConfig,
-    min_fraction,
-    near_points,
-    seen_surface,
-    supports,
-    view_counts,
-)
 from pimper_torch.coarse.window_matching import level_of
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.pixels import crop_intrinsics
@@ -70,7 +62,7 @@ def fine_surface(
     reliable: Int[Tensor, " reliable"],
     contours: Contours,
     densify: DensifyConfig,
-    config: FineSurfaceConfig,
+    config: trim.FineSurfaceConfig,
 ) -> FineSurface:
     """Put a surface through matched points and contours, smooth where there are neither.
 
@@ -99,17 +91,17 @@ def fine_surface(
         pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
-    counts = view_counts(vertices, faces, level, maps, cloud.points_world, reach)
+    counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)
     centres = vertices[faces].mean(dim=1)
-    support = supports(centres, cloud, contour, counts, reach)
+    support = trim.supports(centres, cloud, contour, counts, reach)
     inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
     leave_out("coarse.outside", ~inside, at=centres)
     if not contours.confine:
-        near = near_points(faces, centres, cloud, support, counts, pixel)
+        near = trim.near_points(faces, centres, cloud, support, counts, pixel)
         leave_out("coarse.far", inside & ~near, at=centres)
         inside &= near
-    fraction = min_fraction(contours)
-    kept = seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
+    fraction = trim.min_fraction(contours)
+    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
@@ -132,9 +124,6 @@ def closed_surface(
 
     Returns:
         Vertices, faces, and the contour points that the surface goes through.
-
-    Raises:
-        ReconstructionError: Too few of both.
     """
     points, normals = cloud.points_world, cloud.normals_world
     # The first time on the points, then each time on the surface before.
@@ -153,12 +142,12 @@ def closed_surface(
                 "mesh of your own."
             )
         # Points are denser than contours: without these an octree's cell is two of their grid.
-        cell = (CELL_PX if len(touched.ray) else 2 * POINT_PX) * pixel
+        cell = (trim.CELL_PX if len(touched.ray) else 2 * POINT_PX) * pixel
         vertices, faces = poisson(OrientedPoints.cat([cloud, contour]), cell)
         if not len(touched.ray):
             break
         normals = vertex_normals(vertices, faces)
-        front = visible_vertices(vertices, faces, normals, contours.cameras, CELL_PX * pixel)
+        front = visible_vertices(vertices, faces, normals, contours.cameras, trim.CELL_PX * pixel)
         points, normals = vertices[front], normals[front]
     return vertices, faces, touched
 

@@ -24,9 +24,6 @@ def prepared(
     Returns:
         The mesh, of the scene's floating-point type and device, and figures of how far off it is.
         Warns of what was dropped, and of a mesh that is off.
-
-    Raises:
-        InputError: Nothing of the mesh is a surface, or it is in another frame.
     """
     found, dropped = cleaned(mesh.to(scene.points_world.device))
     if dropped:
@@ -41,9 +38,6 @@ def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
 
     Returns:
         Its surface, and how many of which faces were dropped, in words.
-
-    Raises:
-        InputError: No face is left.
     """
     vertices, faces = welded(mesh.vertices_world.detach(), mesh.faces)
     if len(faces) == 0:
@@ -79,9 +73,6 @@ def oriented_outward(
     Args:
         mesh: World frame; files give it in double precision.
         cameras: They see it; the result has their floating-point type and device.
-
-    Raises:
-        InputError: The mesh has no faces, or no camera sees it.
     """
     like = cameras.cam_from_world
     found, _ = cleaned(mesh.to(like.device, like.dtype))

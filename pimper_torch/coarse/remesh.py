@@ -7,13 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.coarse.splitting import (
-    fitted_normals,
-    mark_edges,
-    normal_weights,
-    split_edges,
-    with_points,
-)
+from pimper_torch.coarse import splitting
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
@@ -129,9 +123,6 @@ def remesh(
         cloud follow :func:`~pimper_torch.coarse.splitting.with_points`. Unused vertices are
         dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
-    Raises:
-        InputError: The surface is not this mesh's subdivided mesh.
-
     A surface without support anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """
@@ -150,7 +141,7 @@ def remesh(
         side = _side(corners, faces) / spacing
         small = (side < config.min_samples) | ~kept
         marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
-        split = split_edges(old, faces, marked)
+        split = splitting.split_edges(old, faces, marked)
     flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
     onto = torch.cat([corners, centres[split.halved]])
     child_kept = kept[split.parent]
@@ -159,8 +150,8 @@ def remesh(
     index = torch.full_like(split.parent, -1)
     index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
-    mesh = mesh.replace(normals_world=fitted_normals(mesh, surface, split, index))
-    return with_points(coarse, mesh, split, index, source)
+    mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
+    return splitting.with_points(coarse, mesh, split, index, source)
 
 
 def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
@@ -280,7 +271,7 @@ def departures(
 
 def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     """Return the root mean square angle between the surface's normals and their facet's mean."""
-    weight = normal_weights(surface.information)
+    weight = splitting.normal_weights(surface.information)
     total = weight.new_zeros(count, 3)
     total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
     mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
@@ -313,7 +304,7 @@ def _worst_first(
     def marks(count: int) -> Bool[Tensor, " edge"]:
         chosen = torch.zeros_like(small)
         chosen[order[:count]] = True
-        return mark_edges(vertices, faces, chosen, small)
+        return splitting.mark_edges(vertices, faces, chosen, small)
 
     def facets(marked: Bool[Tensor, " edge"]) -> int:
         return int((1 + marked[face_edge].sum(dim=1))[kept].sum())

@@ -14,20 +14,8 @@ from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.oriented import OrientedPoints
 from pimper_torch.coarse.window_matching import MatchingLevel
 from pimper_torch.config import Range, require_ranges
+from pimper_torch.geometry import surfaces, topology
 from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.geometry.surfaces import (
-    component_areas,
-    face_normals,
-    side_lengths,
-    unit_face_normals,
-)
-from pimper_torch.geometry.topology import (
-    connected_to,
-    dilated,
-    face_components,
-    face_pairs,
-    graph_components,
-)
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
@@ -110,8 +98,8 @@ def view_counts(
     """
     cameras = level.cameras
     centre = vertices[faces].mean(dim=1)
-    normals = unit_face_normals(vertices, faces)
-    side = side_lengths(vertices[faces]).amax(dim=1)
+    normals = surfaces.unit_face_normals(vertices, faces)
+    side = surfaces.side_lengths(vertices[faces]).amax(dim=1)
     caster, cloud = RayCaster(vertices, faces), cKDTree(matched_world.detach().cpu().numpy())
 
     def of_view(view: int) -> Int[Tensor, "count face"]:
@@ -161,9 +149,11 @@ def without_small_holes(
     largest: float,
 ) -> Bool[Tensor, " face"]:
     """Keep connected components of dropped faces too whose area is small, in scene units."""
-    pairs, _ = face_pairs(faces)
+    pairs, _ = topology.face_pairs(faces)
     dropped = pairs[~kept[pairs].any(dim=1)]
-    areas = component_areas(vertices, faces, graph_components(dropped, len(faces)))
+    areas = surfaces.component_areas(
+        vertices, faces, topology.graph_components(dropped, len(faces))
+    )
     return kept | (~kept & (areas < largest))
 
 
@@ -181,10 +171,10 @@ def enclosed_holes(
     (dropped,) = torch.nonzero(~kept, as_tuple=True)
     if not len(dropped):
         return found
-    label = face_components(faces[dropped])
-    paired = torch.bincount(face_pairs(faces)[0].flatten(), minlength=len(faces))
+    label = topology.face_components(faces[dropped])
+    paired = torch.bincount(topology.face_pairs(faces)[0].flatten(), minlength=len(faces))
     on_border = torch.zeros_like(label).index_add(0, label, (paired[dropped] < 3).long())
-    areas = component_areas(vertices, faces[dropped], label)
+    areas = surfaces.component_areas(vertices, faces[dropped], label)
     found[dropped] = (on_border[label] == 0) & (areas <= largest)
     return found
 
@@ -208,12 +198,12 @@ def fringes(
         smallest: Area from which a supported component is not marked.
         rings: Half the width of the widest narrow strip, in faces.
     """
-    core = ~dilated(faces, ~kept, rings, len(vertices))
-    narrow = kept & ~dilated(faces, core, rings, len(vertices))
-    pairs, _ = face_pairs(faces)
-    label = graph_components(pairs[narrow[pairs].all(dim=1)], len(faces))
-    area = component_areas(vertices, faces, label)
-    known = component_areas(vertices, faces, label, supported)
+    core = ~topology.dilated(faces, ~kept, rings, len(vertices))
+    narrow = kept & ~topology.dilated(faces, core, rings, len(vertices))
+    pairs, _ = topology.face_pairs(faces)
+    label = topology.graph_components(pairs[narrow[pairs].all(dim=1)], len(faces))
+    area = surfaces.component_areas(vertices, faces, label)
+    known = surfaces.component_areas(vertices, faces, label, supported)
     return narrow & ((area < smallest) | (known < area / 2))
 
 
@@ -226,8 +216,8 @@ def supported_components(
     """Find components with at least a fraction of the supported area of all."""
     everything = torch.zeros_like(faces[:, 0])
     own, total = (
-        component_areas(vertices, faces, label, supported)
-        for label in (face_components(faces), everything)
+        surfaces.component_areas(vertices, faces, label, supported)
+        for label in (topology.face_components(faces), everything)
     )
     return own >= fraction * total
 
@@ -273,7 +263,7 @@ def near_points(
     distance = point_distances(centre, cloud.points_world)
     between = (counts.lit >= 2) & (counts.behind < _MIN_BEHIND) & ~supported
     beyond = between & (distance > _MARGIN_PX * pixel)
-    far = connected_to(faces, beyond, distance > _GAP_PX * pixel)
+    far = topology.connected_to(faces, beyond, distance > _GAP_PX * pixel)
     return (supported & (counts.seen >= 2)) | (between & ~far)
 
 
@@ -307,9 +297,9 @@ def seen_surface(
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
     kept = possible & ((counts.seen > 0) | known)
     leave_out("coarse.unseen", possible & ~kept, at=(vertices, faces))
-    area = float(total(face_normals(vertices, faces[kept]).norm(dim=1))) / 2
+    area = float(total(surfaces.face_normals(vertices, faces[kept]).norm(dim=1))) / 2
     holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
-    kept = kept | (holes & ~connected_to(faces, ~kept, ~possible))
+    kept = kept | (holes & ~topology.connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
     rings = int(config.hole_px / (2 * CELL_PX))
     floating = regions_seen_through(faces, kept, bare & (counts.behind > 0))
@@ -335,7 +325,7 @@ def regions_seen_through(
         through: True for faces that views see through.
     """
     (index,) = torch.nonzero(some, as_tuple=True)
-    region = face_components(faces[index])
+    region = topology.face_components(faces[index])
     share = torch.bincount(region, through[index].double()) / torch.bincount(region)
     return torch.zeros_like(some).index_put((index,), (share >= _MOST_THROUGH)[region])
 

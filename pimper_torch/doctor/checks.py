@@ -7,15 +7,12 @@ from pathlib import Path
 from statistics import median
 
 from pimper_torch.doctor.cost import cost
-from pimper_torch.doctor.findings import Finding, ok, warned
+from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.machine import available_gb
-from pimper_torch.doctor.pairs import light, match_copies, overlap, variations
-from pimper_torch.doctor.photograph import Photograph, of_views, read_all
-from pimper_torch.errors import InputError, some
-from pimper_torch.io.decode import read_header
-from pimper_torch.io.header import Header
-from pimper_torch.io.photographs import MIN_PHOTOGRAPHS, list_images
-from pimper_torch.io.responses import find_cautions, responses_told
+from pimper_torch.doctor.pairs import match_copies, overlap
+from pimper_torch.doctor.photograph import Photograph, of_views
+from pimper_torch.errors import some
+from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 from pimper_torch.sfm.lenses import group_lenses
@@ -30,26 +27,16 @@ def examine_folder(
     """Examine the photographs of a folder, in seconds.
 
     Returns:
-        Of files, samples, number, blur, saturation, exposure, lenses, overlap, light and cost.
+        Of number, blur, saturation, exposure, lenses, overlap and cost.
 
     Raises:
-        InputError: No such folder, or no images in it.
+        InputError: As of :func:`pimper_torch.io.photographs.load_views`.
     """
-    paths = list_images(folder)
-    read = read_all(paths, encoding, max_size_px)
-    photographs = [one for one in read if isinstance(one, Photograph)]
-    findings = [
-        Finding(check="files", severity="error", found=str(error).rstrip("."))
-        for error in read
-        if isinstance(error, InputError)
-    ]
+    photographs = of_views(load_views(folder, encoding=encoding, max_size_px=max_size_px))
     matches = match_copies([one.small for one in photographs])
     return [
-        *findings,
-        *samples(paths, encoding),
         *each_alone(photographs),
         *overlap([one.name for one in photographs], matches),
-        *light(variations(photographs, matches)),
         *cost(photographs, available_gb()),
     ]
 
@@ -71,17 +58,12 @@ def number(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     sizes = Counter((one.width, one.height) for one in photographs)
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     told = ", ".join(f"{count} of {w}x{h}" for (w, h), count in sizes.most_common(3))
-    if len(sizes) == 1:
-        told = told.split(" of ")[1] + " each"
     found = f"{len(photographs)} photographs, {told}, {megapixels:.0f} megapixels"
-    if len(photographs) < MIN_PHOTOGRAPHS:
-        advice = "Take 20 to 40 round the object, each under another position of the light."
-        yield warned("number", found, f"{MIN_PHOTOGRAPHS} at least", advice, "error")
-    elif len(photographs) < 8:
+    if len(photographs) < 8:
         advice = "Normals come from at least 4 lights on every part. Take more photographs."
-        yield warned("number", found, "8 or more", advice)
+        yield Finding("number", "warning", found, "8 or more", advice)
     else:
-        yield ok("number", found)
+        yield Finding("number", "ok", found)
 
 
 def blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
@@ -93,55 +75,43 @@ def blur(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     limit = max(_BLUR_PX, _BLUR_RATIO * usual)
     blurred = [f"{one.name} ({one.blur_px:.1f} px)" for one in known if one.blur_px > limit]
     if blurred:
-        yield warned(
-            "blur",
-            f"{len(blurred)} of {len(photographs)} are blurred: {some(blurred, 4)}",
-            f"edges of at most {limit:.1f} px, the median being {usual:.1f}",
-            "Take them again from a tripod or with a shorter exposure, or leave them out.",
-        )
+        found = f"{len(blurred)} of {len(photographs)} are blurred: {some(blurred, 4)}"
+        needed = f"edges of at most {limit:.1f} px, the median being {usual:.1f}"
+        advice = "Take them again from a tripod or with a shorter exposure, or leave them out."
+        yield Finding("blur", "warning", found, needed, advice)
     elif usual > _BLUR_PX:
-        yield warned(
-            "blur",
-            f"all are blurred, by {usual:.1f} px in the median",
-            f"{_BLUR_PX:g} px or less",
-            "`--max-size-px` of half their size loses no detail, and a run takes a quarter of the "
-            "time.",
-            "note",
-        )
+        found = f"all are blurred, by {usual:.1f} px in the median"
+        advice = "`--max-size-px` of half their size loses no detail, in a quarter of the time."
+        yield Finding("blur", "note", found, f"{_BLUR_PX:g} px or less", advice)
     else:
-        amount = f"{usual:.1f} px" if usual >= 0.5 else "less than 0.5 px"
-        yield ok("blur", f"sharp, edges blurred by {amount} in the median")
+        yield Finding("blur", "ok", f"sharp, edges blurred by {usual:.1f} px in the median")
 
 
 def saturation(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Find photographs of which much is saturated."""
     burnt = [f"{one.name} ({one.saturated:.0%})" for one in photographs if one.saturated > 0.05]
-    most = max((one.saturated for one in photographs), default=0.0)
-    if not burnt:
-        yield ok("saturation", f"at most {most:.1%} of a photograph saturated")
-        return
-    yield warned(
-        "saturation",
-        f"{len(burnt)} of {len(photographs)} are saturated in part: {some(burnt, 4)}",
-        "5% of the pixels at most",
-        "Saturated pixels tell no light. Expose less, or darken a white background.",
-    )
+    if burnt:
+        found = f"{len(burnt)} of {len(photographs)} are saturated in part: {some(burnt, 4)}"
+        advice = "Saturated pixels tell no light. Expose less, or darken a white background."
+        yield Finding("saturation", "warning", found, "5% of the pixels at most", advice)
+    else:
+        most = max(one.saturated for one in photographs)
+        yield Finding("saturation", "ok", f"at most {most:.1%} of a photograph saturated")
 
 
 def exposure(photographs: Sequence[Photograph]) -> Iterator[Finding]:
     """Find photographs that are dark all over."""
     dark = [f"{one.name} ({one.bright:.1%})" for one in photographs if one.bright < 0.05]
     if dark:
-        yield warned(
-            "exposure",
-            f"{len(dark)} of {len(photographs)} are dark, brightest parts in per cent of "
-            f"saturation: {some(dark, 4)}",
-            "5% or more",
-            "Expose longer: noise takes the place of shading.",
+        found = (
+            f"the brightest parts of {len(dark)} of {len(photographs)} are dark: {some(dark, 4)}"
         )
-    elif photographs:
+        advice = "Expose longer: noise takes the place of shading."
+        yield Finding("exposure", "warning", found, "5% of saturation or more", advice)
+    else:
         bright = median(one.bright for one in photographs)
-        yield ok("exposure", f"brightest parts at {bright:.0%} of saturation in the median")
+        told = f"brightest parts at {bright:.0%} of saturation in the median"
+        yield Finding("exposure", "ok", told)
 
 
 def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
@@ -150,56 +120,20 @@ def lenses(photographs: Sequence[Photograph]) -> Iterator[Finding]:
         [(max(one.width, one.height), min(one.width, one.height)) for one in photographs],
         [one.focal_px for one in photographs],
     )
-    if not numbers:
-        return
-    counts = sorted(Counter(numbers).items())
-    firsts = [photographs[numbers.index(lens)] for lens, _ in counts]
-    told = "; ".join(
-        f"{count} of {one.width}x{one.height}"
-        + ("" if math.isnan(one.focal_px) else f" at {one.focal_px:.0f} px")
-        for (_, count), one in zip(counts, firsts, strict=True)
-    )
-    several = len(counts) > 1
-    what = f"{len(counts)} lenses, focal lengths or formats" if several else "one lens"
-    if several and min(count for _, count in counts) < 3:
-        yield warned(
-            "lenses",
-            f"{what}: {told}",
-            "3 photographs or more of each, as each is found for itself",
-            "Crop and zoom no more, or give `--reconstruct.shared-camera` if it is one lens "
-            "whatever EXIF says.",
-        )
+    groups = []
+    for lens, count in sorted(Counter(numbers).items()):
+        one = photographs[numbers.index(lens)]
+        focal = "unknown" if math.isnan(one.focal_px) else f"{one.focal_px:.0f} px"
+        groups.append((count, f"{count} of {one.width}x{one.height}, focal length {focal}"))
+    several = len(groups) > 1
+    what = f"{len(groups)} lenses, focal lengths or formats" if several else "one lens"
+    found = f"{what}: {'; '.join(told for _, told in groups)}"
+    if several and min(count for count, _ in groups) < 3:
+        needed = "3 photographs or more of each, as each is found for itself"
+        advice = "Crop and zoom no more, or give `--reconstruct.shared-camera` if it is one lens."
+        yield Finding("lenses", "warning", found, needed, advice)
     elif any(math.isnan(one.focal_px) for one in photographs):
         advice = "It is found from the photographs then; keep EXIF where you can."
-        yield warned("lenses", f"{what}: {told}", "EXIF with the focal length", advice, "note")
+        yield Finding("lenses", "note", found, "EXIF with the focal length", advice)
     else:
-        yield Finding(check="lenses", severity="note" if several else "ok", found=f"{what}: {told}")
-
-
-def samples(paths: Sequence[Path | str], encoding: Encoding) -> Iterator[Finding]:
-    """Report the response of the files that can be read, and warn of what is not followed."""
-    read = [(path, header) for path in paths if (header := _header(path)) is not None]
-    if not read:
-        return
-    named, headers = zip(*read, strict=True)
-    cautions = find_cautions(named, headers, encoding)
-    for sentence, names in cautions.items():
-        yield Finding(
-            check="samples",
-            severity="warning",
-            found=f"{len(names)} of {len(headers)} photographs ({some(names, 4)}): {sentence}",
-        )
-    if not cautions:
-        given = encoding.response
-        taken = f"{given}, as given"
-        if given == "auto":
-            counts = responses_told(headers)
-            taken = "; ".join(f"{what} ({count})" for what, count in counts.items())
-        yield ok("samples", f"response {taken}")
-
-
-def _header(path: Path | str) -> Header | None:
-    try:
-        return read_header(path)
-    except InputError:
-        return None
+        yield Finding("lenses", "note" if several else "ok", found)

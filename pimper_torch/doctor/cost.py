@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from pimper_torch.doctor.findings import Finding, ok, warned
+from pimper_torch.doctor.findings import Finding
 from pimper_torch.doctor.photograph import Photograph
 
 # Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
@@ -69,14 +69,15 @@ def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Itera
     if (disk := 0.045 * megapixels) > needed:  # photographs twice, masks and pyramids
         told = f"{told}; {disk:.0f} GB of disk for temporary files"
     if available_gb is None or needed <= available_gb:
-        yield ok("cost", told)
+        yield Finding("cost", "ok", told)
         return
     longest = max(max(one.width, one.height) for one in photographs)
     fits = max(0.0, (0.9 * available_gb - _GB) / _GB_A_MEGAPIXEL_OF_ONE) * len(photographs)
     size = int(longest * min(1.0, fits / megapixels) ** 0.5) // 50 * 50
     smaller = f"Give `--max-size-px {size}`, or fewer photographs."
-    yield warned(
+    yield Finding(
         "cost",
+        "warning",
         f"{told}; {available_gb:.1f} GB are free",
         "as much memory as the run takes",
         smaller if size else "Free memory, or take fewer photographs.",

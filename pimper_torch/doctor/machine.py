@@ -3,43 +3,30 @@
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 
 from pimper_torch.cores import usable_cores
-from pimper_torch.doctor.findings import Finding, ok, warned
+from pimper_torch.doctor.findings import Finding
 from pimper_torch.io.version import versions
-
-_NEEDED = ("numba", "pycolmap", "kornia", "embreex", "fcpw", "cholespy", "cv2", "skimage")
 
 
 def machine() -> Iterator[Finding]:
     """Report versions, device, threads and memory."""
     told = ", ".join(f"{name} {version}" for name, version in versions().items())
-    missing = [name for name in _NEEDED if find_spec(name) is None]
-    if missing:
-        advice = "Run `pip install pimper_torch` again."
-        found = f"{told}; without {', '.join(missing)}"
-        yield warned("installed", found, "all packages that pimper_torch names", advice, "error")
-    else:
-        yield ok("installed", told)
+    yield Finding("installed", "ok", told)
     cuda = torch.cuda.is_available()
     device = f"CPU and {torch.cuda.get_device_name()}" if cuda else "CPU"
-    yield ok(
-        "device", f"{device}, {torch.get_num_threads()} threads on {usable_cores()} processors"
-    )
+    threads = f"{torch.get_num_threads()} threads on {usable_cores()} processors"
+    yield Finding("device", "ok", f"{device}, {threads}")
     free, total = available_gb(), total_gb()
     if free is None or total is None:
-        yield Finding(check="memory", severity="note", found="the system does not tell its memory")
+        yield Finding("memory", "note", "the system does not tell its memory")
         return
-    found = f"{free:.1f} of {total:.1f} GB are free"
-    if free < 2.5:
-        advice = "Close other programs; the demo takes that much."
-        yield warned("memory", found, "2.5 GB", advice)
-    else:
-        yield ok("memory", found)
+    found, advice = f"{free:.1f} of {total:.1f} GB are free", "Close other programs."
+    short = ("2.5 GB, which the demo takes", advice) if free < 2.5 else ()
+    yield Finding("memory", "warning" if short else "ok", found, *short)
 
 
 def available_gb() -> float | None:

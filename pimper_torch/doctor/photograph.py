@@ -1,9 +1,7 @@
 """A photograph in a few numbers and a small copy."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,13 +9,9 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from pimper_torch.errors import InputError
-from pimper_torch.io.decode import read_header
-from pimper_torch.io.header import Header
-from pimper_torch.io.photographs import shrunk_focals, shrunk_size
-from pimper_torch.io.radiance import read_pictures, resized_radiance
+from pimper_torch.io.radiance import resized_radiance
 from pimper_torch.parallel import side_by_side
-from pimper_torch.radiometry import SATURATED, Encoding
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Record, Views
 
 # Smoothing before the two gradients that are compared: enough for noise, little beside the blur
@@ -102,7 +96,6 @@ class Photograph(Record):
     bright: float
     blur_px: float
     small: Float[Tensor, "rows columns"]
-    small_saturated: Float[Tensor, "rows columns"]
 
 
 def summarize(
@@ -117,7 +110,7 @@ def summarize(
     small = resized_radiance(
         radiance, max(1, round(width * shrink)), max(1, round(height * shrink))
     )
-    grey, highest = radiance.mean(dim=0), small.amax(dim=0)
+    highest = small.amax(dim=0)
     saturated = radiance.amax(dim=0) >= SATURATED
     counted = saturated if mask is None else saturated[mask]
     return Photograph(
@@ -127,44 +120,9 @@ def summarize(
         focal_px=focal_px,
         saturated=float(counted.sum()) / max(1, counted.numel()),
         bright=float(highest.flatten().kthvalue(math.ceil(0.99 * highest.numel())).values),
-        blur_px=edge_blur_px(grey),
+        blur_px=edge_blur_px(radiance.mean(dim=0)),
         small=small.mean(dim=0),
-        small_saturated=highest,
     )
-
-
-def read_all(
-    paths: Sequence[Path], encoding: Encoding, max_size_px: int
-) -> list[Photograph | InputError]:
-    """Read photographs one by one, so that one that cannot be read hides no other.
-
-    Args:
-        encoding: As of :func:`pimper_torch.io.photographs.load_views`; saturation that is to be
-            found is taken for full scale, as one photograph alone cannot tell it.
-    """
-    plain = Encoding(
-        response=encoding.response,
-        saturation=1.0 if encoding.saturation == "auto" else encoding.saturation,
-        black=encoding.black,
-    )
-
-    def read(path: Path) -> tuple[Photograph, Header] | InputError:
-        try:
-            header = read_header(path)
-            size = shrunk_size(header, max_size_px)
-            image = read_pictures([path], [header], [size], plain).images[0]
-        except InputError as error:
-            return error
-        return summarize(path.name, image, math.nan), header
-
-    results = list(side_by_side(read, paths))
-    pairs = [result for result in results if not isinstance(result, InputError)]
-    sizes = [(photograph.width, photograph.height) for photograph, _ in pairs]
-    focals = iter(shrunk_focals([header for _, header in pairs], sizes).tolist())
-    return [
-        result if isinstance(result, InputError) else result[0].replace(focal_px=next(focals))
-        for result in results
-    ]
 
 
 def of_views(views: Views) -> list[Photograph]:

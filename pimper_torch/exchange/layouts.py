@@ -28,9 +28,6 @@ def write_lights(result: Result, folder: Path) -> None:
     frame of the reference camera: x right, y up, z to the viewer. A view whose light has no
     direction, or is unknown, is in ``lights.json`` alone. Blanks in names become ``_`` in
     ``lights.lp``.
-
-    Raises:
-        InputError: No view's light has a direction.
     """
     names = result.scene.views.names
     reference = names.index(result.reference)
@@ -92,9 +89,6 @@ def write_formats(
 
     Args:
         axes: That normals of ``maps`` have.
-
-    Raises:
-        InputError: The result lacks what a layout is made of.
     """
     writers: Mapping[Format, Callable[[Result, Path], None]] = {
         "colmap": write_workspace,

@@ -54,9 +54,6 @@ def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
 
     Args:
         max_samples: Of a picture that says it has more none is read.
-
-    Raises:
-        ValueError: Says what the file is, or holds, that is not read.
     """
     data = Path(path).read_bytes()
     try:

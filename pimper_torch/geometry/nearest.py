@@ -38,9 +38,6 @@ class NearestSurface:
     face are no part of a mesh that has faces. Of faces whose distances differ by less than a
     millionth of the extent of mesh and points, any may be taken for the nearest.
 
-    Raises:
-        InputError: The mesh has no vertices.
-
     >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     >>> NearestSurface(mesh).query(torch.tensor([[0.5, 0.25, 2.0], [1.5, 0.5, 0.0]])).distance

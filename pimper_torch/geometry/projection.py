@@ -45,9 +45,7 @@ def rays_through(
 
 
 def triangulate_rays(
-    cameras: Cameras,
-    pixels: Float[Tensor, "point view 2"],
-    seen: Bool[Tensor, "point view"],
+    cameras: Cameras, pixels: Float[Tensor, "point view 2"], seen: Bool[Tensor, "point view"]
 ) -> Float[Tensor, "point 3"]:
     """Find the points nearest to their rays in the least-squares sense.
 

@@ -20,9 +20,7 @@ def rotate(
     return vectors @ target_from_source[..., :3, :3].mT
 
 
-def invert_rigid(
-    target_from_source: Float[Tensor, "*batch 4 4"],
-) -> Float[Tensor, "*batch 4 4"]:
+def invert_rigid(target_from_source: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Return ``source_from_target`` of a rotation and a translation."""
     rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
     return rigid(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])

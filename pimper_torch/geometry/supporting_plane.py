@@ -76,8 +76,7 @@ def fixation(cam_from_world: Float[Tensor, "view 4 4"]) -> Fixation:
     fixation = torch.linalg.solve(across.sum(dim=0) + near, right)
     distance = (eyes - fixation).norm(dim=1).median()
     return Fixation(
-        fixation_world=fixation.to(cam_from_world),
-        distance=distance.to(cam_from_world),
+        fixation_world=fixation.to(cam_from_world), distance=distance.to(cam_from_world)
     )
 
 

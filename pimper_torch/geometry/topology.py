@@ -21,9 +21,7 @@ def half_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "half_edge 2"]:
     return faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2)
 
 
-def face_edges(
-    faces: Int[Tensor, "face 3"],
-) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
+def face_edges(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
     """List every edge once, its lower vertex first, and which one is opposite to each corner."""
     if len(faces) == 0:
         return faces[:, :2], faces
@@ -137,9 +135,7 @@ def face_components(faces: Int[Tensor, "face 3"]) -> Int[Tensor, " face"]:
     return graph_components(pairs, len(faces))
 
 
-def vertex_fans(
-    faces: Int[Tensor, "face 3"],
-) -> tuple[Int[Tensor, " fan"], Int[Tensor, "face 3"]]:
+def vertex_fans(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, " fan"], Int[Tensor, "face 3"]]:
     """Split non-manifold vertices: every fan of faces round one gets a vertex of its own.
 
     Returns:

@@ -15,25 +15,10 @@ from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageErr
 from torch import Tensor
 
 from pimper_torch.errors import InputError
+from pimper_torch.io import profiles, tiff
 from pimper_torch.io.extras import extra_of, format_of, read_heic, read_heic_header
 from pimper_torch.io.header import Header, focal_from_exif
-from pimper_torch.io.profiles import (
-    PngHead,
-    colour_of_exif,
-    colour_of_png,
-    colour_of_tiff,
-    png_head,
-    read_profile,
-)
 from pimper_torch.io.raw import read_raw, read_raw_header
-from pimper_torch.io.tiff import (
-    CMYK_CAUTION,
-    Layout,
-    layout_of,
-    read_deep_tiff,
-    read_gray_tiff,
-    unread_tiff,
-)
 from pimper_torch.radiometry.colour import SILENT, Colour
 from pimper_torch.records import Record
 
@@ -91,8 +76,8 @@ def read_header(path: Path | str) -> Header:
     def read(image: Image.Image) -> Header:
         layout = None
         if isinstance(image, TiffImagePlugin.TiffImageFile):
-            layout = layout_of(path, image)
-        png = png_head(path) if image.format == "PNG" else None
+            layout = tiff.layout_of(path, image)
+        png = profiles.png_head(path) if image.format == "PNG" else None
         width, height = image.size
         grey = image.mode in ("1", "L", "LA", "La") or image.mode.startswith("I;16")
         _refuse_huge(path, width, height, 1 if grey else 3)
@@ -113,7 +98,7 @@ def read_header(path: Path | str) -> Header:
             deep=deep,
             full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
             colour=_colour(image, exif, png),
-            cautions=(*cautions, *[CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
+            cautions=(*cautions, *[tiff.CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
             layout=layout,
         )
 
@@ -223,18 +208,18 @@ def _full_scale(array: np.ndarray, header: Header) -> int:
     return header.full if array.dtype == np.uint16 and int(array.max()) <= header.full else most
 
 
-def _colour(image: Image.Image, exif: Image.Exif, png: PngHead | None) -> Colour:
+def _colour(image: Image.Image, exif: Image.Exif, png: profiles.PngHead | None) -> Colour:
     """Return what an image says of its samples: by its format's own means, or else by EXIF."""
     if image.mode in ("CMYK", "LAB"):  # turned into sRGB by Pillow
         return SILENT
     if isinstance(image, TiffImagePlugin.TiffImageFile):
-        said = colour_of_tiff(image.tag_v2)
+        said = profiles.colour_of_tiff(image.tag_v2)
     elif png is not None:
-        said = colour_of_png(png.chunks)
+        said = profiles.colour_of_png(png.chunks)
     else:
         profile = image.info.get("icc_profile")
-        said = read_profile(profile) if isinstance(profile, bytes) else SILENT
-    return colour_of_exif(exif) if said is SILENT else said
+        said = profiles.read_profile(profile) if isinstance(profile, bytes) else SILENT
+    return profiles.colour_of_exif(exif) if said is SILENT else said
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
@@ -285,7 +270,7 @@ def _unfit(path: Path, kind: str) -> InputError:
 
 def _unidentified(path: Path) -> InputError:
     """Return the refusal of a file unknown to Pillow: a TIFF of other samples, or no image."""
-    found = unread_tiff(path)
+    found = tiff.unread_tiff(path)
     if found.startswith(("float", "int", "uint", "complex")):
         return _unfit(path, found)
     if found:
@@ -298,12 +283,12 @@ def _unidentified(path: Path) -> InputError:
     )
 
 
-def _read_shallow(image: Image.Image, layout: Layout | None) -> np.ndarray:
+def _read_shallow(image: Image.Image, layout: tiff.Layout | None) -> np.ndarray:
     if layout is not None:
         image.seek(layout.page)
     upright = ImageOps.exif_transpose(image)
     if upright.mode.startswith("I;16"):
-        return read_gray_tiff(upright, layout)
+        return tiff.read_gray_tiff(upright, layout)
     if upright.mode in ("I", "F"):
         return np.asarray(upright)  # 32 bits: the caller refuses them
     if upright.mode == "La":
@@ -319,9 +304,9 @@ def _is_deep_png(path: Path) -> bool:
     return start[24] == 16 and start[25] in (2, 4, 6)  # bit depth; RGB, LA, RGBA
 
 
-def _read_deep(path: Path, layout: Layout | None) -> np.ndarray:
+def _read_deep(path: Path, layout: tiff.Layout | None) -> np.ndarray:
     try:
-        return _read_deep_png(path) if layout is None else read_deep_tiff(path, layout)
+        return _read_deep_png(path) if layout is None else tiff.read_deep_tiff(path, layout)
     except InputError:
         raise
     except Exception as error:  # kornia_rs raises bare Exception

@@ -51,9 +51,6 @@ def read_estimate(path: Path | str) -> Estimate:
             there, ``sparse/`` (COLMAP model whose pinholes are the cameras), ``lights.json``
             and ``depth.npz`` (whose ``name`` is the reference view), as
             :func:`pimper_torch.io.results.write_result` writes them.
-
-    Raises:
-        InputError: Neither is there, or a file of it cannot be read.
     """
     path = Path(path)
     if not path.is_dir():

@@ -66,11 +66,7 @@ def is_installed(extra: str) -> bool:
 
 
 def load_extra(extra: str, path: Path | str) -> ModuleType:
-    """Import the package of an extra.
-
-    Raises:
-        InputError: It is not installed; says how to.
-    """
+    """Import the package of an extra."""
     kind, modules = _EXTRAS[extra]
     for name in modules:
         if _is_there(name):

@@ -358,11 +358,7 @@ _COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
 
 
 def _readable(path: Path, suffix: str) -> bytes:
-    """Return a file's bytes so that trimesh reads all that they hold.
-
-    Raises:
-        InputError: It is cut short, or has values that trimesh passes over.
-    """
+    """Return a file's bytes so that trimesh reads all that they hold."""
     data = path.read_bytes()
     if suffix == ".glb":
         return _with_raw_colors(path, data)

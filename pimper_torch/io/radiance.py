@@ -294,11 +294,7 @@ def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) ->
 def _levels(
     encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
-    """Return black and white of a file as fractions of its full scale.
-
-    Raises:
-        InputError: Levels above full scale, ones for other colours, or no span between them.
-    """
+    """Return black and white of a file as fractions of its full scale."""
     full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black
     if saturation == "auto":

@@ -43,11 +43,7 @@ _UNKNOWN_CAMERA = "is of a camera whose colours nobody tells; albedo keeps them 
 
 
 def read_raw_header(path: Path | str) -> Header:
-    """Read size, turn, colours and EXIF of a raw file, without its samples.
-
-    Raises:
-        InputError: The extra is absent, or the file is not one that LibRaw knows.
-    """
+    """Read size, turn, colours and EXIF of a raw file, without its samples."""
     path = Path(path)
     with _opened(path) as raw:
         rows, columns = _shown(raw)

@@ -1,7 +1,7 @@
 """Responses of photographs: measured curves from small files, and contradictions of files."""
 
 import csv
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -112,45 +112,25 @@ def _is_number(cell: str) -> bool:
 
 # Of the warning that a given response contradicts what files say.
 CONTRADICTED = "is given, but"
-_SILENT = "srgb, as files are silent"
 
 
 def tell_cautions(
     folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
 ) -> None:
-    """Warn of what photographs say and is not followed, as :func:`find_cautions` has it."""
-    for sentence, names in find_cautions(paths, headers, encoding).items():
-        caution(
-            f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
-            stacklevel=3,
-        )
-
-
-def find_cautions(
-    paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
-) -> dict[str, list[str]]:
-    """Find what photographs say and is not followed.
+    """Warn of what photographs say and is not followed.
 
     Args:
         encoding: As given. A measured curve is not compared with what files say.
-
-    Returns:
-        The names of those to which each sentence applies.
     """
     kinds: dict[str, list[str]] = defaultdict(list)
     for path, header in zip(paths, headers, strict=True):
         for sentence in (*header.cautions, *_of_colour(header, encoding)):
             kinds[sentence].append(Path(path).name)
-    return dict(kinds)
-
-
-def responses_told(headers: Sequence[Header]) -> dict[str, int]:
-    """Count the responses that are taken unless one is given, and where files say so."""
-    counts: Counter[str] = Counter()
-    for header in headers:
-        said = header.colour
-        counts[f"{told(said.response)} by {said.source}" if said.response else _SILENT] += 1
-    return dict(counts)
+    for sentence, names in kinds.items():
+        caution(
+            f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
+            stacklevel=3,
+        )
 
 
 def _of_colour(header: Header, encoding: Encoding) -> list[str]:

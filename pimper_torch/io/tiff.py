@@ -64,11 +64,7 @@ class Layout:
 
 
 def layout_of(path: Path | str, image: TiffImagePlugin.TiffImageFile) -> Layout:
-    """Find the picture among a TIFF's pages, and leave the image at it.
-
-    Raises:
-        InputError: None of its pages is a photograph that can be read.
-    """
+    """Find the picture among a TIFF's pages, and leave the image at it."""
     page, cautions = _picture(Path(path), image)
     tags: Mapping[int, Any] = image.tag_v2
     bits = tags.get(_BITS, (1,))

@@ -97,9 +97,6 @@ def border_cycles(faces: Int[Tensor, "face 3"]) -> list[list[int]]:
     """Order the border of an oriented manifold: every one a cycle, its faces on the right.
 
     A face on the other side of an edge runs the way of the cycle.
-
-    Raises:
-        InputError: Faces on two sides of an edge face opposite ways.
     """
     _, index = face_edges(faces)
     alone = (face_counts(index) == 1)[index].flatten()

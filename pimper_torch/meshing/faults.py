@@ -7,17 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry import topology
 from pimper_torch.geometry.surfaces import (
     face_normals,
     side_lengths,
     unit_face_normals,
     vertex_normals,
-)
-from pimper_torch.geometry.topology import (
-    corners_of,
-    face_pairs,
-    graph_components,
-    vertex_components,
 )
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
@@ -65,14 +60,14 @@ class Faults:
     def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
         normals, overturned = unit_face_normals(vertices, self.faces), self.overturned(vertices)
         near = self._near_folds(vertices, normals, overturned).nonzero()[:, 0]
-        pairs = near[face_pairs(self.faces[near])[0]]
+        pairs = near[topology.face_pairs(self.faces[near])[0]]
         one, other = pairs.unbind(dim=1)
         fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(_FOLD)
         found = torch.zeros_like(overturned)
         found[pairs[fold].flatten()] = True
         (index,) = torch.nonzero(overturned, as_tuple=True)
         rank = overturned.cumsum(dim=0) - 1
-        label = graph_components(rank[pairs[overturned[pairs].all(dim=1)]], len(index))
+        label = topology.graph_components(rank[pairs[overturned[pairs].all(dim=1)]], len(index))
         bounded = torch.zeros_like(index, dtype=torch.bool)
         bounded[label[found[index]]] = True
         found[index[bounded[label]]] = True
@@ -90,7 +85,7 @@ class Faults:
         that neighbours are looked for among few faces.
         """
         axis = vertex_normals(vertices, self.faces)
-        near = corners_of(self.faces, overturned, len(vertices))
+        near = topology.corners_of(self.faces, overturned, len(vertices))
         for corner in self.faces.unbind(dim=1):
             # Rounding of a cosine in float32: faces that it adds change nothing.
             bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + 1e-3
@@ -118,9 +113,7 @@ def faults(
 
 
 def facet_means(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    facet: Int[Tensor, " vertex"],
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], facet: Int[Tensor, " vertex"]
 ) -> Float[Tensor, "face 3"]:
     """Assign each face the mean normal of its facet, weighted by area, of any length."""
     one, other, last = facet[faces].unbind(dim=1)
@@ -140,7 +133,7 @@ def small_groups(
     Args:
         max_extent: Diagonal of a component's bounding box.
     """
-    label = vertex_components(faces, among)
+    label = topology.vertex_components(faces, among)
     count = int(label.max()) + 1 if len(label) else 0
     index = label[:, None].expand_as(vertices)
     like = vertices.new_zeros(count, 3)

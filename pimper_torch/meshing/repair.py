@@ -13,13 +13,8 @@ from scipy.sparse import coo_array
 from torch import Tensor
 
 from pimper_torch.config import Range, require_ranges
+from pimper_torch.geometry import topology
 from pimper_torch.geometry.surfaces import side_lengths, vertex_normals
-from pimper_torch.geometry.topology import (
-    boundary_vertices,
-    corners_of,
-    face_edges,
-    vertex_components,
-)
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.meshing.faults import diagonal, faults, small_groups
@@ -28,9 +23,7 @@ from pimper_torch.stage import Stage
 
 
 def least_bent(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    free: Bool[Tensor, " vertex"],
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], free: Bool[Tensor, " vertex"]
 ) -> Float[Tensor, "vertex 3"]:
     r"""Move some vertices to where the surface bends least, as a thin plate clamped all round.
 
@@ -49,8 +42,8 @@ def least_bent(
     if not bool(free.any()):
         return vertices
     known = vertices.double()
-    ring = corners_of(faces, free[faces].any(dim=1), len(vertices))
-    edges, _ = face_edges(faces[ring[faces].any(dim=1)])
+    ring = topology.corners_of(faces, free[faces].any(dim=1), len(vertices))
+    edges, _ = topology.face_edges(faces[ring[faces].any(dim=1)])
     links = torch.cat([edges, edges.flip(1)])
     here, there = links[ring[links[:, 0]]].unbind(dim=1)
     (centre,) = torch.nonzero(ring, as_tuple=True)
@@ -125,7 +118,7 @@ class Repair(Stage):
         vertices = vertices.index_copy(0, used, positions)
         moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
         leave_out("repair", moved, at=before)
-        beside = corners_of(faces, moved[faces].any(dim=1), len(vertices))
+        beside = topology.corners_of(faces, moved[faces].any(dim=1), len(vertices))
         return surface.replace(
             vertices_world=vertices,
             normals_world=torch.where(
@@ -160,18 +153,18 @@ def repair(
     """
     before, count = vertices.detach(), len(vertices)
     shortest = 1e-4 * side_lengths(before[faces]).amax(dim=1).median()
-    fixed = boundary_vertices(faces, count)
-    free = corners_of(faces, broken(before), count)
+    fixed = topology.boundary_vertices(faces, count)
+    free = topology.corners_of(faces, broken(before), count)
     free = _with_neighbours(faces, free & ~_components_with(faces, free, fixed))
     for ring in range(_RINGS + 1):
         positions = least_bent(before, faces, free)
         fixed = fixed | (free & ~small_groups(positions, faces, free, max_extent))
         free = free & ~fixed
         wrong = broken(positions) | (side_lengths(positions[faces]).amax(dim=1) < shortest)
-        still = _components_with(faces, free, corners_of(faces, wrong, count))
+        still = _components_with(faces, free, topology.corners_of(faces, wrong, count))
         if not bool(still.any()):
             break
-        wider = corners_of(faces, still[faces].any(dim=1), count) & ~fixed
+        wider = topology.corners_of(faces, still[faces].any(dim=1), count) & ~fixed
         free = free & ~still if ring == _RINGS else _with_neighbours(faces, free | wider)
     return least_bent(vertices, faces, free), free
 
@@ -182,7 +175,7 @@ def surroundings(
     """Find the faces round defective ones that :func:`repair` may use: it needs no others."""
     near = broken
     for _ in range(_RINGS + 3):  # two rings clamp the plate, and one shows the border
-        near = corners_of(faces, near, num_vertices)[faces].any(dim=1)
+        near = topology.corners_of(faces, near, num_vertices)[faces].any(dim=1)
     return near
 
 
@@ -190,7 +183,7 @@ def _components_with(
     faces: Int[Tensor, "face 3"], among: Bool[Tensor, " vertex"], some: Bool[Tensor, " vertex"]
 ) -> Bool[Tensor, " vertex"]:
     """Find the connected components of vertices ``among`` that have some of others."""
-    label = vertex_components(faces, among)
+    label = topology.vertex_components(faces, among)
     named = torch.zeros_like(among)
     named[label[among & some]] = True
     return among & named[label]
@@ -202,4 +195,4 @@ def _with_neighbours(
     """Leave out connected components without a neighbour that is not free."""
     of_face = free[faces]
     mixed = of_face.any(dim=1) & ~of_face.all(dim=1)
-    return _components_with(faces, free, corners_of(faces, mixed, len(free)))
+    return _components_with(faces, free, topology.corners_of(faces, mixed, len(free)))

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from itertools import count
 from pathlib import Path
 
 from pimper_torch.errors import InputError, OutputError, some
@@ -135,13 +134,7 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
             put_in_place(target)  # goes on
             raise
         except OutputError as error:  # somebody wrote there meanwhile
-            names = (target.with_name(f"{target.name}-{number}") for number in count(2))
-            aside = next(path for path in names if not os.path.lexists(path))
-            try:
-                new.rename(aside)
-            except OSError:  # beside a mount point, or where nothing may be written
-                aside = new
-            raise OutputError(f"{error} The new result is in {aside}.") from error
+            raise OutputError(f"{error} The new result is in {new}.") from error
 
 
 def put_in_place(target: Path) -> None:

@@ -18,19 +18,7 @@ from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_components, face_edges
 from pimper_torch.ledger import leave_out
-from pimper_torch.paper.cloud_filters import (
-    behind_others,
-    delaunay,
-    fill_pixels,
-    interpolate_inverse_depth,
-    neighbours_agree,
-    on_hull,
-    spread,
-    spread_to_count,
-    views_near,
-    well_accompanied,
-    with_cloud,
-)
+from pimper_torch.paper import cloud_filters
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
 from pimper_torch.stage import Stage
 
@@ -91,12 +79,12 @@ class Triangulate(Stage):
         index, quality = self._reliable(scene, reference)
         points = scene.points_world[index]
         pixels, _ = _project(points, cameras, reference)
-        quality = torch.where(on_hull(pixels), quality + quality.amax(), quality)
+        quality = torch.where(cloud_filters.on_hull(pixels), quality + quality.amax(), quality)
         edge_px = _edge_for(config.num_points, pixels)
         if config.fill:  # filled vertices count too: do not crowd where points are dense
-            chosen = spread(pixels, quality, 0.7 * edge_px)
+            chosen = cloud_filters.spread(pixels, quality, 0.7 * edge_px)
         else:
-            chosen = spread_to_count(pixels, quality, config.num_points)
+            chosen = cloud_filters.spread_to_count(pixels, quality, config.num_points)
         vertices = points[chosen]
         source = index[chosen]
         faces = self._facets(vertices, scene.views, cameras, reference)
@@ -118,7 +106,7 @@ class Triangulate(Stage):
         vertices = vertices[used]
         normals = smoothed_normals(vertices, faces)
         mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=normals)
-        return with_cloud(scene, index, mesh, reference, source[used])
+        return cloud_filters.with_cloud(scene, index, mesh, reference, source[used])
 
     def _reliable(
         self, scene: SparseScene, reference: int
@@ -127,7 +115,7 @@ class Triangulate(Stage):
         cameras, observed = scene.cameras, scene.observed
         length = observed.sum(dim=1)
         angle = triangulation_angles(scene.points_world, observed, cameras.centers_world)
-        near = views_near(cameras, reference, _MAX_VIEW_ANGLE_DEG)
+        near = cloud_filters.views_near(cameras, reference, _MAX_VIEW_ANGLE_DEG)
         pixels, depth = _project(scene.points_world, cameras, reference)
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
         tests = {
@@ -145,7 +133,7 @@ class Triangulate(Stage):
         index = keep.nonzero()[:, 0]
         for _ in range(2):  # a second look, without those that seemed to be in between
             if len(index) >= 4:
-                hidden = behind_others(
+                hidden = cloud_filters.behind_others(
                     pixels[index],
                     transform(cameras.cam_from_world[reference], scene.points_world[index]),
                     observed[index, reference],
@@ -155,7 +143,7 @@ class Triangulate(Stage):
                 index = index[~hidden]
         if len(index) >= 4:
             points_cam = transform(cameras.cam_from_world[reference], scene.points_world[index])
-            agree = neighbours_agree(
+            agree = cloud_filters.neighbours_agree(
                 pixels[index],
                 points_cam,
                 neighbours=min(_NEIGHBOURS, len(index) - 1),
@@ -164,7 +152,7 @@ class Triangulate(Stage):
             )
             index = index[agree]
         if len(index) >= 4:
-            index = index[well_accompanied(pixels[index], _MAX_ISOLATION)]
+            index = index[cloud_filters.well_accompanied(pixels[index], _MAX_ISOLATION)]
         if len(index) < 4:
             counts = "; ".join(f"{int(passed.sum())} {test}" for test, passed in tests.items())
             raise ReconstructionError(
@@ -189,9 +177,9 @@ class Triangulate(Stage):
     ) -> Float[Tensor, "filled 3"]:
         """Return new vertices between far-apart ones, on a spline through all reliable points."""
         pixels, _ = _project(vertices, cameras, reference)
-        wanted = fill_pixels(pixels, faces, edge_px)
+        wanted = cloud_filters.fill_pixels(pixels, faces, edge_px)
         known, depth = _project(points, cameras, reference)
-        inverse = interpolate_inverse_depth(known, 1 / depth, wanted, 1e-6)
+        inverse = cloud_filters.interpolate_inverse_depth(known, 1 / depth, wanted, 1e-6)
         possible = inverse > 0.5 / depth.amax()
         rays = rays_through(
             wanted[possible], cameras.cam_from_world[reference], cameras.intrinsics[reference]
@@ -203,7 +191,7 @@ class Triangulate(Stage):
     ) -> Int[Tensor, "face 3"]:
         """Triangulate, drop bridges, and peel off the border what shows no object."""
         pixels, _ = _project(vertices, cameras, reference)
-        faces = delaunay(pixels)
+        faces = cloud_filters.delaunay(pixels)
         normals = unit_face_normals(vertices, faces)
         to_camera = normalize(
             cameras.centers_world[reference] - vertices[faces].mean(dim=1), dim=-1
@@ -264,7 +252,7 @@ def _project(
 
 def _edge_for(num_points: int, pixels: Float[Tensor, "point 2"]) -> float:
     """Return the edge of the triangular grid that puts ``num_points`` on the hull's area."""
-    faces = delaunay(pixels)
+    faces = cloud_filters.delaunay(pixels)
     a, b, c = pixels[faces].unbind(dim=1)
     ab, ac = b - a, c - a
     area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs().sum() / 2

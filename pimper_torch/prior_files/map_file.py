@@ -30,9 +30,6 @@ def read_layers(
     Returns:
         ``height width channel``, and ``height width``: whole numbers of 8 and 16 bits in [0, 1],
         other values as they are; NaN where PNG says that there is nothing.
-
-    Raises:
-        InputError: Names a file that cannot be read, or holds no map of that kind.
     """
     try:
         suffix = path.suffix.lower()

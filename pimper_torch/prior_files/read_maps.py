@@ -7,22 +7,16 @@ import numpy as np
 
 from pimper_torch.errors import InputError
 from pimper_torch.prior_files.folder import read_maps, single
-from pimper_torch.priors.from_maps import (
-    DEPTH_ERROR,
-    NORMALS_ERROR_DEG,
-    NormalAxes,
-    depth_from,
-    normals_from,
-)
+from pimper_torch.priors import from_maps
 from pimper_torch.records import DepthPrior, NormalPrior, Views
 
 
 def read_normals(
     folder: Path | str,
     views: Views,
-    axes: NormalAxes = "auto",
+    axes: from_maps.NormalAxes = "auto",
     *,
-    error_deg: float = NORMALS_ERROR_DEG,
+    error_deg: float = from_maps.NORMALS_ERROR_DEG,
     undistorted: bool = False,
 ) -> NormalPrior:
     """Read normals of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
@@ -38,12 +32,9 @@ def read_normals(
             ``world`` of the cameras that are given; ``auto`` finds them by the scene.
         error_deg: Root mean square of the angular error, where no file has a variance.
         undistorted: Whether they are of the photographs as a run undistorts them.
-
-    Raises:
-        InputError: A file or its name, shape or values cannot be used: says which.
     """
     maps = read_maps(folder, views, ("normal",), _vectors)
-    return normals_from(maps, axes, error_deg=error_deg, undistorted=undistorted)
+    return from_maps.normals_from(maps, axes, error_deg=error_deg, undistorted=undistorted)
 
 
 def _vectors(path: Path, values: np.ndarray) -> np.ndarray:
@@ -59,7 +50,7 @@ def read_depth(
     *,
     along: Literal["axis", "ray"] = "axis",
     gauge: Literal["scene", "scale", "affine"] = "affine",
-    error: float = DEPTH_ERROR,
+    error: float = from_maps.DEPTH_ERROR,
     undistorted: bool = False,
 ) -> DepthPrior:
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
@@ -77,9 +68,8 @@ def read_depth(
         error: Root mean square, where no file has a variance: relative to depth, or to the range
             of a map's values where these have an offset of their own.
         undistorted: Whether they are of the photographs as a run undistorts them.
-
-    Raises:
-        InputError: A file or its name, shape or values cannot be used: says which.
     """
     maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), single)
-    return depth_from(maps, inverse, along=along, gauge=gauge, error=error, undistorted=undistorted)
+    return from_maps.depth_from(
+        maps, inverse, along=along, gauge=gauge, error=error, undistorted=undistorted
+    )

@@ -26,9 +26,6 @@ def read_silhouettes(
 
     Args:
         undistorted: Whether they are of the photographs as a run undistorts them.
-
-    Raises:
-        InputError: A file or its name, shape or values cannot be used: says which.
     """
     return silhouettes_from(
         read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted

@@ -13,14 +13,7 @@ from torch.nn.functional import interpolate
 from pimper_torch.config import require
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.parallel import side_by_side
-from pimper_torch.priors.from_maps import (
-    Maps,
-    depth_from,
-    normals_from,
-    silhouettes_from,
-    stacked,
-    variance_of,
-)
+from pimper_torch.priors import from_maps
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import AlbedoPrior, InlierPrior, Prior, SparseScene, Views
 
@@ -83,7 +76,7 @@ def priors_of(
 
     numbers = range(photographs.num_views)
     guesses = map(guess, numbers) if callable(network) else side_by_side(guess, numbers)
-    maps = stacked(dict(zip(photographs.names, guesses, strict=True)))
+    maps = from_maps.stacked(dict(zip(photographs.names, guesses, strict=True)))
     return _prior(maps, kind, undistorted, meaning)
 
 
@@ -106,13 +99,13 @@ def _map(found: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN40
     return values[0].movedim(0, -1), None if variance is None else variance[0, 0]
 
 
-def _prior(maps: Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -> Prior:
+def _prior(maps: from_maps.Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -> Prior:
     if kind == "normals":
-        return normals_from(maps, **meaning, undistorted=undistorted)
+        return from_maps.normals_from(maps, **meaning, undistorted=undistorted)
     if kind == "depth":
-        return depth_from(maps, **meaning, undistorted=undistorted)
+        return from_maps.depth_from(maps, **meaning, undistorted=undistorted)
     if kind == "silhouettes":
-        return silhouettes_from(maps, **meaning, undistorted=undistorted)
+        return from_maps.silhouettes_from(maps, **meaning, undistorted=undistorted)
     known = maps.values.isfinite().all(dim=-1)
     values = torch.where(known[..., None], maps.values, 0)
     about: dict[str, Any] = {"names": maps.names, "sizes_px": maps.sizes_px}
@@ -121,7 +114,7 @@ def _prior(maps: Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -
         error = meaning.pop("error", torch.nan)
         told = error > 0 or bool(maps.variance.isfinite().any())
         require(told, "error", error, "above 0, where the network returns no variance")
-        variance = variance_of(maps, known, error**2)
+        variance = from_maps.variance_of(maps, known, error**2)
         return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **about, **meaning)
     return InlierPrior(probability=values[..., 0], **about, **meaning)
 

@@ -35,9 +35,7 @@ REC_2020: Chromaticities = ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046), _D65
 DISPLAY_P3: Chromaticities = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), _D65)
 
 
-def srgb_from_primaries(
-    primaries_xyz: Float[Tensor, "3 3"],
-) -> Float[Tensor, "3 3"] | None:
+def srgb_from_primaries(primaries_xyz: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"] | None:
     """Return the matrix from linear values of some primaries to linear sRGB; white stays white.
 
     Args:

@@ -72,9 +72,7 @@ class Record:
                     yield f"{field.name}.{name}", found, needed
 
     def to(
-        self: AnyRecord,
-        target: torch.device | str | torch.dtype,
-        dtype: torch.dtype | None = None,
+        self: AnyRecord, target: torch.device | str | torch.dtype, dtype: torch.dtype | None = None
     ) -> AnyRecord:
         """Copy every tensor, in nested records and tuples too, to a device, a dtype, or both.
 

@@ -22,10 +22,7 @@ from pimper_torch.relighting.lit_surface import (
 
 
 def predict(
-    mesh: Mesh | LitSurface,
-    camera: Cameras,
-    light: ViewLights,
-    materials: Materials | None = None,
+    mesh: Mesh | LitSurface, camera: Cameras, light: ViewLights, materials: Materials | None = None
 ) -> Float[Tensor, "height width channel"]:
     """Return the linear radiance that a camera sees, with cast shadows; NaN beside the mesh.
 

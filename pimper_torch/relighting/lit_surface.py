@@ -203,11 +203,7 @@ class LitSurface:
             reach = torch.full_like(lift[:, 0], torch.inf)
             blocked = self._caster.blocked(pixels.points_world[pixel] + lift, along, reach)
             cosine[light[blocked], pixel[blocked]] = 0
-        return Incidence(
-            to_light=toward,
-            cosine=cosine,
-            irradiance=cosine / distance**2,
-        )
+        return Incidence(to_light=toward, cosine=cosine, irradiance=cosine / distance**2)
 
 
 DIELECTRIC = 0.04

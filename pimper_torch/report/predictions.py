@@ -120,9 +120,7 @@ Json = dict[str, object]
 
 
 def view_entries(
-    scene: SparseScene,
-    silhouettes: Silhouettes,
-    predictions: Sequence[Prediction | None],
+    scene: SparseScene, silhouettes: Silhouettes, predictions: Sequence[Prediction | None]
 ) -> list[Json]:
     """List the photographs with their pinholes, pictures, silhouettes and lights.
 

@@ -91,9 +91,6 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
 
     Args:
         folder: Made if it does not exist; files of those names in it are replaced.
-
-    Raises:
-        OutputError: The files cannot be written.
     """
     with quiet():
         reconstruction = reconstruction_of(model, colors)

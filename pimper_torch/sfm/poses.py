@@ -25,9 +25,6 @@ def pictures_of_poses(views: Views) -> Views:
     Returns:
         Pictures in the order of the poses, under the names of their first photographs. The object
         is where any of a pose's masks shows it.
-
-    Raises:
-        InputError: Photographs of one pose have unlike sizes.
     """
     if views.poses is None:
         return views

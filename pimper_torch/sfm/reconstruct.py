@@ -77,11 +77,7 @@ class Reconstruct(Stage):
         return placed_scene(views, self._given(bare, Path(sparse_model)))
 
     def with_points(self, scene: SparseScene) -> SparseScene:
-        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed.
-
-        Raises:
-            InputError: Cameras and photographs do not belong together.
-        """
+        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed."""
         model = model_of_scene(scene)
         if not lacks_points(model) or not scene.lenses:
             return scene

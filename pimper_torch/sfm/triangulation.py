@@ -13,27 +13,11 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
+from pimper_torch.sfm import epipolar, matching
 from pimper_torch.sfm.colmap import loaded, model_of, observation_errors, quiet, reconstruction_of
 from pimper_torch.sfm.conventions.by_matches import choose_way
 from pimper_torch.sfm.conventions.resized_pictures import Ways
-from pimper_torch.sfm.epipolar import (
-    epipolar_geometry,
-    explained,
-    pinholes_of,
-    undistorted_pairs,
-    undistorted_pixels,
-)
 from pimper_torch.sfm.features import Workspace, find_features, image_ids, too_small, workspace
-from pimper_torch.sfm.matching import (
-    Near,
-    PhotographPair,
-    VerifiedPair,
-    guided_matches,
-    match_pairs,
-    read_features,
-    strongest,
-    verified_pairs,
-)
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.refine_tracks import refine_tracks
@@ -76,9 +60,9 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
         counts = find_features(space, settings, [None] * views.num_views, lenses)
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
-            match_pairs(space, pairs_to_match(space), settings)
+            matching.match_pairs(space, pairs_to_match(space), settings)
             enter_room(leave_out_room(space.database, settings))
-        verified = verified_pairs(space)
+        verified = matching.verified_pairs(space)
         given = choose_way(ways, verified, settings.max_error_px, where)
         if ways.cropped and not lacks_points(given):
             return given
@@ -107,56 +91,58 @@ def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: st
 def _match_along_lines(
     space: Workspace,
     model: SparseModel,
-    verified: Sequence[VerifiedPair],
+    verified: Sequence[matching.VerifiedPair],
     settings: ReconstructConfig,
 ) -> None:
     """Replace what was verified by matches along the cameras' epipolar lines."""
-    pairs, cameras = _pairs(model, verified, settings), pinholes_of(model)
+    pairs, cameras = _pairs(model, verified, settings), epipolar.pinholes_of(model)
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = image_ids(stored, space)
         features = []
         for view, image in enumerate(image_of):
-            its = read_features(stored, image)
-            features.append(its.replace(pixels=undistorted_pixels(model, view, its.pixels)))
+            its = matching.read_features(stored, image)
+            features.append(
+                its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
+            )
 
-        def matches(pair: PhotographPair) -> Tensor:
+        def matches(pair: matching.PhotographPair) -> Tensor:
             first, second = (features[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = Near(epipolar_geometry(cameras, pair), settings.max_error_px)
-            found = guided_matches(first, second, near, settings.max_ratio)
-            ends = VerifiedPair(
+            near = matching.Near(epipolar.epipolar_geometry(cameras, pair), settings.max_error_px)
+            found = matching.guided_matches(first, second, near, settings.max_ratio)
+            ends = matching.VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
             )
-            return found[explained(cameras, ends, settings.max_error_px)]
+            return found[epipolar.explained(cameras, ends, settings.max_error_px)]
 
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
             geometry = loaded().TwoViewGeometry()
             geometry.config = kinds.CALIBRATED
-            geometry.F = epipolar_geometry(cameras, pair).numpy()
+            geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
             geometry.inlier_matches = found.numpy().astype(np.uint32)
             stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
 
 
 def _pairs(
-    model: SparseModel, verified: Sequence[VerifiedPair], settings: ReconstructConfig
-) -> list[PhotographPair]:
+    model: SparseModel, verified: Sequence[matching.VerifiedPair], settings: ReconstructConfig
+) -> list[matching.PhotographPair]:
     """Choose pairs by matches that the cameras explain, then by the angle between their axes."""
     axes = model.cam_from_world[:, 2, :3]
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
-    cameras, limit = pinholes_of(model), settings.max_error_px
+    cameras, limit = epipolar.pinholes_of(model), settings.max_error_px
     weights = {
         (first, second): 1 - float(angles[first, second]) / 60
         for first, second in combinations(range(model.num_views), 2)
         if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
     }
-    for pair in undistorted_pairs(model, verified):
-        count = int(explained(cameras, pair, limit).sum())
+    for pair in epipolar.undistorted_pairs(model, verified):
+        count = int(epipolar.explained(cameras, pair, limit).sum())
         if count:
             weights[pair.views] = weights.get(pair.views, 0.0) + count
-    return strongest(weights, model.num_views, max(settings.guided_pairs, 1))
+    return matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
 
 
 def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:

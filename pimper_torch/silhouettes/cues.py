@@ -21,15 +21,9 @@ from pimper_torch.geometry.supporting_plane import (
 )
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
+from pimper_torch.silhouettes import parallax
 from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.silhouettes.opencv import convex_hull_of
-from pimper_torch.silhouettes.parallax import (
-    WorkingPictures,
-    of_views,
-    plane_agreement,
-    room_agreement,
-    working_pictures,
-)
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 
 FEW = 3  # soft masks: fewer have no majority
@@ -60,7 +54,7 @@ class SoftMasks(Record):
         return self.inside > 0.5
 
 
-def soft_masks_of(views: Views, pictures: WorkingPictures) -> SoftMasks | None:
+def soft_masks_of(views: Views, pictures: parallax.WorkingPictures) -> SoftMasks | None:
     """Merge the silhouettes that views carry as priors; ``None`` without any.
 
     Log odds of several maps of one view add up. A map that nowhere says that the object is not
@@ -140,7 +134,7 @@ class Cues(Record):
         soft: Masks that the photographs come with as priors.
     """
 
-    pictures: WorkingPictures
+    pictures: parallax.WorkingPictures
     object_px: tuple[Float[Tensor, "_ 2"], ...]
     background_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
@@ -169,7 +163,7 @@ class Cues(Record):
     def surrounded(self) -> Bool[Tensor, "view height width"]:
         """Find what the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
-        return of_views(
+        return parallax.of_views(
             lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
         )
 
@@ -220,9 +214,9 @@ class Cues(Record):
         """Compare views with what they see through homographies; ``None`` without any."""
         found = []
         if self.plane is not None:
-            found.append(plane_agreement(self.pictures, self.plane, self.fixation, hidden))
+            found.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, hidden))
         if len(self.background_from_view):
-            room = room_agreement(self.pictures, self.background_from_view, hidden)
+            room = parallax.room_agreement(self.pictures, self.background_from_view, hidden)
             surrounded = self.surrounded()
             found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
         return by_view(lambda *all_of: reduce(torch.fmax, all_of), *found) if found else None
@@ -231,7 +225,7 @@ class Cues(Record):
 def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:
     """Gather what is known of the object from photographs, cameras and cloud."""
     scene = scene.to("cpu", torch.float32)
-    pictures = working_pictures(scene.views, scene.cameras, config.size_px)
+    pictures = parallax.working_pictures(scene.views, scene.cameras, config.size_px)
     cameras, points = pictures.cameras, scene.points_world
     focus = fixation(cameras.cam_from_world)
     distance = float(focus.distance)
@@ -257,11 +251,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
-    """Return the region in the scene's frame.
-
-    Raises:
-        InputError: No point of the cloud is in it, and no view sees any of it.
-    """
+    """Return the region in the scene's frame."""
     low, high = torch.tensor(corners, dtype=torch.float64).reshape(2, 3)
     offset = low.new_tensor(scene.offset_world)
     box, points = torch.stack([low, high]) - offset, scene.points_world

@@ -50,9 +50,6 @@ class FindSilhouettes(Stage):
             reliable, everything above the plane that the object stands on, or everything where none
             is found, with a :class:`~pimper_torch.errors.PimperWarning` that says why. Where the
             object was moved between series of photographs, each series is looked at by itself.
-
-        Raises:
-            InputError: Masks are asked for, and none are given.
         """
         config, masks = self.config, scene.views.masks
         if config.object == "everything":

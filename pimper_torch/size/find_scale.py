@@ -14,11 +14,7 @@ from pimper_torch.size.scale import Length, Scale, fitted, most_accurate
 
 
 def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit = "mm") -> Scale:
-    """Find the scale of a result from places that are known distances apart.
-
-    Raises:
-        InputError: A place cannot be found, see :func:`~pimper_torch.size.marks.place_of`.
-    """
+    """Find the scale of a result from places that are known distances apart."""
     lengths = [
         Length(
             found=float((place_of(bar.first, result) - place_of(bar.second, result)).norm()),
@@ -68,9 +64,6 @@ def find_scale(
 
     Returns:
         ``None`` where nothing tells the size.
-
-    Raises:
-        InputError: A place or a photograph that is named cannot be found.
     """
     scales = []
     if bars:
@@ -85,7 +78,7 @@ def find_scale(
             caution(
                 "No marker was found that two photographs show alike. Print a sheet (`pimper "
                 "markers`), lay it flat beside the object, and photograph both sharply, not "
-                "overexposed.",
+                "overexposed."
             )
         elif found is not None:
             scales.append(found)

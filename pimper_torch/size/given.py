@@ -137,11 +137,7 @@ def number_of(name: str, names: Sequence[str]) -> int:
 
 
 def require_inside(pointer: Pointer, width: int, height: int) -> None:
-    """Refuse a pixel outside of its photograph.
-
-    Raises:
-        InputError: Names it, and the photograph's size.
-    """
+    """Refuse a pixel outside of its photograph."""
     if not (0 <= pointer.x <= width and 0 <= pointer.y <= height):
         raise InputError(
             f"{pointer}: lies outside of the photograph, which has {width} x {height} pixels; "

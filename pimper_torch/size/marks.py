@@ -9,12 +9,7 @@ from torch import Tensor
 from pimper_torch.errors import InputError, caution
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid
-from pimper_torch.geometry.supporting_plane import (
-    Plane,
-    fixation,
-    supporting_plane,
-    well_tracked,
-)
+from pimper_torch.geometry.supporting_plane import Plane, fixation, supporting_plane, well_tracked
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.sfm.colmap import undistort_pixels
@@ -30,11 +25,7 @@ _MIN_ANGLE_DEG = 1.0
 
 
 def view_of(name: str, scene: SparseScene) -> int:
-    """Find a photograph among those that have a camera.
-
-    Raises:
-        InputError: It has no camera, or there is none of that name, or several.
-    """
+    """Find a photograph among those that have a camera."""
     names = scene.views.names
     if number_of(name, (*names, *scene.unregistered)) >= len(names):
         raise InputError(
@@ -53,9 +44,6 @@ def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
 
     Args:
         mark: Pixels of the photographs as they were loaded: the right way up, before undistortion.
-
-    Raises:
-        InputError: Names the pixel, what is wrong with it and what to do.
     """
     views = [view_of(pointer.name, result.scene) for pointer in mark.pointers]
     rays = torch.stack(

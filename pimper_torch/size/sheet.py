@@ -43,11 +43,7 @@ def side_of(code: int) -> int | None:
 
 
 def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
-    """Put markers along the border of a sheet; the object stands in the middle.
-
-    Raises:
-        ConfigError: A side of which there are no markers.
-    """
+    """Put markers along the border of a sheet; the object stands in the middle."""
     sound = MIN_SIDE_MM <= side_mm <= MAX_SIDE_MM
     needed = f"{MIN_SIDE_MM} to {MAX_SIDE_MM} whole millimetres"
     require(sound, "side_mm", side_mm, needed)

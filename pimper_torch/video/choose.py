@@ -4,7 +4,7 @@ A jump of the pictures, in which there is no frame, counts as one distance only.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -13,13 +13,34 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, cat
 
 from pimper_torch.errors import InputError
-from pimper_torch.records import Record
 
 # Width of the pictures in which motion is measured. A choice: a hundredth of it is 3 pixels.
 _WIDTH_PX = 320
+# A frame is compared with one before until it has moved so far, fractions of the width: what noise
+# adds then counts once. A choice, 6 pixels of 320: flow is still sure.
+_STEP = 0.02
 
-# Lags in pixels: blur takes differences over the short one, and hardly those over the long one.
-_SHORT, _LONG = 1, 4
+
+class Scan(NamedTuple):
+    """Sharpness of every frame of a video, and how far pictures have moved since the first."""
+
+    sharpness: Float[Tensor, " frame"]
+    way: Float[Tensor, " frame"]
+
+
+def scanned(frames: Iterable[UInt8[Tensor, "height width"]]) -> Scan:
+    """Look at every frame of a video once, in their order; the way is in widths of the frame."""
+    sharp: list[float] = []
+    way: list[float] = []
+    anchor, walked = None, 0.0
+    for luma in frames:
+        small = thumbnail(luma)
+        moved = 0.0 if anchor is None else motion(anchor, small)
+        sharp.append(sharpness(luma))
+        way.append(walked + moved)
+        if anchor is None or moved > _STEP:
+            anchor, walked = small, walked + moved
+    return Scan(torch.tensor(sharp), torch.tensor(way).cummax(dim=0).values)
 
 
 def sharpness(luma: UInt8[Tensor, "height width"]) -> float:
@@ -28,15 +49,11 @@ def sharpness(luma: UInt8[Tensor, "height width"]) -> float:
     It is that of rows or of columns, whichever is less: motion blurs along one of them. Brightness
     and contrast cancel. It compares frames of one video; 0 where nothing differs.
     """
-    values = luma.to(torch.float32)
-    return min(_finest(values), _finest(values.mT))
-
-
-def _finest(values: Float[Tensor, "row column"]) -> float:
-    short, long = (
-        float((values[:, lag:] - values[:, :-lag]).square().mean()) for lag in (_SHORT, _LONG)
-    )
-    return short / long if long > 0 else 0.0
+    finest = []
+    for values in (luma.float(), luma.float().mT):
+        near, far = (float((values[:, lag:] - values[:, :-lag]).square().mean()) for lag in (1, 4))
+        finest.append(near / far if far > 0 else 0.0)
+    return min(finest)
 
 
 def thumbnail(luma: UInt8[Tensor, "height width"]) -> UInt8[np.ndarray, "height width"]:
@@ -60,39 +77,6 @@ def motion(
     return float(np.quantile(np.linalg.norm(flow, axis=2), 0.8)) / before.shape[1]
 
 
-# A frame is compared with one before until it has moved so far, fractions of the width: what noise
-# adds then counts once. A choice, 6 pixels of 320: flow is still sure.
-_STEP = 0.02
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Scan(Record):
-    """Quality of every frame of a video.
-
-    Attributes:
-        sharpness: See :func:`sharpness`.
-        way: How far the pictures have moved since the first frame, in widths.
-    """
-
-    sharpness: Float[Tensor, " frame"]
-    way: Float[Tensor, " frame"]
-
-
-def scanned(frames: Iterable[UInt8[Tensor, "height width"]]) -> Scan:
-    """Look at every frame of a video once, in their order."""
-    sharp: list[float] = []
-    way: list[float] = []
-    anchor, walked = None, 0.0
-    for luma in frames:
-        small = thumbnail(luma)
-        moved = 0.0 if anchor is None else motion(anchor, small)
-        sharp.append(sharpness(luma))
-        way.append(walked + moved)
-        if anchor is None or moved > _STEP:
-            anchor, walked = small, walked + moved
-    return Scan(sharpness=torch.tensor(sharp), way=torch.tensor(way).cummax(dim=0).values)
-
-
 def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
     """Choose the sharpest frame of each of equal stretches of the way.
 
@@ -113,8 +97,12 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
             "all); needed: a camera that goes round the object, or an object that turns."
         )
     steps = scan.way.double().diff()
-    # Frames that have moved by less than a pixel of those that flow is measured in show the same.
-    length = max(_stretch(steps, count), 1 / 320)
+    # A stretch is the largest s with sum(min(step, s)) >= count s, each jump being one: what the
+    # smaller steps leave for each stretch without the j largest, at least. Frames that have moved
+    # by less than a pixel of those that flow is measured in show the same.
+    jumps = cat([steps.new_zeros(1), steps.sort(descending=True).values[: count - 1].cumsum(dim=0)])
+    left = (steps.sum() - jumps).clamp(min=0) / (count - torch.arange(len(jumps)))
+    length = max(float(left.min()), 1 / _WIDTH_PX)
     place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
     # Sums of the length may round down.
     stretch = (place + 1e-6).floor().clamp(max=count - 1)
@@ -126,21 +114,3 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
         inner = here[middle[here] <= max(0.3, float(middle[here].min()))]
         numbers.append(inner[scan.sharpness[inner].argmax()])
     return torch.stack(numbers)
-
-
-def _stretch(steps: Float[Tensor, " step"], count: int) -> float:
-    """Compute the length of a stretch of which the way has ``count``, each jump being one.
-
-    The largest ``s`` with ``sum(min(step, s)) >= count s``: that holds for every ``s`` up to the
-    least of what the smaller steps leave for each stretch without the ``j`` largest.
-    """
-    largest = steps.sort(descending=True).values[: count - 1]
-    taken = cat([steps.new_zeros(1), largest.cumsum(dim=0)])
-    rest = (steps.sum() - taken).clamp(min=0)
-    return float((rest / (count - torch.arange(len(rest)))).min())
-
-
-def blurred(scan: Scan, frames: Int[Tensor, " chosen"]) -> Int[Tensor, " blurred"]:
-    """List chosen frames that are less than half as sharp as the median of the others."""
-    sharp = scan.sharpness[frames]
-    return frames[sharp < 0.5 * sharp.median()]

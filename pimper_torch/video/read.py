@@ -1,7 +1,7 @@
 """Frames of a video as they are shown. The only importer of PyAV, an extra."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from pimper_torch.errors import InputError, caution
 
 # No list of other files leads out of this one.
 _LOCAL = {"protocol_whitelist": "file"}
-
 # Transfer characteristics of ITU-T H.273 whose light is not that of a display of standard range.
 _HIGH_RANGE = {16: "PQ (HDR10, Dolby Vision)", 18: "HLG"}
 
@@ -25,10 +24,14 @@ def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
     Raises:
         InputError: No video, one that cannot be decoded, or PyAV is not installed.
     """
-    with _opened(path) as (container, stream):
-        _warn_of_range(path, stream)
-        for frame in _whole_frames(path, container, stream):
-            yield torch.from_numpy(frame.to_ndarray(format="gray"))
+    for number, frame in enumerate(_frames(path)):
+        if number == 0 and int(frame.color_trc) in _HIGH_RANGE:
+            caution(
+                f"{path}: is of high dynamic range, {_HIGH_RANGE[int(frame.color_trc)]}, whose "
+                "curve is not sRGB's: radiance would be wrong. Record in standard range, or "
+                "convert it before."
+            )
+        yield torch.from_numpy(frame.to_ndarray(format="gray"))
 
 
 def frame_pictures(
@@ -39,39 +42,57 @@ def frame_pictures(
     Args:
         numbers: Of frames, from 0, ascending.
     """
-    wanted = set(numbers)
-    with _opened(path) as (container, stream):
-        for number, frame in enumerate(_whole_frames(path, container, stream)):
-            if number in wanted:
-                yield number, _upright(frame)
-            if number >= max(wanted):
-                break
+    for number, frame in zip(range(max(numbers) + 1), _frames(path), strict=False):
+        if number in numbers:
+            yield number, _upright(frame)
 
 
-def _whole_frames(path: Path, container: Any, stream: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
-    """Decode frames to whole pictures of square pixels.
+def _frames(path: Path) -> Iterator[Any]:
+    """Decode frames to whole pictures of square pixels; no side shrinks.
 
     The other field is interpolated (Weston 3-field deinterlacing) where a frame is marked as
-    interlaced; pixels that are not square are stretched along one side.
+    interlaced.
     """
+    try:
+        import av
+    except ImportError as error:
+        raise InputError(
+            f'{path}: videos are read by PyAV, which is not installed: pip install "pimper_torch'
+            '[video]".'
+        ) from error
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: found {found}; needed: a video, such as .mp4 or .mov.")
+    try:
+        with av.open(str(path), metadata_errors="replace", options=_LOCAL) as container:
+            streams = container.streams.video
+            if container.format.name in ("hls", "dash", "concat") or not streams:
+                raise InputError(f"{path}: holds no pictures that move; needed: a video.")
+            yield from _shown(path, container, streams[0])
+    except av.error.FFmpegError as error:
+        raise InputError(
+            f"{path}: cannot be decoded as a video ({error.strerror}). Copy it again, or convert "
+            "it to MP4 (H.264)."
+        ) from error
+
+
+def _shown(path: Path, container: Any, stream: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
     from av.filter import Graph
 
+    if stream.codec_context is None:
+        raise InputError(f"{path}: FFmpeg knows no decoder for it. Convert it to MP4 (H.264).")
+    shape = float(stream.sample_aspect_ratio or 1)
+    width, height = round(stream.width * max(shape, 1)), round(stream.height / min(shape, 1))
+    if max(width, height) > 16_384:
+        raise InputError(f"{path}: is {width} x {height}; needed: 16384 pixels a side at most.")
+    stream.thread_type = "AUTO"
     graph = Graph()
     for frame in container.decode(stream):
         if (frame.width, frame.height) != (stream.width, stream.height):
-            raise InputError(
-                f"{path}: changes its size from {stream.width} x {stream.height} to "
-                f"{frame.width} x {frame.height}; needed: frames of one size."
-            )
+            raise InputError(f"{path}: its frames change their size; needed: one size.")
         if not graph.configured:
-            width, height = _shown_size(stream)
             graph.link_nodes(
-                graph.add_buffer(
-                    width=frame.width,
-                    height=frame.height,
-                    format=frame.format,
-                    time_base=stream.time_base,
-                ),
+                graph.add_buffer(template=frame, time_base=stream.time_base),
                 graph.add("bwdif", "mode=send_frame:deint=interlaced"),
                 graph.add("scale", f"{width}:{height}:flags=lanczos"),
                 graph.add("buffersink"),
@@ -89,12 +110,6 @@ def _pulled(graph: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
             yield graph.vpull()
 
 
-def _shown_size(stream: Any) -> tuple[int, int]:  # noqa: ANN401 - untyped
-    """Return the size at which pixels are square; no side shrinks."""
-    shape = float(stream.sample_aspect_ratio or 1)
-    return round(stream.width * max(shape, 1)), round(stream.height / min(shape, 1))
-
-
 def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401 - untyped
     """Convert a frame to colours, its rows and columns as its display matrix places them."""
     picture: np.ndarray = frame.to_ndarray(format="rgb24")
@@ -106,51 +121,3 @@ def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401
     if abs(b) > abs(a):
         picture, a, d = picture.swapaxes(0, 1), c, b
     return picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(
-            f'{path}: videos are read by PyAV, which is not installed: pip install "pimper_torch'
-            '[video]".'
-        ) from error
-
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path}: found {found}; needed: a video, such as .mp4 or .mov.")
-    try:
-        with av.open(str(path), metadata_errors="replace", options=_LOCAL) as container:
-            if container.format.name in ("hls", "dash", "concat"):
-                raise InputError(f"{path}: is a list of other files; needed: a video.")
-            if not container.streams.video:
-                raise InputError(f"{path}: holds no pictures that move; needed: a video.")
-            stream = container.streams.video[0]
-            if stream.codec_context is None:
-                raise InputError(
-                    f"{path}: FFmpeg knows no decoder for its pictures. Convert it to MP4 (H.264)."
-                )
-            width, height = _shown_size(stream)
-            if max(width, height) > 16_384:
-                raise InputError(
-                    f"{path}: is {width} x {height}; needed: 16384 pixels a side at most."
-                )
-            stream.thread_type = "AUTO"
-            yield container, stream
-    except av.error.FFmpegError as error:
-        raise InputError(
-            f"{path}: cannot be decoded as a video ({error.strerror}). Copy it again, or convert "
-            "it to MP4 (H.264)."
-        ) from error
-
-
-def _warn_of_range(path: Path, stream: Any) -> None:  # noqa: ANN401 - untyped
-    curve = _HIGH_RANGE.get(int(stream.codec_context.color_trc))
-    if curve:
-        caution(
-            f"{path}: is of high dynamic range, {curve}, whose curve is not sRGB's: radiance would "
-            "be wrong. Record in standard range, or convert it before.",
-            stacklevel=3,
-        )

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.geometry.supporting_plane import fixation
 from pimper_torch.records import Cameras, Mesh, Record
 
 
@@ -87,13 +88,9 @@ def frame_of_cameras(
     if len(points_world):
         middle = points_world.detach().cpu().double().median(dim=0).values
     else:
-        forward = poses[:, 2, :3]
-        across = torch.eye(3).double() - forward[:, :, None] * forward[:, None]
-        wanted = (across @ centers[..., None]).reshape(-1, 1)
-        middle = torch.linalg.lstsq(across.reshape(-1, 3), wanted, driver="gelsd").solution[:, 0]
+        middle = fixation(poses).fixation_world
     away = centers - middle
-    x = away[reference] - (away[reference] @ up) * up
-    x = normalize(x, dim=0)
+    x = normalize(away[reference] - (away[reference] @ up) * up, dim=0)
     return Frame(
         rotation=torch.stack([x, torch.linalg.cross(up, x), up]),
         center_world=middle,

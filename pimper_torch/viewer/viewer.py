@@ -17,16 +17,16 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.report.predictions import shrunk
 from pimper_torch.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
-from pimper_torch.viewer.layers import LAYERS, layers_of, painted
+from pimper_torch.viewer.layers import LAYERS, painted
 from pimper_torch.viewer.server import HOST, PORT, address, close_server, open_server
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
 
 NO_PHOTOGRAPH = "none"
-# Longer side of photographs in place, units of the viewer: cameras are three away, and two dozen of
-# them on a ring stand 0.8 apart. None is put farther into the scene than half that way.
-_SIDE, _DEEPEST = 0.35, 1.5
+# Of frusta: photographs are a third of a unit wide where cameras are three away, and two dozen of
+# them on a ring stand 0.8 apart.
+_SCALE = 0.15
 _POINT_COLOR = (110, 140, 190)
 # Raking light from up on the left, and how much of it is round about; degrees.
 _AZIMUTH, _ELEVATION, _AMBIENT = -45.0, 40.0, 0.15
@@ -39,16 +39,14 @@ class Viewer:
 
     Attributes:
         server: viser's own, for whatever else is to be shown.
-        unit: Of lengths, as the legend tells it.
     """
 
-    def __init__(self, server: "ViserServer", unit: str = "scene units") -> None:
-        self.server, self.unit = server, unit
+    def __init__(self, server: "ViserServer") -> None:
+        self.server = server
         self._lock = threading.RLock()
         self._frame: Frame | None = None
         self._passes: list[tuple[str, Mesh]] = []
         self._stands: dict[str, Stand] = {}
-        self._lights: dict[str, tuple[Float[Tensor, " 3"], float]] = {}
         scene = server.scene
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
@@ -84,7 +82,7 @@ class Viewer:
         reference: int = 0,
         views: Views | None = None,
     ) -> None:
-        """Show cameras and the sparse cloud, and photographs in place where they are at hand.
+        """Show cameras and the sparse cloud, and photographs in frusta where they are at hand.
 
         Args:
             names: Of the photographs, in the order of the cameras.
@@ -95,9 +93,7 @@ class Viewer:
         scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
         self._points.disabled = False
         scene.add_frame("/cameras", show_axes=False)
-        scene.add_frame("/photographs", show_axes=False)
         pictures = None if views is None else small_pictures(views)
-        self._photographs.disabled = pictures is None
         for view, name in enumerate(names):
             self._add_camera(view, name, cameras, None if pictures is None else pictures[view])
         self._chosen.options = (NO_PHOTOGRAPH, *names)
@@ -111,36 +107,19 @@ class Viewer:
 
         assert self._frame is not None
         stand = self._stands[name] = stand_of(cameras, view, self._frame)
-        wxyz, position = SO3.from_matrix(stand.rotation.numpy()).wxyz, stand.position.numpy()
-        (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[view].tolist()
         width, height = cameras.sizes_px[view].tolist()
-        depth = min(_DEEPEST, _SIDE / max(width / fx, height / fy))
-        # viser makes frusta of the same volume; this one is as deep.
-        scale = depth * math.cbrt(width / height * math.tan(stand.fov / 2) ** 2 / 3)
-        scene, node = self.server.scene, f"{view:05d}"
-        handles: list[Any] = [
-            scene.add_camera_frustum(
-                f"/cameras/{node}",
-                stand.fov,
-                width / height,
-                scale=scale,
-                wxyz=wxyz,
-                position=position,
-                thickness=1.5,
-                thickness_units="screen",
-            )
-        ]
-        if picture is not None:
-            size = (depth * width / fx, depth * height / fy)
-            middle = [size[0] / 2 - depth * cx / fx, size[1] / 2 - depth * cy / fy, depth]
-            at = stand.position + stand.rotation @ stand.position.new_tensor(middle)
-            handles.append(
-                scene.add_image(
-                    f"/photographs/{node}", picture, *size, wxyz=wxyz, position=at.numpy()
-                )
-            )
-        for handle in handles:
-            handle.on_click(lambda event, name=name: self.choose(name, event.client))
+        frustum = self.server.scene.add_camera_frustum(
+            f"/cameras/{view:05d}",
+            stand.fov,
+            width / height,
+            scale=_SCALE,
+            thickness=1.5,
+            thickness_units="screen",
+            image=picture,
+            wxyz=SO3.from_matrix(stand.rotation.numpy()).wxyz,
+            position=stand.position.numpy(),
+        )
+        frustum.on_click(lambda event: self.choose(name, event.client))
 
     def add_pass(self, name: str, mesh: Mesh) -> None:
         """Show a surface; the slider goes back to those before.
@@ -166,24 +145,8 @@ class Viewer:
             else:
                 self._pass.value = last  # paints
 
-    def set_lights(
-        self,
-        names: Sequence[str],
-        directions_world: Float[Tensor, "view 3"],
-        ambient: Float[Tensor, " view"],
-    ) -> None:
-        """Know the light of photographs, which choosing one of them sets.
-
-        Args:
-            directions_world: Towards it; a photograph of which it is NaN or zero has none.
-            ambient: Share of light that comes from everywhere.
-        """
-        for name, towards, share in zip(names, directions_world, ambient.tolist(), strict=True):
-            if float(towards.norm()) > 0:
-                self._lights[name] = (towards, share)
-
     def choose(self, name: str, client: "ClientHandle | None" = None) -> None:
-        """Set the light of a photograph, and stand where it was taken.
+        """Stand where a photograph was taken.
 
         Its own frustum is hidden meanwhile, as it is before the object.
 
@@ -193,24 +156,16 @@ class Viewer:
         """
         self._chosen.value = name
         for view, other in enumerate(self._stands):
-            for group in ("cameras", "photographs"):
-                node = self.server.scene.get_handle_by_name(f"/{group}/{view:05d}")
-                if node is not None:
-                    node.visible = other != name
+            self.server.scene.get_handle_by_name(f"/cameras/{view:05d}").visible = other != name
         if name not in self._stands:
             return
         for one in self.server.get_clients().values() if client is None else (client,):
             with one.atomic():
                 _stand_at(one.camera, self._stands[name])
-        if name in self._lights and self._frame is not None:
-            towards, self._ambient.value = self._lights[name]
-            x, y, z = self._frame.directions(towards[None])[0].tolist()
-            self._azimuth.value = math.degrees(math.atan2(y, x))
-            self._elevation.value = math.degrees(math.atan2(z, math.hypot(x, y)))
 
     def _add_controls(self) -> None:
         gui, scene = self.server.gui, self.server.scene
-        self._layer = gui.add_dropdown("layer", LAYERS)
+        self._layer = gui.add_dropdown("layer", tuple(LAYERS))
         self._pass = gui.add_slider("pass", 0, 1, 1, 0, visible=False)
         self._about = gui.add_markdown("No surface yet.")
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
@@ -221,7 +176,6 @@ class Viewer:
         with gui.add_folder("show"):
             self._surface = gui.add_checkbox("surface", True)
             self._cameras = gui.add_checkbox("cameras", True)
-            self._photographs = gui.add_checkbox("photographs", True, disabled=True)
             self._points = gui.add_checkbox("points", True, disabled=True)
         for control in (self._layer, self._pass):
             control.on_update(lambda _: self._paint())
@@ -231,7 +185,7 @@ class Viewer:
         self._chosen.on_update(
             lambda event: self.choose(self._chosen.value, event.client) if event.client else None
         )
-        for name in ("surface", "cameras", "photographs", "points"):
+        for name in ("surface", "cameras", "points"):
             box = getattr(self, f"_{name}")
 
             def show(_: object, name: str = name, box: Any = box) -> None:  # noqa: ANN401 - viser's
@@ -248,8 +202,8 @@ class Viewer:
                 return
             name, mesh = self._passes[round(self._pass.value)]
             wanted = self._layer.value
-            there = wanted in layers_of(mesh)
-            layer = painted(mesh, wanted if there else "shape", self._frame, self.unit)
+            bare = mesh.albedo is None and wanted in ("lit", "albedo")
+            layer = painted(mesh, "shape" if bare else wanted, self._frame)
             attributes = {
                 "POSITION": self._frame.points(mesh.vertices_world),
                 "NORMAL": self._frame.directions(layer.normals_world),
@@ -261,7 +215,7 @@ class Viewer:
                 MATTE if layer.lit else MATTE | {"extensions": {"KHR_materials_unlit": {}}},
             )
             self.server.scene.add_glb("/surface", data, visible=self._surface.value)
-            legend = layer.legend if there else f'It has no layer "{wanted}": grey clay.'
+            legend = "It has no albedo: grey clay." if bare else LAYERS[wanted]
             self._about.content = f"**{name}**, {len(mesh.faces):,} faces. {legend}"
 
     def _light(self) -> None:

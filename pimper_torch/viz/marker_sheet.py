@@ -29,9 +29,6 @@ def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -
 
     Args:
         side_mm: Of the black squares, 10 to 36; their numbers tell it.
-
-    Raises:
-        ConfigError: A side of which there are no markers.
     """
     figure = draw_sheet(side_mm, paper)
     figure.savefig(path, format="pdf", metadata={"CreationDate": None, "Title": TITLE})

@@ -75,11 +75,7 @@ def draw_turn(
 
 
 def circling(
-    mesh: Mesh,
-    up: Float[Tensor, " 3"],
-    start: Float[Tensor, " 3"],
-    number: int,
-    side_px: int,
+    mesh: Mesh, up: Float[Tensor, " 3"], start: Float[Tensor, " 3"], number: int, side_px: int
 ) -> Cameras:
     """Return square pinholes that look at a mesh from a circle round it.
 

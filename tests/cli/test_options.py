@@ -73,7 +73,6 @@ RUNS = {
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
         "--trimmed-fraction 0.1",
         "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
-        "{told} {true_mesh} --samples 500 --calibration {out}.png --overwrite",
         "{result} {scene} --samples 500 --report {out}.html --overwrite",
     ],
     "bench": [

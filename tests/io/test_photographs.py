@@ -11,11 +11,10 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
-from pimper_torch.doctor.photograph import read_all
 from pimper_torch.errors import InputError, PimperWarning
 from pimper_torch.io.photographs import list_images, load_views, read_mask
 from pimper_torch.progress import listening
-from pimper_torch.radiometry import FROM_FILES, LINEAR, linear_from_srgb
+from pimper_torch.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.sfm.lenses import choose_lenses
 
 
@@ -85,8 +84,7 @@ def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
     views = load_views(tmp_path)
     assert views.focals_px.tolist() == pytest.approx([wide, wide, 2 * wide, 2 * wide])
     assert choose_lenses(views) == [0, 0, 1, 1]
-    photographs = read_all(list_images(tmp_path), FROM_FILES, max_size_px=6)
-    assert [one.focal_px for one in photographs] == pytest.approx((views.focals_px / 2).tolist())
+    assert load_views(tmp_path, max_size_px=6).focals_px.tolist() == (views.focals_px / 2).tolist()
 
 
 def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path):

@@ -377,26 +377,6 @@ def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):
 
 
 def test_a_file_that_comes_during_the_run_does_not_cost_the_result(out):
-    (out.parent / "out-2").touch()
-    with (
-        pytest.raises(OutputError, match=r"letter\.txt.* The new result is in .*out-3\."),
-        written_whole(out, "result", overwrite=True) as filled,
-    ):
-        fill(filled, result("second") | {"../../letter.txt": "dear"})
-    assert contents(out) == result("first", "masks/a.png") | {"letter.txt": "dear"}
-    assert contents(out.parent / "out-3") == result("second")
-    write(out.parent / "out-3", result("third"), overwrite=True)  # it has its list
-
-
-def test_a_result_that_cannot_be_put_aside_waits_until_its_folder_is_free(out, monkeypatch):
-    rename = Path.rename
-
-    def refuse(path, target):
-        if target == out.parent / "out-2":
-            raise OSError(errno.EXDEV, "Invalid cross-device link")
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, "rename", refuse)
     with (
         pytest.raises(OutputError, match=rf"letter\.txt.* The new result is in .*{STAGES}/new\."),
         written_whole(out, "result", overwrite=True) as filled,

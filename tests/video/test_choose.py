@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import InputError
-from pimper_torch.video.choose import Scan, blurred, chosen
+from pimper_torch.video.choose import Scan, chosen
 
 
 def scan(way, sharpness=None):
@@ -71,11 +71,3 @@ def test_what_cannot_be_chosen_from_is_refused():
         chosen(scan(torch.arange(5)), 10)
     with pytest.raises(InputError, match="nothing moves in the 50 frames"):
         chosen(scan(torch.linspace(0, 0.05, 50)), 10)
-
-
-def test_frames_that_are_blurred_beside_the_others_are_named():
-    sharpness = torch.full((10,), 0.3)
-    sharpness[4] = 0.1
-    found = scan(torch.arange(10), sharpness)
-    assert blurred(found, torch.arange(10)).tolist() == [4]
-    assert blurred(found, torch.tensor([0, 1, 2])).tolist() == []

@@ -10,10 +10,9 @@ from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.exchange.result import Result
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Mesh
-from pimper_torch.relighting.fit_lights import fit_lights
 from pimper_torch.viewer import server as server_module
 from pimper_torch.viewer.server import open_server, require_viser
-from pimper_torch.viewer.show import add_found, add_outcome, show
+from pimper_torch.viewer.show import add_found, show
 from pimper_torch.viewer.viewer import NO_PHOTOGRAPH, opened
 
 pytest.importorskip("viser")
@@ -26,12 +25,9 @@ def node(viewer, name):
 @pytest.fixture
 def page(viewer, reconstruction):
     """The page of a whole result."""
-    mesh = reconstruction.mesh
-    mesh = mesh.replace(expected_error=0.01 * mesh.vertices_world.square().sum(dim=1))
-    reconstruction = reconstruction.replace(mesh=mesh)
     add_found(viewer, reconstruction.scene)
     viewer.add_pass("coarse surface", reconstruction.coarse.mesh)
-    add_outcome(viewer, reconstruction)
+    viewer.add_pass("result", reconstruction.mesh)
     return viewer
 
 
@@ -49,7 +45,7 @@ def test_scene_holds_cameras_photographs_points_and_surface(page, reconstruction
     assert node(page, "/surface").glb_data[:4] == b"glTF"
     for view in range(3):
         assert node(page, f"/cameras/{view:05d}") is not None
-        assert node(page, f"/photographs/{view:05d}") is not None
+        assert node(page, f"/cameras/{view:05d}").image is not None
     frustum = node(page, "/cameras/00001")
     assert frustum.aspect == pytest.approx(60 / 40)
     assert frustum.fov == pytest.approx(2 * math.atan(20 / 90))
@@ -66,9 +62,6 @@ def test_a_frustum_stands_where_the_camera_does(page, reconstruction):
         # Float64 at three units from the middle; coordinates may be zero.
         np.testing.assert_allclose(frustum.position, placed[view], atol=1e-12)
         np.testing.assert_allclose(SO3(frustum.wxyz).as_matrix()[:, 2], forward[view], atol=1e-6)
-        way = node(page, f"/photographs/{view:05d}").position - placed[view]
-        way /= np.linalg.norm(way)
-        assert way @ forward[view] > 0.99
 
 
 def test_layers_change_the_colours_and_the_legend(page):
@@ -77,7 +70,7 @@ def test_layers_change_the_colours_and_the_legend(page):
         page._layer.value = name
         seen.add(node(page, "/surface").glb_data)
         said.add(page._about.content)
-    assert len(seen) == len(said) == 6
+    assert len(seen) == len(said) == 4
 
 
 def test_the_slider_goes_back_to_earlier_surfaces(page, reconstruction):
@@ -98,25 +91,15 @@ def test_the_light_is_where_the_sliders_are(page):
     np.testing.assert_allclose(np.array(page._sun.position)[:2], 0, atol=1e-9)
 
 
-def test_choosing_a_photograph_sets_its_light_and_hides_its_frustum(page, reconstruction):
-    towards = torch.tensor([[0.0, 0.0, 0.6], [torch.nan] * 3, [0.3, 0.0, 0.3]])
+def test_choosing_a_photograph_hides_its_frustum(page, reconstruction):
     names = reconstruction.scene.views.names
-    page._lights.clear()
-    page.set_lights(names, towards, torch.tensor([0.25, 0.0, 0.5]))
     page.choose(names[0])
-    assert page._ambient.value == pytest.approx(0.25)
-    wanted = page._frame.directions(torch.tensor([[0.0, 0.0, 1.0]]))[0].numpy()
-    found = np.array(page._sun.position)
-    np.testing.assert_allclose(found / np.linalg.norm(found), wanted, atol=1e-6)
     assert [node(page, f"/cameras/{view:05d}").visible for view in range(3)] == [0, 1, 1]
-    before = page._azimuth.value
-    page.choose(names[1])  # whose light is not known
-    assert page._azimuth.value == before
     page.choose(NO_PHOTOGRAPH)
-    assert all(node(page, f"/photographs/{view:05d}").visible for view in range(3))
+    assert all(node(page, f"/cameras/{view:05d}").visible for view in range(3))
 
 
-@pytest.mark.parametrize("name", ["surface", "cameras", "photographs", "points"])
+@pytest.mark.parametrize("name", ["surface", "cameras", "points"])
 def test_a_check_box_shows_and_hides(page, name):
     box = getattr(page, f"_{name}")
     for shown in (False, True, False):
@@ -150,26 +133,20 @@ def test_show_takes_what_chains_return(reconstruction):
             viewer.stop()
 
 
-def test_a_result_that_was_read_begins_in_its_reference_with_its_light_and_unit(reconstruction):
-    scene, mesh = reconstruction.scene, reconstruction.mesh
+def test_a_result_that_was_read_begins_in_its_reference(reconstruction):
+    scene = reconstruction.scene
     result = Result(
-        mesh=mesh.replace(expected_error=torch.full_like(mesh.confidence, 0.5)),
+        mesh=reconstruction.mesh,
         scene=scene,
         cameras=scene.cameras,
         silhouettes=reconstruction.silhouettes,
         lights_world=None,
         reference=scene.views.names[1],
-        summary={"scale": {"unit": "mm", "factor": 2.0}},
+        summary={},
     )
     viewer = show(result, port=0)
     try:
         assert viewer._chosen.value == scene.views.names[1]
-        lights = fit_lights(mesh, scene, reconstruction.silhouettes)
-        wanted = viewer._frame.directions(lights.direction_world[1:2])[0].numpy()
-        found = np.array(viewer._sun.position)
-        np.testing.assert_allclose(found / np.linalg.norm(found), wanted, atol=1e-4)
-        viewer._layer.value = "expected error"
-        assert "0.5 mm" in viewer._about.content
     finally:
         viewer.stop()
 

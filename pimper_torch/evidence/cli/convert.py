@@ -15,21 +15,7 @@ from torch import Tensor
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets import (
-    read_colmap,
-    read_diligent_mv,
-    read_dtu_mvs,
-    read_dtu_points,
-    read_idr,
-    read_llff,
-    read_meshroom,
-    read_metashape,
-    read_rendered,
-    read_transforms,
-    write_colmap,
-    write_idr,
-    write_transforms,
-)
+from pimper_torch.evidence import datasets
 from pimper_torch.evidence.datasets.posed import assemble
 from pimper_torch.evidence.datasets.sampling import LightOptions, read_shots
 from pimper_torch.exchange.nerfstudio import thinned
@@ -152,17 +138,17 @@ def parse(arguments: Sequence[str]) -> ConvertJob:
 def readers() -> Mapping[Source, Callable[..., Capture]]:
     """List the reader of each layout."""
     return {
-        "colmap": read_colmap,
-        "llff": read_llff,
-        "idr": read_idr,
-        "transforms": read_transforms,
-        "meshroom": read_meshroom,
-        "metashape": read_metashape,
-        "dtu-points": read_dtu_points,
-        "dtu-mvs": read_dtu_mvs,
-        "diligent-mv": read_diligent_mv,
+        "colmap": datasets.read_colmap,
+        "llff": datasets.read_llff,
+        "idr": datasets.read_idr,
+        "transforms": datasets.read_transforms,
+        "meshroom": datasets.read_meshroom,
+        "metashape": datasets.read_metashape,
+        "dtu-points": datasets.read_dtu_points,
+        "dtu-mvs": datasets.read_dtu_mvs,
+        "diligent-mv": datasets.read_diligent_mv,
         # Without its maps, which no layout has a place for.
-        "rendered": lambda folder: read_rendered(folder, maps=False),
+        "rendered": lambda folder: datasets.read_rendered(folder, maps=False),
     }
 
 
@@ -207,7 +193,11 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
             "this data set says nothing about its cameras; needed: cameras to export. Use its "
             "photographs as they are."
         )
-    writers = {"colmap": write_colmap, "idr": write_idr, "transforms": write_transforms}
+    writers = {
+        "colmap": datasets.write_colmap,
+        "idr": datasets.write_idr,
+        "transforms": datasets.write_transforms,
+    }
     folder.mkdir(parents=True, exist_ok=True)
     points = cloud(capture.truth)
     writers[target](capture.views, capture.cameras, folder, points_world=points)

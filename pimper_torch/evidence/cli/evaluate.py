@@ -34,7 +34,6 @@ from pimper_torch.io.version import installed_version
 from pimper_torch.outputs.files import file_written_whole, prepare_file
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Truth, Views
 from pimper_torch.report.page import HEAD
-from pimper_torch.viz.calibration import TITLE, draw_calibration
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
@@ -52,8 +51,6 @@ class EvaluateJob:
         result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
         truth: Folder of a rendered scene or of a data set, or a mesh.
         out: JSON file for all figures.
-        calibration: PNG file for the calibration curve of a result that tells its expected
-            error.
         report: HTML file that shows the result in a browser with its errors; the photographs that
             it was made from must be where they were.
         overwrite: Replace files that a former evaluation wrote, and no others.
@@ -68,7 +65,6 @@ class EvaluateJob:
     result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")]
     truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     report: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     overwrite: Flag = False
     truth_layout: Layout = "auto"
@@ -81,12 +77,6 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     job = checked(command, arguments)
     config = job.config
     estimate = read_estimate(job.result)
-    if job.calibration is not None and estimate.mesh.expected_error is None:
-        raise InputError(
-            f"{job.result}: tells no expected error, so there is nothing to calibrate; needed: a "
-            "result with `expected_error` at its vertices, as `pimper reconstruct` writes it "
-            "unless `fuse.error_draws` is 0."
-        )
     capture, maps, protocol = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, capture, config, maps=maps, dtu=protocol)
     relighting = read_relighting(job.result)
@@ -96,13 +86,10 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
     if job.out is not None:
         write_report(evaluation, job, relighting)
         output.remark(f"{job.out} has all figures.")
-    if job.calibration is not None:
-        _draw(evaluation, job.calibration)
-        output.remark(f"{job.calibration} is drawn.")
     if job.report is not None:
         _write_page(evaluation, capture, job.result, job.report)
         output.remark(f"{job.report} shows the errors.")
-    files = {"figures": job.out, "calibration": job.calibration, "report": job.report}
+    files = {"figures": job.out, "report": job.report}
     paths = {name: path for name, path in files.items() if path is not None}
     output.result(paths, figures={**report(evaluation), "relighting": relighting})
 
@@ -241,25 +228,6 @@ def write_report(
         fresh.write_text(text, encoding="utf-8")
 
 
-def _draw(evaluation: Evaluation, path: Path) -> None:
-    """Draw expected against true error in per cent of the diagonal."""
-    surface = evaluation.surface
-    if surface is None or surface.calibration is None:
-        raise InputError(
-            "too little of the result belongs to the object to calibrate its expected error. "
-            "Check the alignment."
-        )
-    bins, percent = surface.calibration.bins, 100 / surface.diagonal
-    with file_written_whole(path) as fresh:
-        draw_calibration(
-            [percent * one.expected for one in bins],
-            [percent * one.root_mean_square for one in bins],
-            [percent * one.robust for one in bins],
-            "% of the diagonal",
-            fresh,
-        )
-
-
 def _write_page(evaluation: Evaluation, capture: Capture, result: Path, path: Path) -> None:
     """Write the page of a result with its errors, whole or not at all."""
     mesh = true_surface(capture)
@@ -269,7 +237,7 @@ def _write_page(evaluation: Evaluation, capture: Capture, result: Path, path: Pa
 
 def _prepare_files(job: EvaluateJob) -> None:
     """Refuse, before the work and before writing, files that are not ours to replace."""
-    marks = {job.out: f'"format": "{FORMAT}"', job.calibration: TITLE, job.report: HEAD}
+    marks = {job.out: f'"format": "{FORMAT}"', job.report: HEAD}
     for path, mark in marks.items():
         if path is not None:
             prepare_file(path, job.overwrite, mark)

@@ -31,9 +31,6 @@ def write_idr(
     Args:
         points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
             them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
-
-    Raises:
-        InputError: There is nothing to guess the sphere from.
     """
     folder = Path(folder)
     digits = max(3, len(str(views.num_views - 1)))

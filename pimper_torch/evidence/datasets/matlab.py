@@ -21,18 +21,8 @@ from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.errors import some
 
 # Numbers by their type in the file, and classes of arrays that hold numbers.
-_KINDS = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
+_KINDS |= {12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _CLASSES |= {14: "i8", 15: "u8"}
 _MATRIX, _COMPRESSED, _COMPLEX = 14, 15, 0x0800

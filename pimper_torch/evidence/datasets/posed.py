@@ -119,11 +119,7 @@ def assemble(
 
 
 def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
-    """Let each lens follow its photograph to the size it was read at.
-
-    Raises:
-        InputError: A photograph of another shape than its lens is for.
-    """
+    """Let each lens follow its photograph to the size it was read at."""
     lenses = []
     for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
         lens = one.lens

@@ -8,13 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.evidence.metrics import similarity
 from pimper_torch.evidence.metrics.in_view import angles_deg
-from pimper_torch.evidence.metrics.similarity import (
-    nearest_rotation,
-    rotation_angles_deg,
-    similarity_between_points,
-    split_similarity,
-)
 from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
 from pimper_torch.geometry.projection import project, triangulate_rays
 from pimper_torch.geometry.rigid import transform
@@ -65,14 +60,14 @@ def compare_lights(
     if not bool(known.any()):
         return None
     ours, truth = normalize(ours[known], dim=1), normalize(truth[known], dim=1)
-    joint = nearest_rotation(truth.mT @ ours)
+    joint = similarity.nearest_rotation(truth.mT @ ours)
     plain, rotated = angles_deg(ours, truth), angles_deg(ours @ joint.mT, truth)
     return LightFigures(
         mean_deg=float(plain.mean()),
         median_deg=float(plain.median()),
         mean_rotated_deg=float(rotated.mean()),
         median_rotated_deg=float(rotated.median()),
-        rotation_deg=float(rotation_angles_deg(joint)),
+        rotation_deg=float(similarity.rotation_angles_deg(joint)),
         lights=int(known.sum()),
     )
 
@@ -123,12 +118,12 @@ def compare_cameras(
         surface: The true one; vertices alone of a cloud.
     """
     truth_from_ours = truth_from_world.double().cpu()
-    _, rotation = split_similarity(truth_from_ours)
+    _, rotation = similarity.split_similarity(truth_from_ours)
     rotated = ours.cam_from_world[:, :3, :3].double().cpu() @ rotation.mT
     centers = transform(truth_from_ours, ours.centers_world.double().cpu())
     centers_true = truth.centers_world.double().cpu()
     between = truth.cam_from_world[:, :3, :3].double().cpu() @ rotated.mT
-    angles = rotation_angles_deg(between)
+    angles = similarity.rotation_angles_deg(between)
     offset = (centers - centers_true).norm(dim=1)
     away, diagonal = torch.full_like(offset, torch.nan), math.nan
     focal = _focal(ours) / _focal(truth) - 1
@@ -139,7 +134,7 @@ def compare_cameras(
         away, diagonal = (centers_true - centre).norm(dim=1), bounding_diagonal(surface)
         found, right = _positions(ours, truth, corners[:: max(1, len(corners) // 2000)])
         if len(found) >= 10:
-            fitted = similarity_between_points(found, right)
+            fitted = similarity.similarity_between_points(found, right)
             position, bend = (
                 float(100 * (transform(transferred, found) - right).norm(dim=1).mean() / diagonal)
                 for transferred in (truth_from_ours, fitted)

@@ -10,24 +10,9 @@ from torch import Tensor
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.metrics.camera_errors import (
-    CameraFigures,
-    LightFigures,
-    compare_cameras,
-    compare_lights,
-)
+from pimper_torch.evidence.metrics import camera_errors, similarity
 from pimper_torch.evidence.metrics.dtu_protocol import DtuFigures, dtu_figures
 from pimper_torch.evidence.metrics.in_view import ViewFigures, compare_along_rays
-from pimper_torch.evidence.metrics.similarity import (
-    Alignment,
-    Method,
-    align_estimate,
-    pair_views,
-    paired_cameras,
-    similarity_between_cameras,
-    split_similarity,
-    transfer,
-)
 from pimper_torch.evidence.metrics.surface_distances import (
     SurfaceComparison,
     TrueSurface,
@@ -55,7 +40,7 @@ class EvaluateConfig:
         trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
     """
 
-    alignment: Method = "auto"
+    alignment: similarity.Method = "auto"
     views: tuple[str, ...] = ()
     thresholds_percent: tuple[float, ...] = (0.25, 0.5, 1.0)
     seen_from: Annotated[int, Range(least=1, most=100_000)] = 3
@@ -76,11 +61,11 @@ class Evaluation(Record):
     Those of the cameras are after the similarity on cameras, all others after ``alignment``.
     """
 
-    alignment: Alignment
+    alignment: similarity.Alignment
     surface: SurfaceComparison | None
     views: tuple[ViewFigures, ...]
-    lights: LightFigures | None
-    cameras: CameraFigures | None
+    lights: camera_errors.LightFigures | None
+    cameras: camera_errors.CameraFigures | None
     dtu: DtuFigures | None
 
 
@@ -109,10 +94,10 @@ def evaluate(
     """
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
-    alignment = align_estimate(
+    alignment = similarity.align_estimate(
         estimate, capture, config.alignment, config.trimmed_fraction, generator=generator
     )
-    moved = transfer(estimate.mesh, alignment.truth_from_world)
+    moved = similarity.transfer(estimate.mesh, alignment.truth_from_world)
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture
     compared = (
@@ -141,16 +126,12 @@ def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | 
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
-    """Return the indices of the views to compare in.
-
-    Raises:
-        InputError: A view that was asked for is not in the truth.
-    """
+    """Return the indices of the views to compare in."""
     names = capture.views.names
     chosen: dict[int, None] = {}
     for asked in config.views:
         try:
-            chosen[int(pair_views([asked], names)[1][0])] = None
+            chosen[int(similarity.pair_views([asked], names)[1][0])] = None
         except InputError as error:
             raise InputError(
                 f"there is no view {asked!r} in the truth; it has {', '.join(names[:5])}"
@@ -158,34 +139,36 @@ def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -
             ) from error
     if not chosen and estimate.reference is not None:
         with suppress(InputError):
-            chosen[int(pair_views([estimate.reference], names)[1][0])] = None
+            chosen[int(similarity.pair_views([estimate.reference], names)[1][0])] = None
     return tuple(chosen) or ((len(names) // 2,) if names else ())
 
 
 def _lights(
     estimate: Estimate, capture: Capture, truth_from_world: Float[Tensor, "4 4"]
-) -> LightFigures | None:
+) -> camera_errors.LightFigures | None:
     lights, truth = estimate.lights_world, capture.truth.lights_world
     if lights is None or truth is None:
         return None
     try:
-        ours, theirs = pair_views(estimate.names, capture.views.names)
+        ours, theirs = similarity.pair_views(estimate.names, capture.views.names)
     except InputError:
         return None
-    return compare_lights(lights[ours], truth[theirs], split_similarity(truth_from_world)[1])
+    return camera_errors.compare_lights(
+        lights[ours], truth[theirs], similarity.split_similarity(truth_from_world)[1]
+    )
 
 
-def camera_figures(estimate: Estimate, capture: Capture) -> CameraFigures | None:
+def camera_figures(estimate: Estimate, capture: Capture) -> camera_errors.CameraFigures | None:
     """Compare the cameras of the views that both have; ``None`` for fewer than two."""
-    pairs = paired_cameras(estimate, capture)
+    pairs = similarity.paired_cameras(estimate, capture)
     if pairs is None or pairs[0].num_views < 2:
         return None
     ours, truth = pairs
     known = capture.truth.mesh is not None or capture.truth.points_world is not None
-    return compare_cameras(
+    return camera_errors.compare_cameras(
         ours,
         truth,
-        similarity_between_cameras(ours, truth),
+        similarity.similarity_between_cameras(ours, truth),
         views=capture.views.num_views,
         surface=true_surface(capture) if known else None,
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.evidence.metrics.camera_errors import CameraFigures, LightFigures
 from pimper_torch.evidence.metrics.dtu_protocol import CAP_MM, THINNING_MM, DtuFigures
 from pimper_torch.evidence.metrics.evaluation import Evaluation
-from pimper_torch.evidence.metrics.in_view import ViewFigures
+from pimper_torch.evidence.metrics.in_view import AngleFigures, ViewFigures
 from pimper_torch.evidence.metrics.surface_distances import (
     Calibration,
     DistanceFigures,
@@ -67,157 +67,111 @@ def rows(
 
 
 def _alignment_rows(evaluation: Evaluation) -> Iterator[FigureRow]:
-    alignment = evaluation.alignment
-    yield FigureRow("method", alignment.method, alignment.description)
+    found = evaluation.alignment
+    yield FigureRow("method", found.method, found.description)
+    value = f"{_number(found.scale)}, {found.rotation_deg:.2f}°"
     yield FigureRow(
-        "scale, rotation",
-        f"{_number(alignment.scale)}, {alignment.rotation_deg:.2f}°",
-        "of the similarity that carries the result to the truth",
+        "scale, rotation", value, "of the similarity that carries the result to the truth"
     )
-    if alignment.residual is not None:
-        state = "came to rest" if alignment.converged else "stopped by the limit of iterations"
-        yield FigureRow(
-            "residual",
-            _number(alignment.residual),
-            f"root mean square of the samples kept, scene units; {state}",
-        )
+    if found.residual is not None:
+        state = "came to rest" if found.converged else "stopped by the limit of iterations"
+        meaning = f"root mean square of the samples kept, scene units; {state}"
+        yield FigureRow("residual", _number(found.residual), meaning)
 
 
 def _surface_rows(surface: SurfaceComparison) -> Iterator[FigureRow]:
-    yield FigureRow(
-        "diagonal",
-        _number(surface.diagonal),
-        "of the true object's bounding box, scene units; % below are of it",
-    )
+    meaning = "of the true object's bounding box, scene units; % below are of it"
+    yield FigureRow("diagonal", _number(surface.diagonal), meaning)
     if surface.accuracy is not None:
         yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
     if surface.surroundings_fraction > 0:
-        yield FigureRow(
-            "surroundings_fraction",
-            _fraction(surface.surroundings_fraction),
-            "of the result lies nearer to the surroundings; left out of the accuracy",
-        )
+        meaning = "of the result lies nearer to the surroundings; left out of the accuracy"
+        value = _fraction(surface.surroundings_fraction)
+        yield FigureRow("surroundings_fraction", value, meaning)
     if surface.whole is not None:
         yield from _two_sided_rows(surface.whole, "", "the whole truth")
     if surface.seen is not None and surface.seen_fraction is not None:
-        part = (
-            f"the {_fraction(surface.seen_fraction)} of it seen from {surface.seen_from} positions"
-        )
+        seen = _fraction(surface.seen_fraction)
+        part = f"the {seen} of it seen from {surface.seen_from} positions"
         yield from _two_sided_rows(surface.seen, " (seen)", part)
     if surface.calibration is not None:
         yield from _calibration_rows(surface.calibration, surface.diagonal)
 
 
 def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[FigureRow]:
+    within = f"{_fraction(found.within_one)}, {_fraction(found.within_two)}"
     yield FigureRow(
         "expected_error",
-        f"{found.ratio:.2f}; {_fraction(found.within_one)}, {_fraction(found.within_two)}; "
-        f"{found.rank_correlation:.2f}",
+        f"{found.ratio:.2f}; {within}; {found.rank_correlation:.2f}",
         "true over expected error, 1 if calibrated; true error within one and two "
         "expected, 68 and 95 % if calibrated; rank correlation",
     )
     for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
-        yield FigureRow(
-            f"{which} tenth",
-            f"{_number(100 * one.expected / diagonal)} %; "
-            f"{_number(100 * one.root_mean_square / diagonal)} %",
-            "expected error; true error, root mean squares",
-        )
+        errors = (one.expected, one.root_mean_square)
+        value = "; ".join(f"{_number(100 * error / diagonal)} %" for error in errors)
+        meaning = "expected error; true error, root mean squares"
+        yield FigureRow(f"{which} tenth", value, meaning)
 
 
 def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[FigureRow]:
-    yield _distance_row(
-        f"completeness{mark}", figures.completeness, f"truth to result, over {part}: mean; median"
-    )
-    for name, length, percent, meaning in (
-        ("chamfer_mean", figures.chamfer_mean, figures.chamfer_mean_percent, "mean"),
-        ("chamfer_sum", figures.chamfer_sum, figures.chamfer_sum_percent, "sum"),
+    meaning = f"truth to result, over {part}: mean; median"
+    yield _distance_row(f"completeness{mark}", figures.completeness, meaning)
+    for name, length, percent in (
+        ("mean", figures.chamfer_mean, figures.chamfer_mean_percent),
+        ("sum", figures.chamfer_sum, figures.chamfer_sum_percent),
     ):
-        yield FigureRow(
-            name + mark,
-            f"{_number(length)} ({_number(percent)} %)",
-            f"{meaning} of mean accuracy and mean completeness{mark}",
-        )
+        meaning = f"{name} of mean accuracy and mean completeness{mark}"
+        yield FigureRow(f"chamfer_{name}{mark}", _percent_too(length, percent), meaning)
     for at in figures.thresholds:
-        yield FigureRow(
-            f"f_score{mark} at {at.threshold_percent:g} %",
-            _fraction(at.f_score),
+        meaning = (
             f"precision {_fraction(at.precision)}, recall{mark} {_fraction(at.recall)}, "
-            f"nearer than {_number(at.threshold)}",
+            f"nearer than {_number(at.threshold)}"
         )
+        name = f"f_score{mark} at {at.threshold_percent:g} %"
+        yield FigureRow(name, _fraction(at.f_score), meaning)
 
 
 def _view_rows(view: ViewFigures) -> Iterator[FigureRow]:
-    yield FigureRow(
-        "relative_error",
-        f"{_number(view.relative_error)} %",
-        "100 ||S - S'|| / ||S - mean S|| where both are met",
-    )
-    yield FigureRow(
-        "coverage", _fraction(view.coverage), f"of {view.pixels} true pixels are met by the result"
-    )
-    for name, angles, meaning in (
-        ("shape_normals", view.shape_normals, "normals of the mesh's shape: mean; median; pitted"),
-        (
-            "transferred_normals",
-            view.transferred_normals,
-            "normals the mesh carries: mean; median; pitted",
-        ),
+    value = f"{_number(view.relative_error)} %"
+    yield FigureRow("relative_error", value, "100 ||S - S'|| / ||S - mean S|| where both are met")
+    meaning = f"of {view.pixels} true pixels are met by the result"
+    yield FigureRow("coverage", _fraction(view.coverage), meaning)
+    for name, angles, whose in (
+        ("shape_normals", view.shape_normals, "of the mesh's shape"),
+        ("transferred_normals", view.transferred_normals, "the mesh carries"),
     ):
         if angles is not None:
-            value = (
-                f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°; {angles.pitted_percent:.2f} %"
-            )
-            yield FigureRow(name, value, meaning)
-    if view.albedo is not None:
-        yield FigureRow(
-            "albedo",
-            f"{view.albedo.one_scale_percent:.1f} %; {view.albedo.one_scale_median_percent:.1f} %",
-            "after one scale: root mean square, least squares; median, median ratio",
-        )
-        yield FigureRow(
-            "albedo, channel scales",
-            f"{view.albedo.channel_scales_percent:.1f} %",
-            "after a scale for each channel: root mean square, least squares",
-        )
+            value = f"{_degrees(angles)}; {angles.pitted_percent:.2f} %"
+            yield FigureRow(name, value, f"normals {whose}: mean; median; pitted")
+    if (albedo := view.albedo) is not None:
+        value = f"{albedo.one_scale_percent:.1f} %; {albedo.one_scale_median_percent:.1f} %"
+        meaning = "after one scale: root mean square, least squares; median, median ratio"
+        yield FigureRow("albedo", value, meaning)
+        value = f"{albedo.channel_scales_percent:.1f} %"
+        meaning = "after a scale for each channel: root mean square, least squares"
+        yield FigureRow("albedo, channel scales", value, meaning)
 
 
 def _light_rows(lights: LightFigures) -> Iterator[FigureRow]:
-    yield FigureRow(
-        "direction",
-        f"{lights.mean_deg:.2f}°; {lights.median_deg:.2f}°",
-        f"of {lights.lights} lights, in the frame of the truth: mean; median",
-    )
-    yield FigureRow(
-        "direction, rotated",
-        f"{lights.mean_rotated_deg:.2f}°; {lights.median_rotated_deg:.2f}°",
-        f"up to one rotation of all, by {lights.rotation_deg:.2f}°: mean; median",
-    )
+    meaning = f"of {lights.lights} lights, in the frame of the truth: mean; median"
+    yield FigureRow("direction", _degrees(lights), meaning)
+    value = f"{lights.mean_rotated_deg:.2f}°; {lights.median_rotated_deg:.2f}°"
+    meaning = f"up to one rotation of all, by {lights.rotation_deg:.2f}°: mean; median"
+    yield FigureRow("direction, rotated", value, meaning)
 
 
 def _camera_rows(cameras: CameraFigures) -> Iterator[FigureRow]:
-    yield FigureRow(
-        "missing",
-        f"{cameras.missing} of {cameras.views}",
-        "photographs without a camera in the result",
-    )
-    yield FigureRow(
-        "rotation",
-        f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°",
-        "after the similarity on cameras: mean; median",
-    )
+    value = f"{cameras.missing} of {cameras.views}"
+    yield FigureRow("missing", value, "photographs without a camera in the result")
+    value = f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°"
+    yield FigureRow("rotation", value, "after the similarity on cameras: mean; median")
     percent = cameras.mean_center_percent
     away = "" if math.isnan(percent) else f", {_number(percent)} % of the way to the object"
-    yield FigureRow(
-        "center",
-        f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}",
-        f"after the similarity on cameras, scene units: mean; median{away}",
-    )
-    yield FigureRow(
-        "focal",
-        f"{_number(cameras.mean_focal_percent)} %",
-        "mean of the absolute differences of the focal length",
-    )
+    value = f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}"
+    meaning = f"after the similarity on cameras, scene units: mean; median{away}"
+    yield FigureRow("center", value, meaning)
+    value = f"{_number(cameras.mean_focal_percent)} %"
+    yield FigureRow("focal", value, "mean of the absolute differences of the focal length")
     if not math.isnan(cameras.mean_position_percent):
         yield FigureRow(
             "positions",
@@ -228,47 +182,46 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[FigureRow]:
 
 
 def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[FigureRow]:
-    meaning = "mean over {} photographs of sRGB values on the object, each under its fitted light"
-    meaning = meaning.format(len(relighting["views"]))
-    names = {
-        "psnr_db": "PSNR",
-        "psnr_matte_db": "PSNR, matte",
-        "psnr_textured_db": "PSNR, textured",
-    }
-    for key, name in names.items():
-        if (value := relighting.get(key)) is not None:
-            yield FigureRow(name, f"{value:.2f} dB", meaning)
+    views = len(relighting["views"])
+    meaning = (
+        f"mean over {views} photographs of sRGB values on the object, each under its fitted light"
+    )
+    for kind in ("", "matte", "textured"):
+        value = relighting.get(f"psnr_{kind}_db" if kind else "psnr_db")
+        if value is not None:
+            yield FigureRow(f"PSNR, {kind}" if kind else "PSNR", f"{value:.2f} dB", meaning)
     for one in relighting["materials"]:
-        yield FigureRow(
-            "roughness, specular, metallic",
-            f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}",
-            f"glTF's material of {one['vertices']:.0%} of the vertices",
-        )
+        value = f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}"
+        meaning = f"glTF's material of {one['vertices']:.0%} of the vertices"
+        yield FigureRow("roughness, specular, metallic", value, meaning)
 
 
 def _dtu_rows(dtu: DtuFigures) -> Iterator[FigureRow]:
-    cap = f"{CAP_MM:g} mm or more"
-    yield FigureRow(
-        "accuracy",
-        f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm",
-        f"{dtu.evaluated} points in the mask, thinned to {THINNING_MM:g} mm: mean; median; "
-        f"{_fraction(dtu.capped_fraction)} {cap}",
-    )
-    yield FigureRow(
-        "completeness",
-        f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm",
-        f"{dtu.evaluated_true} points of the scan above the table: mean; median; "
-        f"{_fraction(dtu.capped_fraction_true)} {cap}",
-    )
+    value = f"{dtu.mean_accuracy:.4f} mm; {dtu.median_accuracy:.4f} mm"
+    part = f"{dtu.evaluated} points in the mask, thinned to {THINNING_MM:g} mm"
+    yield FigureRow("accuracy", value, _capped(part, dtu.capped_fraction))
+    value = f"{dtu.mean_completeness:.4f} mm; {dtu.median_completeness:.4f} mm"
+    part = f"{dtu.evaluated_true} points of the scan above the table"
+    yield FigureRow("completeness", value, _capped(part, dtu.capped_fraction_true))
     yield FigureRow("overall", f"{dtu.overall:.4f} mm", "mean of the two means")
 
 
+def _capped(part: str, fraction: float) -> str:
+    return f"{part}: mean; median; {_fraction(fraction)} {CAP_MM:g} mm or more"
+
+
 def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> FigureRow:
-    value = (
-        f"{_number(figures.mean)} ({_number(figures.mean_percent)} %); "
-        f"{_number(figures.median)} ({_number(figures.median_percent)} %)"
-    )
-    return FigureRow(name, value, meaning)
+    mean = _percent_too(figures.mean, figures.mean_percent)
+    median = _percent_too(figures.median, figures.median_percent)
+    return FigureRow(name, f"{mean}; {median}", meaning)
+
+
+def _percent_too(length: float, percent: float) -> str:
+    return f"{_number(length)} ({_number(percent)} %)"
+
+
+def _degrees(angles: AngleFigures | LightFigures) -> str:
+    return f"{angles.mean_deg:.2f}°; {angles.median_deg:.2f}°"
 
 
 def _number(value: float) -> str:

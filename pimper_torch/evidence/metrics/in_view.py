@@ -273,9 +273,6 @@ def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
 
     Returns:
         ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
-
-    Raises:
-        InputError: No ray meets both.
     """
     cameras, maps = capture.cameras, true_maps(capture, view)
     if cameras is None or maps is None or len(mesh.faces) == 0:

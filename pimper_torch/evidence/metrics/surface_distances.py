@@ -43,9 +43,6 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
 
     Stratified: the faces' areas laid end to end are cut in ``count`` equal pieces, with one point
     in each.
-
-    Raises:
-        InputError: The surface has no extent: no vertices, or faces without any area.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()
@@ -293,9 +290,6 @@ class TrueSurface:
     Args:
         capture: With the true mesh or points, and its cameras.
         seen_from: Positions of the camera that must see a true point; see :func:`count_seeing`.
-
-    Raises:
-        InputError: There is no true surface, or it has no extent.
     """
 
     def __init__(

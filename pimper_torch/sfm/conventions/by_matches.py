@@ -14,16 +14,8 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 from pimper_torch.sfm.colmap import pinhole_of
+from pimper_torch.sfm.conventions import resized_pictures
 from pimper_torch.sfm.conventions.choice import surely_better
-from pimper_torch.sfm.conventions.resized_pictures import (
-    Ways,
-    around,
-    cut,
-    of_another_size,
-    tell_crop,
-    tell_open_turns,
-    tell_turned,
-)
 from pimper_torch.sfm.epipolar import explained, match_errors, pinholes_of, undistorted_pairs
 from pimper_torch.sfm.matching import VerifiedPair
 from pimper_torch.sfm.model import SparseModel
@@ -36,7 +28,7 @@ _MIN_AGREEMENT, _RIGHT = 0.5, 0.95
 
 
 def choose_way(
-    ways: Ways, verified: Sequence[VerifiedPair], max_error_px: float, where: str
+    ways: resized_pictures.Ways, verified: Sequence[VerifiedPair], max_error_px: float, where: str
 ) -> SparseModel:
     """Choose the cameras that explain most matches.
 
@@ -64,15 +56,15 @@ def _choose_turns(
     scores = [_explained_fraction(model, verified, max_error_px) for model in models]
     best = scores.index(max(scores))
     if sum(pair.num_matches for pair in verified) < MIN_MATCHES:
-        tell_open_turns(where, "matches")
+        resized_pictures.tell_open_turns(where, "matches")
     elif best:
-        tell_turned(where, "what their matches show")
+        resized_pictures.tell_turned(where, "what their matches show")
     return models[best]
 
 
 def _find_crop(
     plain: SparseModel | None,
-    ways: Ways,
+    ways: resized_pictures.Ways,
     verified: Sequence[VerifiedPair],
     max_error_px: float,
     where: str,
@@ -95,7 +87,7 @@ def _find_crop(
         return match_errors(model, strongest).clamp_max(max_error_px)
 
     def shifted(shift: Float[Tensor, "2"]) -> SparseModel:
-        return cut(usual, changed, None, shift)
+        return resized_pictures.cut(usual, changed, None, shift)
 
     usual = min(crops, key=lambda model: float(errors(model).mean()))
     middle, corner = (pinhole_of(one.lenses[changed[0]])[:2, 2] for one in (crops[0], crops[-1]))
@@ -103,7 +95,7 @@ def _find_crop(
     shift, step = torch.zeros_like(room), float(room.max()) / 4
     while step >= 0.5:
         for _ in range(12):
-            ring = torch.cat([torch.zeros(1, 2).to(shift), step * around(shift)])
+            ring = torch.cat([torch.zeros(1, 2).to(shift), step * resized_pictures.around(shift)])
             shifts = torch.minimum(torch.maximum(shift + ring, -room), room)
             means = torch.stack([errors(shifted(one)).mean() for one in shifts])
             nearest = shifts[means.argmin()]
@@ -117,15 +109,15 @@ def _find_crop(
     best = errors(crop)
     if plain is not None and not surely_better(errors(plain), best):
         return None
-    beside = [errors(shifted(shift + 8 * one)) for one in around(shift)]
+    beside = [errors(shifted(shift + 8 * one)) for one in resized_pictures.around(shift)]
     sharp = all(surely_better(one, best) for one in beside)
     if _explained_fraction(crop, verified, max_error_px) <= _RIGHT or not sharp:
         raise InputError(
-            f"{of_another_size(where, crop, changed)}, and what their matches show fits a crop "
-            "better than a resize, but does not tell which crop. Give the photographs that it was "
-            "made from, resized if you like, but not cropped."
+            f"{resized_pictures.of_another_size(where, crop, changed)}, and what their matches "
+            "show fits a crop better than a resize, but does not tell which crop. Give the "
+            "photographs that it was made from, resized if you like, but not cropped."
         )
-    tell_crop(where, crop, changed, "what their matches show")
+    resized_pictures.tell_crop(where, crop, changed, "what their matches show")
     return crop
 
 

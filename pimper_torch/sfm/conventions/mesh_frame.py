@@ -76,11 +76,7 @@ def compare_with_scene(
 
 
 def refuse_other_axes(mesh: Mesh, scene: SparseScene) -> None:
-    """Refuse poses that miss a mesh, where camera-to-world or cameras of OpenGL would show it.
-
-    Raises:
-        InputError: Says which, and how to turn them into poses that are right.
-    """
+    """Refuse poses that miss a mesh, where camera-to-world or cameras of OpenGL would show it."""
     cameras = scene.cameras
     poses = cameras.cam_from_world.detach().double()
     given = from_local(poses, scene.offset_world)  # where a scene is far off, it may be for this

@@ -25,11 +25,7 @@ from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
-from pimper_torch.single_view.factorization.low_rank import (
-    brightness_guess,
-    low_rank_problem,
-    singular_left,
-)
+from pimper_torch.single_view.factorization import low_rank
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -86,9 +82,9 @@ def fit_encoded(
         heavy = weight / rate.square()
         heavy = heavy / heavy.max()
         if left is None:
-            guess = brightness_guess(target, mask)[None]
-            left = singular_left(target[None], mask[None], problem.rank, guess, 29)[0]
-        matrix = low_rank_problem(target[None], heavy[None], left[None])
+            guess = low_rank.brightness_guess(target, mask)[None]
+            left = low_rank.singular_left(target[None], mask[None], problem.rank, guess, 29)[0]
+        matrix = low_rank.low_rank_problem(target[None], heavy[None], left[None])
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
         linear = left @ solved.shading[0]
@@ -246,9 +242,6 @@ def gamma_of_photographs(
         views: Read with :data:`~pimper_torch.radiometry.LINEAR`; pixels that any of their masks
             leaves out are left out.
         mask: True on the object, for all photographs.
-
-    Raises:
-        InputError: As :func:`estimate_gamma`, and for unlike sizes.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
         raise InputError(

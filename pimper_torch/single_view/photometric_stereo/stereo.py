@@ -8,12 +8,7 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError
 from pimper_torch.records import Record
-from pimper_torch.single_view.factorization.bas_relief import (
-    BasRelief,
-    convex,
-    relief_from_strength,
-    standard_relief,
-)
+from pimper_torch.single_view.factorization import bas_relief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,
     resolve_by_albedo_entropy,
@@ -59,7 +54,7 @@ class PhotometricStereo(Record):
     lights: Float[Tensor, "view 3"]
     lit: Bool[Tensor, "view height width"]
     valid: Bool[Tensor, "height width"]
-    applied: BasRelief | None
+    applied: bas_relief.BasRelief | None
     free: str
 
 
@@ -96,9 +91,6 @@ def photometric_stereo(
         weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
             known to be in shadow.
         robust: Whether shadows and highlights lose weight.
-
-    Raises:
-        InputError: Input that the method cannot use.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
@@ -158,14 +150,14 @@ def _integrable(
     matrix = integrable(factors.shading, reliability, mask)
     shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
     if resolve == "rounded":
-        relief = standard_relief(shading, reliability)
+        relief = bas_relief.standard_relief(shading, reliability)
     elif resolve == "equal_strength":
-        relief = relief_from_strength(lights, shading, reliability, mask)
+        relief = bas_relief.relief_from_strength(lights, shading, reliability, mask)
     else:
         used = reliability > 0
         groups = chromaticity_groups(radiance[:, :, used]) if radiance.shape[1] > 1 else None
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
-    relief = convex(relief, shading, reliability, mask)
+    relief = bas_relief.convex(relief, shading, reliability, mask)
     moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
     free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
     return _lambertian(radiance, moved, relief, free)
@@ -174,7 +166,7 @@ def _integrable(
 def _lambertian(
     radiance: Float[Tensor, "view channel pixel"],
     factors: Factored,
-    applied: BasRelief | None,
+    applied: bas_relief.BasRelief | None,
     free: str,
 ) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""

@@ -96,7 +96,7 @@ def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
         asked["encoding"] = encoding
         return read_transforms(data)
 
-    monkeypatch.setattr(convert, "read_dtu_mvs", stand_in)
+    monkeypatch.setattr(convert.datasets, "read_dtu_mvs", stand_in)
     arguments = ["data", "-o", "out", "--source", "dtu-mvs", "--target", "idr", "--scan", "3"]
     convert.read(convert.parse([*arguments, "--photographs.response", "2.2"]))
     assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
@@ -150,14 +150,16 @@ def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
 
 def test_a_rendered_scene_is_read_without_maps(data, monkeypatch):
     asked = {}
-    monkeypatch.setattr(convert, "read_rendered", lambda folder, **options: asked.update(options))
+    monkeypatch.setattr(
+        convert.datasets, "read_rendered", lambda folder, **options: asked.update(options)
+    )
     readers()["rendered"](data)
     assert asked == {"maps": False}
 
 
 def test_a_set_without_cameras_is_not_exported(data, tmp_path, monkeypatch, capsys):
     bare = read_transforms(data).replace(cameras=None)
-    monkeypatch.setattr(convert, "read_llff", lambda folder: bare)
+    monkeypatch.setattr(convert.datasets, "read_llff", lambda folder: bare)
     arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
     assert main([*arguments, "--target", "idr"]) == 2
     assert "says nothing about its cameras" in capsys.readouterr().err
