@@ -134,9 +134,7 @@ def blend_patches(
         depths.patches.buckets, depths.buckets, depths.photometric.buckets, heights, strict=True
     )
 
-    def of_bucket(
-        bucket: tuple[Templates, Depths, Photometry, Heights | None],
-    ) -> _Estimates:
+    def of_bucket(bucket: tuple[Templates, Depths, Photometry, Heights | None]) -> _Estimates:
         def of_some(some: slice) -> _Estimates:
             templates, height_field, photometry, offsets = bucket
             return _estimates(

@@ -132,8 +132,7 @@ def kept_slopes(
     """
     found = slopes(edges, flat, directions, shape, variance)
     return found.replace(
-        targets=(found.coefficients * transferred[edges]).sum(dim=1),
-        evaluated=False,
+        targets=(found.coefficients * transferred[edges]).sum(dim=1), evaluated=False
     )
 
 

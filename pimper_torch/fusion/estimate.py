@@ -140,13 +140,7 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " v
     heights = fused.heights
     try:
         (heights,) = _solved(
-            kinds,
-            fused.weights,
-            factors,
-            start,
-            fused.damping,
-            guess=heights,
-            tolerance=_ACCURATE,
+            kinds, fused.weights, factors, start, fused.damping, guess=heights, tolerance=_ACCURATE
         )
     except SingularSystemError as error:
         _kept(error)

@@ -244,11 +244,7 @@ class Fuse(Stage):
         return problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
 
     def _noise(
-        self,
-        swept: SweptPatches,
-        whole: Subdivision,
-        mine: Bool[Tensor, " facet"],
-        shared: _Shared,
+        self, swept: SweptPatches, whole: Subdivision, mine: Bool[Tensor, " facet"], shared: _Shared
     ) -> dict[Key, tuple[int, Float[Tensor, ""]]]:
         """Return the noise factors of a block, each with the number of equations that show it."""
         problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)

@@ -26,12 +26,7 @@ from pimper_torch.fusion.equations import (
     upright,
     upright_heights,
 )
-from pimper_torch.fusion.normal_bias import (
-    MEDIAN_OF_TILT,
-    common,
-    common_variance,
-    normal_bias,
-)
+from pimper_torch.fusion.normal_bias import MEDIAN_OF_TILT, common, common_variance, normal_bias
 from pimper_torch.fusion.problem import Problem
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster

@@ -19,12 +19,7 @@ from pimper_torch.kernels.dense_systems import eliminate
 from pimper_torch.kernels.factorization import samples_that_count
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import apply, frame, project
-from pimper_torch.kernels.twin_constants import (
-    CAUCHY,
-    GEMAN_MCCLURE,
-    MIN_DEVIATION,
-    SQUARES,
-)
+from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
 
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]

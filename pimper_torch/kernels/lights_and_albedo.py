@@ -308,7 +308,7 @@ def _step(
     for first in range(0, num_samples, TILE):
         _tile(
             geometry, lights, shading, residual, weight, albedo, first,
-            slopes, cross, own, albedo_gradient, matrix, gradient,
+            slopes, cross, own, albedo_gradient, matrix, gradient
         )  # fmt: skip
     for v in range(num_views):
         total = 0.0
@@ -396,7 +396,7 @@ def fit(
         after = np.inf
         if _step(
             geometry, lights, shading, residual, weight, albedo, damping, max_closeness,
-            cross, new_lights, new_albedo,
+            cross, new_lights, new_albedo
         ):  # fmt: skip
             _shade(geometry, new_lights, trial_shading)
             after = _settle(radiance, seen, trial_shading, scale, weight, new_residual, new_albedo)

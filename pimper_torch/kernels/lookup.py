@@ -11,9 +11,7 @@ from pimper_torch.kernels.compile import compiled
 Array = NDArray[Any]
 
 
-@compiled(
-    "Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)",
-)
+@compiled("Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)")
 def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
     """Return the upper left one of the four pixels around a point, and bilinear weights.
 

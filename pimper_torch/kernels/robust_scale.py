@@ -7,11 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
-from pimper_torch.kernels.twin_constants import (
-    GAUSSIAN_SCALE,
-    LONGEST_NEWTON_STEP,
-    NEWTON_STEPS,
-)
+from pimper_torch.kernels.twin_constants import GAUSSIAN_SCALE, LONGEST_NEWTON_STEP, NEWTON_STEPS
 
 Floats = NDArray[Any]
 

@@ -17,12 +17,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
-from pimper_torch.linalg.aggregation import (
-    coarser,
-    dominant_diagonal,
-    parts_of,
-    prolongation,
-)
+from pimper_torch.linalg.aggregation import coarser, dominant_diagonal, parts_of, prolongation
 from pimper_torch.parallel import on_one_thread, over_rows
 
 Product = Callable[[Tensor], Tensor]

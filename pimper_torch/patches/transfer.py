@@ -72,10 +72,7 @@ def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
 
 
 def _transferred(
-    surface: Mesh,
-    normals: Float[Tensor, "vertex 3"],
-    caster: RayCaster,
-    templates: Templates,
+    surface: Mesh, normals: Float[Tensor, "vertex 3"], caster: RayCaster, templates: Templates
 ) -> Templates:
     num, height, width = templates.depth.shape
     world_from_patch = invert_rigid(templates.patch_from_world)

@@ -232,11 +232,7 @@ class Warp(Stage):
         self.config = config or WarpConfig()
 
     def forward(
-        self,
-        views: Views,
-        cameras: Cameras,
-        patches: PatchSet,
-        sources: Sources | None = None,
+        self, views: Views, cameras: Cameras, patches: PatchSet, sources: Sources | None = None
     ) -> PatchViews:
         """Return J and D of every patch.
 
@@ -293,11 +289,7 @@ class Warp(Stage):
         return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
 
     def _register(
-        self,
-        cameras: Cameras,
-        sources: Sources,
-        rows: Int[Tensor, " view"],
-        templates: Templates,
+        self, cameras: Cameras, sources: Sources, rows: Int[Tensor, " view"], templates: Templates
     ) -> Observations:
         found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
         guesses = [

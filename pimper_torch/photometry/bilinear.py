@@ -335,10 +335,7 @@ def iterate(
         cause=torch.where(has_data, causes, int(StopCause.EMPTY)),
     )
     return Factors(
-        lights=final.lights,
-        shading=final.shading,
-        weight=final.weight,
-        convergence=convergence,
+        lights=final.lights, shading=final.shading, weight=final.weight, convergence=convergence
     )
 
 

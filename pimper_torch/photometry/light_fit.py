@@ -239,9 +239,7 @@ def _newton_matrix(
 
 
 def _second_derivatives(
-    model: LightModel,
-    lights: Float[Tensor, "view parameter"],
-    weight: Float[Tensor, "sample view"],
+    model: LightModel, lights: Float[Tensor, "view parameter"], weight: Float[Tensor, "sample view"]
 ) -> Float[Tensor, "view parameter parameter"]:
     """Sum the second derivatives of the samples' shading, by each view's parameters."""
     if model.normals is None:

@@ -220,8 +220,7 @@ def _whitened(
 
 
 def _eliminated(
-    white: list[Float[Tensor, "patch view sample"]],
-    shading: Float[Tensor, "patch rank sample"],
+    white: list[Float[Tensor, "patch view sample"]], shading: Float[Tensor, "patch rank sample"]
 ) -> Float[Tensor, "patch unknown unknown"]:
     """Sum the samples' Schur terms ``(n n^T) (x) (white^T white)``.
 

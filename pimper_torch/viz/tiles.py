@@ -1,5 +1,6 @@
 """Sheets of pictures: rows of tiles with titles, on white."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 # Choices, for a sheet of four tiles of 390 pixels.
 _GAP_PX, _TITLE_PX, _HEADLINE_PX = 10, 26, 36
-_TEXT_PX, _LARGE_PX = 15, 18
+_TEXT_PX, _LARGE_PX, _SMALL_PX = 15, 18, 11
 TALLEST = 1.6  # a picture that is higher for its width is shown narrower
 
 
@@ -23,12 +24,14 @@ class Tile:
     """A picture of a sheet.
 
     Attributes:
-        picture: sRGB in [0, 1], rows first.
+        picture: sRGB in [0, 1], rows first; ``None`` where there is none.
+        note: Stands in the place of a missing picture.
         wide: Takes a row of its own, as wide as the sheet.
     """
 
-    picture: Picture
     title: str = ""
+    picture: Picture | None = None
+    note: str = ""
     wide: bool = False
 
 
@@ -40,9 +43,12 @@ def sheet(rows: Sequence[Sequence[Tile]], tile_px: int, headline: str = "") -> I
     for row in rows:
         room = width - 2 * _GAP_PX if row[0].wide else tile_px
         top += _TITLE_PX if any(tile.title for tile in row) else 0
-        pictures = [_image(fitted(one.picture, room)) for one in row]
+        pictures = [
+            None if one.picture is None else _image(fitted(one.picture, room)) for one in row
+        ]
         placed.append((top, room, row, pictures))
-        top += max(one.height for one in pictures) + _GAP_PX
+        top += max([one.height for one in pictures if one is not None], default=tile_px)
+        top += _GAP_PX
     page = Image.new("RGB", (width, top), "white")
     draw = ImageDraw.Draw(page)
     draw.text((width / 2, _HEADLINE_PX / 2), headline, "black", _font(_LARGE_PX), anchor="mm")
@@ -51,7 +57,12 @@ def sheet(rows: Sequence[Sequence[Tile]], tile_px: int, headline: str = "") -> I
             left = _GAP_PX + column * (tile_px + _GAP_PX)
             above = (left + room / 2, top - _TITLE_PX / 2)
             draw.text(above, tile.title, "black", _font(_TEXT_PX), anchor="mm")
-            page.paste(picture, (left + (room - picture.width) // 2, top))
+            if picture is not None:
+                page.paste(picture, (left + (room - picture.width) // 2, top))
+            elif tile.note:
+                words = textwrap.fill(tile.note, room // 8, max_lines=4, placeholder=" …")
+                at = (left + room / 2, top + room / 4)
+                draw.text(at, words, "gray", _font(_SMALL_PX), anchor="mm", align="center")
     return page
 
 

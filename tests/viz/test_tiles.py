@@ -45,9 +45,12 @@ def test_a_wide_tile_has_the_sheets_width_and_a_tall_one_is_narrower():
     assert (wide[2], page.width - wide[3]) == (10, 10)
 
 
-def test_a_headline_takes_room():
-    tile = Tile(picture=plain((0.8, 0, 0)))
-    assert sheet([[tile]], 80, "3 photographs").height > sheet([[tile]], 80).height
+def test_a_headline_and_a_note_are_written():
+    bare = sheet([[Tile()]], 80)
+    noted = sheet([[Tile(note="not installed: pmvs2\nmore")]], 80)
+    assert (np.asarray(bare) == 255).all()
+    assert (np.asarray(noted) < 200).any()
+    assert sheet([[Tile()]], 80, "3 photographs").height > bare.height
 
 
 def test_pictures_are_scaled_to_their_tile_and_kept_where_they_fit():

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import PimperError, PimperWarning
@@ -34,13 +34,27 @@ from pimper_torch.evidence.bench.bench_table import (
 )
 from pimper_torch.evidence.bench.measure import peak_memory, this_machine
 from pimper_torch.evidence.metrics.evaluation import Evaluation, evaluate
-from pimper_torch.evidence.metrics.in_view import ViewFigures, figures_of, meet_truth
+from pimper_torch.evidence.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
 from pimper_torch.evidence.metrics.similarity import transfer
+from pimper_torch.evidence.metrics.surface_distances import bounding_diagonal
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import listening
-from pimper_torch.records import Capture, StageReport
+from pimper_torch.records import Capture, Mesh, StageReport
 from pimper_torch.reporting import Observer, Silent, peak_memory_mb
+from pimper_torch.viz.heatmap import (
+    ErrorScale,
+    MethodPanels,
+    SceneRow,
+    crop_to,
+    draw_heatmap,
+    draw_sheet,
+    error_picture,
+    normals_picture,
+    shading_in_view,
+    surface_picture,
+)
+from pimper_torch.viz.tiles import encoded
 
 Covered = Bool[Tensor, "height width"]
 
@@ -98,7 +112,77 @@ def _along_rays(view: ViewFigures | None) -> dict[str, Any]:
     }
 
 
-BENCH_NAMES = ("table.md", "table.json", "meshes")
+# Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
+ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
+
+
+def method_panels(
+    mesh: Mesh,
+    met: Meeting | None,
+    inputs: Inputs,
+    scene: str,
+    method: str,
+    heatmap: Path | str | str,
+) -> MethodPanels:
+    """Draw the errors of a surface on it, and return its pictures for the sheet.
+
+    Args:
+        mesh: In the frame of the truth.
+        met: Of the rays of the reference view; ``None`` if none meets it.
+    """
+    truth = inputs.maps
+    if met is None or truth.cameras is None:
+        return MethodPanels(method=method, note="points only")
+    errors = error_along_rays(met, truth)
+    shading = shading_in_view(mesh, truth.cameras, 0)
+    draw_heatmap(errors, ERROR_SCALE, heatmap, shading=shading, title=f"{scene}, {method}")
+    crop = _crop(truth)
+    return MethodPanels(
+        method=method,
+        surface=surface_picture(mesh, truth.cameras, 0, met.hits)[crop],
+        error=error_picture(errors, ERROR_SCALE, shading=shading)[crop],
+    )
+
+
+def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
+    """Return a scene's row: photograph, truth, and the panels of all methods."""
+    maps = inputs.maps
+    assert maps.cameras is not None
+    assert maps.truth.normals_world is not None
+    crop = _crop(maps)
+    taken = inputs.scene.views.images[inputs.coarse.reference]
+    return SceneRow(
+        scene=scene,
+        photograph=encoded(taken.movedim(0, -1))[crop],
+        truth=normals_picture(maps.truth.normals_world[0], maps.cameras, 0)[crop],
+        methods=methods,
+    )
+
+
+def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
+    """Return the distance of a surface from the truth along the rays of a view.
+
+    Per cent of the diagonal of the true bounding box; infinite on the object where the surface is
+    missed, NaN off the object.
+    """
+    assert capture.truth.mesh is not None
+    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
+    error[met.valid] = torch.inf
+    distance = (met.points - met.points_true).norm(dim=-1).double()
+    error[met.both] = 100 * distance / bounding_diagonal(capture.truth.mesh)
+    return error
+
+
+def _crop(maps: Capture) -> tuple[slice, slice]:
+    assert maps.truth.foreground is not None
+    return crop_to(maps.truth.foreground[0])
+
+
+BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
+
+
+_Cell = tuple[BenchRow, MethodPanels, Covered | None]
+"""Row, pictures, and pixels of the reference view whose rays meet truth and surface."""
 
 
 def run_bench(
@@ -109,13 +193,15 @@ def run_bench(
     overwrite: bool = False,
     cache: Path | str | None = None,
 ) -> Table:
-    """Run methods on scenes, and write the table and all surfaces to a folder.
+    """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
 
     ==================  ===========================================================
     file                content
     ==================  ===========================================================
     `table.md`          the table, beside the published figures
     `table.json`        the same with all digits, and why figures are missing
+    `sheet.png`         photograph, true normals, each method's normals and errors
+    `heatmaps/`         errors on the surface, one picture a scene and method
     `meshes/`           every surface, in the frame of the truth, as PLY
     ==================  ===========================================================
 
@@ -129,14 +215,18 @@ def run_bench(
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
     rows: list[BenchRow] = []
+    sheet: list[SceneRow] = []
     with (
         written_whole(folder, "table", overwrite=overwrite) as staging,
         tempfile.TemporaryDirectory(prefix="pimper_bench_") as workspace,
     ):
-        (staging / "meshes").mkdir()
+        for part in ("heatmaps", "meshes"):
+            (staging / part).mkdir()
         for scene in config.scenes:
             try:
-                rows += _scene(scene, methods, config, Path(workspace), staging, observer, cache)
+                measured, pictures = _scene(
+                    scene, methods, config, Path(workspace), staging, observer, cache
+                )
             except KeyboardInterrupt:
                 if not rows:
                     raise
@@ -146,6 +236,8 @@ def run_bench(
                     stacklevel=2,
                 )
                 break
+            rows += measured
+            sheet += pictures
         table = Table(
             rows=with_published(rows),
             machine=this_machine(),
@@ -155,6 +247,8 @@ def run_bench(
         )
         write_json(table, staging / "table.json")
         (staging / "table.md").write_text(markdown(table) + "\n", encoding="utf-8")
+        if sheet:
+            draw_sheet(sheet, ERROR_SCALE, staging / "sheet.png")
     return table
 
 
@@ -166,7 +260,7 @@ def _scene(
     staging: Path,
     observer: Observer,
     cache: Path | str | None,
-) -> list[BenchRow]:
+) -> tuple[list[BenchRow], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem
     with _shown(observer, f"{name} render"):
@@ -175,14 +269,14 @@ def _scene(
         with _shown(observer, f"{name} sfm"):
             inputs = prepare(rendered, config, cache)
     except PimperError as error:
-        return [row_of_failure(name, method, error) for method in methods]
+        return [row_of_failure(name, method, error) for method in methods], []
     cells = []
     for method, run in methods.items():
         with _shown(observer, f"{name} {method}"):
             cells.append(_cell(name, method, run, inputs, config, staging))
-    rows, covered = zip(*cells, strict=True)
+    rows, panels, covered = zip(*cells, strict=True)
     meshes = [_mesh_file(staging, name, method) for method in methods]
-    return with_common(rows, covered, meshes, inputs.maps)
+    return with_common(rows, covered, meshes, inputs.maps), [scene_row(name, inputs, panels)]
 
 
 def _mesh_file(folder: Path, scene: str, method: str) -> Path:
@@ -191,8 +285,7 @@ def _mesh_file(folder: Path, scene: str, method: str) -> Path:
 
 def _cell(
     scene: str, method: str, run: Method, inputs: Inputs, config: BenchConfig, staging: Path
-) -> tuple[BenchRow, Covered | None]:
-    """Measure a method; of the reference view, find the pixels that show truth and surface."""
+) -> _Cell:
     began = time.perf_counter()
     sfm_minutes = inputs.sfm_seconds / 60 or None
     try:
@@ -209,13 +302,15 @@ def _cell(
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
-        return row, None
+        return row, MethodPanels(method=method, note=row.note), None
     mesh = transfer(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
     write_ply(mesh, _mesh_file(staging, scene, method))
+    heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
     # Evaluated in a view, it has been met.
     met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
     row = row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes)
-    return row, met.both if met else None
+    panels = method_panels(mesh, met, inputs, scene, method, heatmap)
+    return row, panels, met.both if met else None
 
 
 def row_of(

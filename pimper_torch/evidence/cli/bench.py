@@ -28,7 +28,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         )
     if not output.as_json:
         Console().print(terminal(table))
-    output.remark(f"{job.out}/table.md is the table.")
+    output.remark(f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.")
     output.result({name: job.out / name for name in BENCH_NAMES if (job.out / name).exists()})
 
 

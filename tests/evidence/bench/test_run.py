@@ -13,13 +13,15 @@ from pimper_torch.errors import (
 )
 from pimper_torch.evidence.bench import run_bench as runner
 from pimper_torch.evidence.bench.bench_inputs import BenchConfig, Inputs, MethodRun, method_named
-from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, run_bench
+from pimper_torch.evidence.bench.run_bench import BENCH_NAMES, error_along_rays, run_bench
 from pimper_torch.evidence.metrics import TrueSurface
+from pimper_torch.evidence.metrics.in_view import meet_truth
 from pimper_torch.evidence.scenes import SceneObject, render_objects, sparse_scene
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.evidence.scenes.scene_lights import wandering_lights
 from pimper_torch.evidence.scenes.textures import random_speckle
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.outputs.marker import MARKER
 from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
@@ -158,7 +160,7 @@ def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(s
     assert_close(alone.common_relative_error, alone.relative_error, atol=1e-4, rtol=0)
 
 
-def test_the_folder_holds_table_and_surfaces(staged, tmp_path):
+def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
     config = BenchConfig(samples=3000, scenes=("ball",), methods=("larger", "lost"))
     table = run_bench(config, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
@@ -167,6 +169,7 @@ def test_the_folder_holds_table_and_surfaces(staged, tmp_path):
     rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
     assert [row["method"] for row in rows] == [row.method for row in table.rows]
     assert "larger" in (tmp_path / "out" / "table.md").read_text()
+    assert [path.name for path in (tmp_path / "out" / "heatmaps").iterdir()] == ["ball_larger.png"]
     mesh = read_mesh(tmp_path / "out" / "meshes" / "ball_larger.ply")
     radii = mesh.vertices_world.norm(dim=1)
     assert_close(radii, torch.full_like(radii, 1.02), rtol=0, atol=1e-4)
@@ -210,6 +213,22 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, mo
     )
     assert [row.method for row in table.rows] == ["exact", "larger"]
     assert all("no view" in row.note for row in table.rows)
+
+
+def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
+    shift = torch.eye(4).double()
+    camera = ball.maps.cameras.cam_from_world[0]
+    shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
+    mesh = ball.capture.truth.mesh
+    moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
+    error = error_along_rays(meet_truth(moved, ball.maps, 0), ball.maps)
+    foreground = ball.maps.truth.foreground[0]
+    assert torch.equal(error.isnan(), ~foreground)
+    centre = error[22, 30]
+    assert_close(centre, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
+    half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
+    missed = error_along_rays(meet_truth(half, ball.maps, 0), ball.maps).isinf()
+    assert 0.3 < missed[foreground].float().mean() < 0.7
 
 
 def test_names_that_are_no_method_are_refused():
