@@ -62,9 +62,10 @@ def tracked(arguments: Any) -> tuple[Any, list[Tensor]]:  # noqa: ANN401 - recor
 
 
 def pulled_back(result: Any, inputs: list[Tensor]) -> list[Tensor]:  # noqa: ANN401
-    """Return the gradients of the sum of squares of all that a stage gives."""
+    """Return the gradients of the sum of squares of all finite values that a stage gives."""
     leaves = [leaf for leaf in pytree.tree_leaves(result) if isinstance(leaf, Tensor)]
-    total = sum(leaf.square().sum() for leaf in leaves if leaf.requires_grad and leaf.numel())
+    finite = [leaf[leaf.isfinite()] for leaf in leaves if leaf.requires_grad]
+    total = sum(leaf.square().sum() for leaf in finite if leaf.numel())
     if not isinstance(total, Tensor):
         return []  # constants to autograd
     found = torch.autograd.grad(total, inputs, allow_unused=True)

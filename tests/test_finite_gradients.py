@@ -1,0 +1,89 @@
+"""Every gradient is finite where the value is: of whole scenes, by stage and through the chain."""
+
+import pytest
+import torch
+from gradient_cost import STAGES, calls, pulled_back, tracked
+from priors import prior_of
+
+import pimper_torch as pt
+from pimper_torch.evidence.datasets.rendered import read_rendered
+from pimper_torch.evidence.scenes import render_scene
+from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::pimper_torch.errors.PimperWarning", "ignore:Converting a tensor with requires_grad"
+)
+
+# What no view lights is in the mug.
+SCENES = {
+    "potatoes": {},
+    "balls": {"specular": 0.3},
+    "mug": {},
+    "a black photograph": {},
+    "a saturated photograph": {},
+    "views that see nothing of most facets": {},
+}
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Photographs of 240x180 from eight places with true cameras, masks, and guessed normals."""
+
+    def make(name):
+        kind = name if name in ("potatoes", "balls", "mug") else "potatoes"
+        folder = tmp_path_factory.getbasetemp() / f"finite-{kind}"
+        if not folder.exists():
+            config = SceneConfig(num_views=8, width=240, height=180, **SCENES[name])
+            render_scene(kind, folder, config)
+        views = pt.load_views(folder / "photos", masks=folder / "masks")
+        images = views.images.clone()
+        if name == "a black photograph":
+            images[2] = 0
+        if name == "a saturated photograph":
+            images[2] = 1
+        if name == "views that see nothing of most facets":
+            seen = (torch.arange(240) > 110) | (torch.arange(8)[:, None] < 4)
+            views = views.replace(masks=views.masks & seen[:, None])
+        views = views.replace(images=images, priors=prior_of("normals:5", read_rendered(folder)))
+        chain = pt.load_chain("default", {"scales": [0.25]})
+        return chain.reconstruct(views, folder / "truth" / "sparse")
+
+    return make
+
+
+def assert_finite(slopes, where):
+    wrong = sum(int((~slope.isfinite()).sum()) for slope in slopes)
+    assert slopes, where
+    assert wrong == 0, f"{where}: {wrong} of {sum(slope.numel() for slope in slopes)}"
+
+
+def assert_stages_finite(chain, scene):
+    """Check every stage on what the chain hands it; return what the factorization is handed."""
+    given = calls(chain, scene)
+    for stage in [stage for stage in STAGES if stage in given]:
+        arguments, inputs = tracked(given[stage])
+        assert_finite(pulled_back(getattr(chain, stage)(*arguments), inputs), stage)
+    return given
+
+
+def test_gradients_of_a_pass_are_finite(rendered):
+    assert_stages_finite(pt.load_chain("default", {"scales": [0.25]}), rendered("potatoes"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("name", SCENES)
+def test_gradients_are_finite_where_values_are(rendered, name, dtype):
+    scene = rendered(name).to(dtype)
+    chain = pt.load_chain("default", {"scales": [0.25, 0.25]})
+    given = assert_stages_finite(chain, scene)
+    (seen,), _ = tracked(given["factorize"])
+    total = sum(bucket.albedo.square().sum() for bucket in chain.factorize(seen).buckets)
+    slopes = torch.autograd.grad(total, [bucket.radiance for bucket in seen.buckets])
+    for slope, bucket, templates in zip(slopes, seen.buckets, seen.patches.buckets, strict=True):
+        counts = (bucket.valid & templates.inside[:, None])[:, :, None]
+        assert not slope[~counts.expand_as(slope)].any()
+    mesh = given["decompose"][0].mesh
+    (scene, mesh), inputs = tracked((scene, mesh))
+    result = pt.load_chain("default", {"scales": [0.25]})(scene, mesh=mesh)
+    assert_finite(pulled_back(result, inputs), "chain")
