@@ -155,7 +155,7 @@ def test_least_squares_repeat_bit_for_bit():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("lstsq")
     ]
-    assert len(calls) > 2
+    assert len(calls) > 1
     assert all("driver='gelsd'" in call for _, call in calls), calls
 
 

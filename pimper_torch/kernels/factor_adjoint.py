@@ -18,7 +18,7 @@ from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import eliminate
 from pimper_torch.kernels.factorization import samples_that_count
 from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.shading_steps import apply, frame, project
+from pimper_torch.kernels.shading_steps import frame, project
 from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
 
 Doubles = NDArray[np.float64]
@@ -139,6 +139,19 @@ def _data(
             prior[i, k] = problem.prior[p, i, samples[k]]
     level = MIN_DEVIATION * size / max(count, 1.0)
     return Data(radiance, given, anchor, regularization, prior, num_scale, level, loss, scale)
+
+
+@compiled()
+def _start(
+    lights: Doubles3, shading: Doubles3, p: int, views: Integers, samples: Integers
+) -> tuple[Doubles, Doubles]:
+    light, shade = np.empty((len(views), 4)), np.empty((4, len(samples)))
+    for i in range(4):
+        for f in range(len(views)):
+            light[f, i] = lights[p, views[f], i]
+        for k in range(len(samples)):
+            shade[i, k] = shading[p, i, samples[k]]
+    return light, shade
 
 
 @compiled()
@@ -290,10 +303,7 @@ def _descent(
     """Compute minus half the gradient, and return its square."""
     _pull(at.weighted, lights, shading, at, on_lights, on_samples)
     image, drawn = np.empty_like(shading), np.empty((3, shading.shape[1]))
-    for k in range(shading.shape[1]):
-        found = _apply_prior(data.prior, shading, k)
-        for i in range(4):
-            image[i, k] = found[i]
+    _prior_image(data, shading, image)
     _coordinates(at, image, drawn)
     total = 0.0
     for a in range(3):
@@ -308,20 +318,18 @@ def _descent(
 
 
 @compiled(fast=True)
-def _apply_prior(prior: Doubles, shading: Doubles, k: int) -> tuple[float, float, float, float]:
-    p = (
-        prior[0, k],
-        prior[1, k],
-        prior[2, k],
-        prior[3, k],
-        prior[4, k],
-        prior[5, k],
-        prior[6, k],
-        prior[7, k],
-        prior[8, k],
-        prior[9, k],
-    )
-    return apply(p, (shading[0, k], shading[1, k], shading[2, k], shading[3, k]))
+def _prior_image(data: Data, vectors: Doubles, image: Doubles) -> None:
+    """Multiply each sample's prior with its vector."""
+    image[:] = 0
+    entry = 0
+    for i in range(4):
+        for j in range(i, 4):
+            prior = data.prior[entry]
+            for k in range(vectors.shape[1]):
+                image[i, k] += prior[k] * vectors[j, k]
+                if i != j:
+                    image[j, k] += prior[k] * vectors[i, k]
+            entry += 1
 
 
 @compiled(fast=True)
@@ -388,8 +396,12 @@ def _product(one: Doubles, other: Doubles) -> float:
 def _inverses(data: Data, lights: Doubles, shading: Doubles, at: Point) -> None:
     """Invert every sample's block; zero where it has no data, which does not move."""
     num_views = len(lights)
+    slope, images = np.empty_like(shading), np.empty_like(at.basis)
+    _prior_image(data, shading, slope)
+    for a in range(3):
+        _prior_image(data, at.basis[4 * a : 4 * a + 4], images[4 * a : 4 * a + 4])
     for k in range(shading.shape[1]):
-        _, g1, g2, g3 = _apply_prior(data.prior, shading, k)
+        g1, g2, g3 = slope[1, k], slope[2, k], slope[3, k]
         m00 = m01 = m02 = m11 = m12 = m22 = 0.0
         for f in range(num_views):
             bend, weighted = at.bend[f, k], at.weighted[f, k]
@@ -404,9 +416,7 @@ def _inverses(data: Data, lights: Doubles, shading: Doubles, at: Point) -> None:
             g1 -= lights[f, 1] * weighted
             g2 -= lights[f, 2] * weighted
             g3 -= lights[f, 3] * weighted
-        p = _apply_prior(data.prior, at.basis[0:4], k)
-        q = _apply_prior(data.prior, at.basis[4:8], k)
-        r = _apply_prior(data.prior, at.basis[8:12], k)
+        p, q, r = images[0:4, k], images[4:8, k], images[8:12, k]
         n, first, second = at.basis[0:4, k], at.basis[4:8, k], at.basis[8:12, k]
         for i in range(4):
             m00 += n[i] * p[i]
@@ -689,6 +699,12 @@ def _pull_back(
             entry += 1
 
 
+@compiled()
+def _is_anchored(problem: Given, p: int, f: int) -> bool:
+    """Return whether the light of a view is its anchor: without data."""
+    return problem.regularization[p, f] > 0 and not np.any(problem.weight[p, f] > 0)
+
+
 @compiled(annotated=True)
 def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solved) -> None:
     """Take a batch of solutions to rest by Newton's method, and compute weights and residuals.
@@ -701,17 +717,15 @@ def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solve
     """
     lights, shading, weight, residual = solution
     for p in range(len(lights)):
+        for f in range(lights.shape[1]):
+            if _is_anchored(problem, p, f):
+                lights[p, f] = problem.anchor[p, f]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
             continue
         data = _data(problem, p, views, samples, num_scale, loss, scale)
-        light, shade = np.empty((len(views), 4)), np.empty((4, len(samples)))
-        for i in range(4):
-            for f in range(len(views)):
-                light[f, i] = lights[p, views[f], i]
-            for k in range(len(samples)):
-                shade[i, k] = shading[p, i, samples[k]]
+        light, shade = _start(lights, shading, p, views, samples)
         heavy = np.empty(data.given.shape)
         residual[p] = _newton_refined(data, light, shade, heavy)
         for f in range(len(views)):
@@ -743,19 +757,12 @@ def pull_back(
     """
     for p in range(len(lights)):
         for f in range(lights.shape[1]):
-            # The light of a view without data is its anchor.
-            if problem.regularization[p, f] > 0 and not np.any(problem.weight[p, f] > 0):
-                for i in range(4):
-                    found.anchor[p, f, i] = given.lights[p, f, i]
+            if _is_anchored(problem, p, f):
+                found.anchor[p, f] = given.lights[p, f]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
             continue
         data = _data(problem, p, views, samples, num_scale, loss, scale)
-        light, shade = np.empty((len(views), 4)), np.empty((4, len(samples)))
-        for i in range(4):
-            for f in range(len(views)):
-                light[f, i] = lights[p, views[f], i]
-            for k in range(len(samples)):
-                shade[i, k] = shading[p, i, samples[k]]
+        light, shade = _start(lights, shading, p, views, samples)
         _pull_back(data, light, shade, p, views, samples, given, found)

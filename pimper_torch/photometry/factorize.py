@@ -450,12 +450,12 @@ class Factorize(Stage):
         return SOLVERS[config.solver](problem.detach(), *limits).to(dtype)
 
 
-@torch.no_grad()
 def _balanced(registered: Observations, field: LightField) -> Observations:
-    """Divide radiance by each view's gain, and guessed lights by its exposure."""
-    gain, exposure, priors = field.gain, field.exposure, registered.priors
-    if gain is None or exposure is None or bool((gain == 1).all()):
+    """Divide radiance by each view's gain, and guessed lights by its exposure: constants."""
+    priors = registered.priors
+    if field.gain is None or field.exposure is None or bool((field.gain == 1).all()):
         return registered
+    gain, exposure = field.gain.detach(), field.exposure.detach()
     if priors is not None and priors.lights_patch is not None:
         lights = priors.lights_patch / exposure[:, None].to(priors.lights_patch)
         registered = registered.replace(priors=priors.replace(lights_patch=lights))
