@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pimper_torch.kernels.arrays import Doubles1, Doubles2, Doubles3
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import eliminate
-from pimper_torch.kernels.factorization import samples_that_count
+from pimper_torch.kernels.factorization import overwrite, samples_that_count
 from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.shading_steps import frame, project
 from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
@@ -305,22 +305,16 @@ def _descent(
     image, drawn = np.empty_like(shading), np.empty((3, shading.shape[1]))
     _prior_image(data, shading, image)
     _coordinates(at, image, drawn)
-    total = 0.0
-    for a in range(3):
-        for k in range(shading.shape[1]):
-            on_samples[a, k] -= drawn[a, k]
-            total += on_samples[a, k] ** 2
+    on_samples -= drawn
     for f in range(len(lights)):
-        for i in range(4):
-            on_lights[f, i] -= data.regularization[f] * (lights[f, i] - data.anchor[f, i])
-            total += on_lights[f, i] ** 2
-    return total
+        on_lights[f] -= data.regularization[f] * (lights[f] - data.anchor[f])
+    return np.sum(on_lights**2) + np.sum(on_samples**2)
 
 
 @compiled(fast=True)
 def _prior_image(data: Data, vectors: Doubles, image: Doubles) -> None:
     """Multiply each sample's prior with its vector."""
-    image[:] = 0
+    overwrite(image, np.zeros_like(image))
     entry = 0
     for i in range(4):
         for j in range(i, 4):
@@ -477,22 +471,9 @@ def _solve(at: Point, on_lights: Doubles, on_samples: Doubles) -> bool:
             for a in range(3):
                 for k in range(num_samples):
                     inner[side, a, k] -= at.solved[row, a * num_samples + k] * step
-        for a in range(3):
-            for k in range(num_samples):
-                on_samples[side, a, k] = inner[side, a, k]
+    overwrite(on_samples[0], inner[0])
+    overwrite(on_samples[1], inner[1])
     return True
-
-
-@compiled(fast=True)
-def _scalar(one_lights: Doubles, one_samples: Doubles, lights: Doubles, samples: Doubles) -> float:
-    total = 0.0
-    for f in range(len(lights)):
-        for i in range(4):
-            total += one_lights[f, i] * lights[f, i]
-    for a in range(3):
-        for k in range(samples.shape[1]):
-            total += one_samples[a, k] * samples[a, k]
-    return total
 
 
 @compiled(fast=True)
@@ -537,15 +518,11 @@ def _corrected(
     """
     if not _solve(at, on_lights, on_samples):
         return False
-    along = _scalar(other_lights, other_samples, on_lights[0], on_samples[0])
-    remainder = 1 + _scalar(other_lights, other_samples, on_lights[1], on_samples[1])
+    along = np.sum(other_lights * on_lights[0]) + np.sum(other_samples * on_samples[0])
+    remainder = 1 + np.sum(other_lights * on_lights[1]) + np.sum(other_samples * on_samples[1])
     factor = along / remainder if remainder != 0 else 0.0
-    for f in range(on_lights.shape[1]):
-        for i in range(4):
-            on_lights[0, f, i] -= factor * on_lights[1, f, i]
-    for a in range(3):
-        for k in range(on_samples.shape[2]):
-            on_samples[0, a, k] -= factor * on_samples[1, a, k]
+    on_lights[0] -= factor * on_lights[1]
+    on_samples[0] -= factor * on_samples[1]
     return True
 
 
@@ -563,17 +540,10 @@ def _newton_refined(data: Data, lights: Doubles, shading: Doubles, weight: Doubl
         _evaluate(data, new_lights, new_shading, at)
         new_size = _descent(data, new_lights, new_shading, at, on_lights[0], on_samples[0])
         if new_size < size:
-            moved, square = 0.0, 0.0
-            for f in range(num_views):
-                for i in range(4):
-                    moved += (new_lights[f, i] - lights[f, i]) ** 2
-                    square += lights[f, i] ** 2
-                    lights[f, i] = new_lights[f, i]
-                for k in range(num_samples):
-                    weight[f, k] = data.given[f, k] * at.weight[f, k]
-            for i in range(4):
-                for k in range(num_samples):
-                    shading[i, k] = new_shading[i, k]
+            moved, square = np.sum((new_lights - lights) ** 2), np.sum(lights**2)
+            overwrite(lights, new_lights)
+            overwrite(shading, new_shading)
+            overwrite(weight, data.given * at.weight)
             first, rms = size == np.inf, at.numbers[1]
             size, fraction = new_size, min(2 * fraction, 1.0)
             if moved <= _CLOSE * _CLOSE * square and not first:
@@ -584,22 +554,15 @@ def _newton_refined(data: Data, lights: Doubles, shading: Doubles, weight: Doubl
             _pull(at.by_residual, lights, shading, at, p_lights, p_samples)
             if not _corrected(at, p_lights, p_samples, on_lights, on_samples):
                 return rms
-            way[:] = on_lights[0]
+            overwrite(way, on_lights[0])
             _ambient(at, on_samples[0], change)
         else:
             fraction /= 2
             if fraction < _SHORTEST:
                 return rms
-        for f in range(num_views):
-            for i in range(4):
-                new_lights[f, i] = lights[f, i] + fraction * way[f, i]
+        new_lights, trial = lights + fraction * way, shading + fraction * change
         for k in range(num_samples):
-            found = project(
-                shading[0, k] + fraction * change[0, k],
-                shading[1, k] + fraction * change[1, k],
-                shading[2, k] + fraction * change[2, k],
-                shading[3, k] + fraction * change[3, k],
-            )
+            found = project(trial[0, k], trial[1, k], trial[2, k], trial[3, k])
             for i in range(4):
                 new_shading[i, k] = found[i]
     return rms
@@ -634,10 +597,7 @@ def _pull_back(
             direct[f, k] = on_relative * per_width
             direct[f, k] += per_rms * data.given[f, k] * at.residual[f, k]
             total -= on_relative * relative
-    total = total / deviation if deviation > 0 else 0.0
-    for f in range(num_views):
-        for k in range(num_samples):
-            direct[f, k] += total * at.by_residual[f, k]
+    direct += (total / deviation if deviation > 0 else 0.0) * at.by_residual
     on_lights, on_samples = np.empty((2, num_views, 4)), np.empty((2, 3, num_samples))
     _pull(direct, light, shade, at, on_lights[0], on_samples[0])
     ambient, drawn = np.empty((4, num_samples)), np.empty((3, num_samples))
@@ -647,9 +607,7 @@ def _pull_back(
         for k in range(num_samples):
             ambient[i, k] = given.shading[p, i, samples[k]]
     _coordinates(at, ambient, drawn)
-    for a in range(3):
-        for k in range(num_samples):
-            on_samples[0, a, k] = drawn[a, k] - on_samples[0, a, k]
+    overwrite(on_samples[0], drawn - on_samples[0])
     q_lights, q_samples = np.empty((num_views, 4)), np.empty((3, num_samples))
     field = np.empty((num_views, num_samples))
     _by_deviation(at, field)
@@ -657,9 +615,9 @@ def _pull_back(
     _pull(at.by_residual, light, shade, at, on_lights[1], on_samples[1])
     if not _corrected(at, q_lights, q_samples, on_lights, on_samples):
         return
-    if not math.isfinite(_scalar(on_lights[0], on_samples[0], on_lights[0], on_samples[0])):
+    if not math.isfinite(np.sum(on_lights[0]) + np.sum(on_samples[0])):
         return
-    on_deviation = _scalar(q_lights, q_samples, on_lights[0], on_samples[0])
+    on_deviation = np.sum(q_lights * on_lights[0]) + np.sum(q_samples * on_samples[0])
     _ambient(at, on_samples[0], ambient)
     for f in range(num_views):
         for k in range(num_samples):
@@ -682,12 +640,7 @@ def _pull_back(
             ) + 0.5 * per_rms * (r * r - rms * rms)
         for i in range(4):
             found.anchor[p, views[f], i] = data.regularization[f] * on_lights[0, f, i]
-        found.regularization[p, views[f]] = -(
-            on_lights[0, f, 0] * (light[f, 0] - data.anchor[f, 0])
-            + on_lights[0, f, 1] * (light[f, 1] - data.anchor[f, 1])
-            + on_lights[0, f, 2] * (light[f, 2] - data.anchor[f, 2])
-            + on_lights[0, f, 3] * (light[f, 3] - data.anchor[f, 3])
-        )
+        found.regularization[p, views[f]] = np.sum(on_lights[0, f] * (data.anchor[f] - light[f]))
     entry = 0
     for i in range(4):
         for j in range(i, 4):
@@ -719,7 +672,8 @@ def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solve
     for p in range(len(lights)):
         for f in range(lights.shape[1]):
             if _is_anchored(problem, p, f):
-                lights[p, f] = problem.anchor[p, f]
+                for i in range(4):
+                    lights[p, f, i] = problem.anchor[p, f, i]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
@@ -758,7 +712,8 @@ def pull_back(
     for p in range(len(lights)):
         for f in range(lights.shape[1]):
             if _is_anchored(problem, p, f):
-                found.anchor[p, f] = given.lights[p, f]
+                for i in range(4):
+                    found.anchor[p, f, i] = given.lights[p, f, i]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:

@@ -7,7 +7,7 @@ views are float64.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -246,7 +246,7 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
             for f in range(len(lights)):
                 for i in range(4):
                     new_lights[f, i] = lights[f, i] + step[4 * f + i]
-            _overwrite(new_shading, shading)
+            overwrite(new_shading, shading)
             _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
             update_shading(patch.equations, new_shading, SHADING_STEPS)
@@ -259,8 +259,8 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
         stalled = damping > 1 / _EPS and not exact
         damping = max(damping, _EPS)
         if better:
-            _overwrite(lights, new_lights)
-            _overwrite(shading, new_shading)
+            overwrite(lights, new_lights)
+            overwrite(shading, new_shading)
             slope, new_slope, cost = new_slope, slope, after
             if patch.loss != SQUARES:
                 scale_start = _robust_weights(patch, lights, shading, scale_start)
@@ -276,7 +276,7 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
 
 
 @compiled()
-def _overwrite(target: Floats, source: Floats) -> None:
+def overwrite(target: NDArray[Any], source: NDArray[Any]) -> None:
     """Copy a matrix; assigned slices would compile a message on shapes, a second each."""
     for i in range(len(target)):
         for k in range(target.shape[1]):
