@@ -18,11 +18,6 @@ def slopes_from_normals(
     return (-normals[..., :2] / nz).clamp(-steepest, steepest)
 
 
-def normals_from_slopes(slopes: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    """Undo :func:`slopes_from_normals`: the unit normal with ``n_z < 0``."""
-    return normalize(torch.cat([slopes, -torch.ones_like(slopes[..., :1])], dim=-1), dim=-1)
-
-
 def face_normals(
     vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
 ) -> Float[Tensor, "face 3"]:

@@ -23,6 +23,8 @@ from pimper_torch.kernels.twin_constants import (
 from pimper_torch.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
 from pimper_torch.linalg.sums import along_last
 
+Scale = Annotated[float, Range(above=0, most=1e12)]
+
 
 class Loss(ABC):
     r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, by which outliers lose weight.
@@ -36,6 +38,9 @@ class Loss(ABC):
 
     scale: float
     code: ClassVar[int | None] = None
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
     @abstractmethod
     def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -71,7 +76,7 @@ class Squares(Loss):
     r"""Plain least squares, :math:`\rho = u`."""
 
     code: ClassVar[int | None] = SQUARES
-    scale: float = 1.0
+    scale: Scale = 1.0
 
     def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Return the squares themselves."""
@@ -81,25 +86,13 @@ class Squares(Loss):
         """Return 1."""
         return torch.ones_like(square)
 
-    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Return 0."""
-        return torch.zeros_like(square)
-
 
 @dataclass(frozen=True, slots=True)
-class _Robust(Loss):
-    scale: Annotated[float, Range(above=0, most=1e12)]
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
-
-
-@dataclass(frozen=True, slots=True)
-class Cauchy(_Robust):
+class Cauchy(Loss):
     r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence."""
 
     code: ClassVar[int | None] = CAUCHY
-    scale: float = CAUCHY_TUNING
+    scale: Scale = CAUCHY_TUNING
 
     def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Return the logarithm."""
@@ -109,20 +102,16 @@ class Cauchy(_Robust):
         r"""Return :math:`1 / (1 + u)`."""
         return 1 / (1 + square)
 
-    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        r"""Return :math:`-1 / (1 + u)^2`."""
-        return -1 / (1 + square).square()
-
 
 @dataclass(frozen=True, slots=True)
-class GemanMcClure(_Robust):
+class GemanMcClure(Loss):
     r"""Geman and McClure's loss, :math:`\rho = u / (1 + u)`: outliers lose all influence.
 
     Source: Geman & McClure, Bulletin of the International Statistical Institute 52(4), 1987.
     """
 
     code: ClassVar[int | None] = GEMAN_MCCLURE
-    scale: float = GEMAN_MCCLURE_TUNING
+    scale: Scale = GEMAN_MCCLURE_TUNING
 
     def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         r"""Return :math:`u / (1 + u)`."""
@@ -132,20 +121,16 @@ class GemanMcClure(_Robust):
         r"""Return :math:`1 / (1 + u)^2`."""
         return 1 / (1 + square).square()
 
-    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        r"""Return :math:`-2 / (1 + u)^3`."""
-        return -2 / (1 + square) ** 3
-
 
 @dataclass(frozen=True, slots=True)
-class Huber(_Robust):
+class Huber(Loss):
     r"""Huber's loss, :math:`\rho = u` up to 1 and :math:`2 \sqrt u - 1` beyond: convex.
 
     Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
     """
 
     code: ClassVar[int | None] = HUBER
-    scale: float = HUBER_TUNING
+    scale: Scale = HUBER_TUNING
 
     def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Return squares of small residuals, and sizes of large ones."""
@@ -154,10 +139,6 @@ class Huber(_Robust):
     def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         r"""Return 1, and :math:`1 / \sqrt u` beyond."""
         return square.clamp_min(1).rsqrt()
-
-    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        r"""Return 0, and :math:`-u^{-3/2} / 2` beyond."""
-        return torch.where(square > 1, -0.5 * square.clamp_min(1) ** -1.5, 0)
 
 
 def median_deviation(

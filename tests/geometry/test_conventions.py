@@ -2,6 +2,7 @@
 
 import pycolmap
 import torch
+from slopes import normals_from_slopes
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
@@ -14,7 +15,7 @@ from pimper_torch.geometry.pixels import (
     scale_intrinsics,
 )
 from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.geometry.surfaces import normals_from_slopes, slopes_from_normals
+from pimper_torch.geometry.surfaces import slopes_from_normals
 
 WIDTH, HEIGHT = 7, 5
 

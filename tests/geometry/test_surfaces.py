@@ -1,13 +1,13 @@
 import pytest
 import torch
 import trimesh
+from slopes import normals_from_slopes
 from torch.testing import assert_close
 
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     face_normals,
-    normals_from_slopes,
     slopes_from_normals,
     unit_face_normals,
     vertex_normals,
