@@ -32,6 +32,9 @@ _STEPS, _SHORTEST, _CLOSE = 30, 1e-3, 1e-11
 # Lorentz transformations of free lights, do not move.
 _RIDGE = 1e-10
 
+# A patch whose adjoint is larger counts as singular: products would leave the range of float32.
+_MOST = 1e25
+
 
 class Solved(NamedTuple):
     """Solutions of a batch, or derivatives by them: see ``Factors``."""
@@ -250,7 +253,7 @@ def _deviation(data: Data, at: Point) -> float:
                 at.by_residual[f, k] = ratio * r / scale / (1 + ratio * ratio) ** 2
     for f in range(len(data.given)):
         for k in range(data.num_scale):
-            at.by_residual[f, k] *= deviation / total
+            at.by_residual[f, k] *= deviation / total if total > 0 else 0.0
     return deviation
 
 
@@ -615,7 +618,7 @@ def _pull_back(
     _pull(at.by_residual, light, shade, at, on_lights[1], on_samples[1])
     if not _corrected(at, q_lights, q_samples, on_lights, on_samples):
         return
-    if not math.isfinite(np.sum(on_lights[0]) + np.sum(on_samples[0])):
+    if not np.sum(np.abs(on_lights[0])) + np.sum(np.abs(on_samples[0])) < _MOST:
         return
     on_deviation = np.sum(q_lights * on_lights[0]) + np.sum(q_samples * on_samples[0])
     _ambient(at, on_samples[0], ambient)
@@ -707,7 +710,7 @@ def pull_back(
 
     Args:
         lights: The solution, as :func:`refine` leaves it, and ``shading``.
-        found: Zero before, and after for a patch whose Hessian is singular.
+        found: Zero before, and after for a patch whose Hessian is singular, as without albedo.
     """
     for p in range(len(lights)):
         for f in range(lights.shape[1]):
