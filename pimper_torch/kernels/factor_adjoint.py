@@ -36,7 +36,7 @@ _RIDGE = 1e-10
 _MOST = 1e25
 
 
-class Solved(NamedTuple):
+class FactorSolution(NamedTuple):
     """Solutions of a batch, or derivatives by them: see ``Factors``."""
 
     lights: Doubles3
@@ -45,7 +45,7 @@ class Solved(NamedTuple):
     residual: Doubles1
 
 
-class Given(NamedTuple):
+class FactorData(NamedTuple):
     """Data of a batch, or derivatives by them: see ``Bilinear``."""
 
     radiance: Doubles3
@@ -115,7 +115,7 @@ def _views_with_data(given: Doubles) -> Integers:
 
 @compiled()
 def _data(
-    problem: Given,
+    problem: FactorData,
     p: int,
     views: Integers,
     samples: Integers,
@@ -579,8 +579,8 @@ def _pull_back(
     p: int,
     views: Integers,
     samples: Integers,
-    given: Solved,
-    found: Given,
+    given: FactorSolution,
+    found: FactorData,
 ) -> None:
     num_views, num_samples = len(views), len(samples)
     at = _point(num_views, num_samples)
@@ -656,13 +656,15 @@ def _pull_back(
 
 
 @compiled()
-def _is_anchored(problem: Given, p: int, f: int) -> bool:
+def _is_anchored(problem: FactorData, p: int, f: int) -> bool:
     """Return whether the light of a view is its anchor: without data."""
     return problem.regularization[p, f] > 0 and not np.any(problem.weight[p, f] > 0)
 
 
 @compiled(annotated=True)
-def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solved) -> None:
+def refine(
+    problem: FactorData, loss: int, scale: float, stride: int, solution: FactorSolution
+) -> None:
     """Take a batch of solutions to rest by Newton's method, and compute weights and residuals.
 
     Args:
@@ -697,14 +699,14 @@ def refine(problem: Given, loss: int, scale: float, stride: int, solution: Solve
 
 @compiled(annotated=True)
 def pull_back(
-    problem: Given,
+    problem: FactorData,
     loss: int,
     scale: float,
     stride: int,
     lights: Doubles3,
     shading: Doubles3,
-    given: Solved,
-    found: Given,
+    given: FactorSolution,
+    found: FactorData,
 ) -> None:
     """Compute derivatives by the data from those by the solution: the adjoint, at rest.
 

@@ -111,8 +111,8 @@ class _Compiled(torch.autograd.Function):
             torch.zeros_like(radiance, memory_format=torch.contiguous_format),
             radiance.new_zeros(len(radiance)),
         )
-        given = factor_adjoint.Given(*(as_array(each, torch.float64) for each in data))
-        solution = factor_adjoint.Solved(*map(as_array, found))
+        given = factor_adjoint.FactorData(*(as_array(each, torch.float64) for each in data))
+        solution = factor_adjoint.FactorSolution(*map(as_array, found))
         factor_adjoint.refine(given, code, scale, stride, solution)
         ctx.loss = code, scale, stride
         ctx.save_for_backward(*found[:2], *data)
@@ -133,14 +133,14 @@ class _Compiled(torch.autograd.Function):
         contiguous, exact = torch.contiguous_format, torch.float64
         found = [torch.zeros_like(each, dtype=exact, memory_format=contiguous) for each in data]
         factor_adjoint.pull_back(
-            factor_adjoint.Given(*(as_array(each, exact) for each in data)),
+            factor_adjoint.FactorData(*(as_array(each, exact) for each in data)),
             code,
             scale,
             stride,
             as_array(lights),
             as_array(shading),
-            factor_adjoint.Solved(*(as_array(each, exact) for each in cotangents)),
-            factor_adjoint.Given(*map(as_array, found)),
+            factor_adjoint.FactorSolution(*(as_array(each, exact) for each in cotangents)),
+            factor_adjoint.FactorData(*map(as_array, found)),
         )
         return None, None, *(each.to(data[0]) for each in found)
 

@@ -20,7 +20,7 @@ BARS = {
     "docstrings that begin with Give, Tell, Say, Mark, What or How": 0,
     "file names that occur twice or more": 0,
     "public class names that occur twice or more": 0,
-    "numeric module constants": 211,
+    "numeric module constants": 213,
 }
 
 _OPENING = re.compile(r'^ *r?"""(?:Give|Tell|Say|Mark|What|How) ', re.MULTILINE)
