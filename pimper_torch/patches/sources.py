@@ -226,17 +226,19 @@ def kernel_geometry(
     rows: Int[Tensor, " view"],
     templates: Templates,
     outward: Float[Tensor, "patch height width 3"],
+    projections: Float[Tensor, "patch view 3 4"],
 ) -> tuple[Projection, Samples]:
     """Lay cameras and samples out for kernels; pixels are computed in float64.
 
     Args:
         rows: Where each camera's photograph is among the sources.
         outward: Unit normals of the samples, patch frame.
+        projections: See :func:`image_from_patch`.
     """
-    centers = cameras.centers_world.to(torch.float64)
+    centers = cameras.to(torch.float64).centers_world
     projection = Projection(
         as_array(rows),
-        as_array(image_from_patch(cameras, templates.patch_from_world).flatten(0, 1)),
+        as_array(projections.flatten(0, 1)),
         as_array(transform(templates.patch_from_world.double(), centers).flatten(0, 1)),
     )
     samples = Samples(

@@ -66,7 +66,7 @@ def resampled(
         outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
     images, projection = sources.images, image_from_patch(cameras, templates.patch_from_world)
     inputs = images.finest, images.coarser, projection, templates.origin, templates.spacing
-    geometry = kernel_geometry(cameras, rows, templates, outward)
+    geometry = kernel_geometry(cameras, rows, templates, outward, projection)
     call = images.pictures, as_array(images.table), *geometry
     limits = as_array(cameras.sizes_px), as_array(templates.inside), min_facing, dark_level
     radiance, valid = _Resampled.apply(  # type: ignore[no-untyped-call]

@@ -136,7 +136,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
                     break
             elif (fraction := fraction / 2) < _MIN_STEP:
                 break
-        solve = _newton_matrix(model, samples, lights, albedo, fixed)
+        solve = solve or _newton_matrix(model, samples, lights, albedo, fixed)
     by_lights, by_albedo = solve(*_descent(model, samples, lights, albedo))
     return LightFit(
         model=model,

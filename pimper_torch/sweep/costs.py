@@ -14,7 +14,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.patches.sources import Sources, kernel_geometry, look_up
+from pimper_torch.patches.sources import Sources, image_from_patch, kernel_geometry, look_up
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
 
@@ -197,7 +197,13 @@ def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
 
     templates, photometry = given.templates, given.photometry
     intrinsics = given.cameras.intrinsics.double()
-    projection, samples = kernel_geometry(given.cameras, given.images, templates, given.outward)
+    projection, samples = kernel_geometry(
+        given.cameras,
+        given.images,
+        templates,
+        given.outward,
+        image_from_patch(given.cameras, templates.patch_from_world),
+    )
     lights, gains = given.lights
     shading = sweep_costs.Shading(
         as_array(photometry.normals_patch, torch.float32),
