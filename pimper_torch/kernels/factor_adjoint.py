@@ -238,7 +238,7 @@ def _deviation(data: Data, at: Point) -> float:
             if data.given[f, k] > 0:
                 squares[count] = at.residual[f, k] ** 2
                 count += 1
-    variance, scale = robust_variance(squares[:count], 0.0)
+    variance, scale = robust_variance(squares[:count], 0.0, np.float64)
     deviation = math.sqrt(variance)
     if not deviation > data.level:
         return data.level

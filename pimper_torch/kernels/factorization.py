@@ -296,7 +296,7 @@ def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: 
         for k in range(patch.num_scale):
             squares[count] = residual_row[k] * residual_row[k]
             count += given[k] > 0
-    variance, scale = robust_variance(squares[:count], start_scale)
+    variance, scale = robust_variance(squares[:count], start_scale, np.float32)
     width = patch.scale * max(math.sqrt(variance), patch.level)
     one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
     for f in range(len(lights)):

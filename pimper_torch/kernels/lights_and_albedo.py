@@ -152,7 +152,7 @@ def _scales(
         for i in range(len(left)):
             squares[count] = left[i] * left[i]
             count += visible[i] > 0
-        variance, guess[v] = robust_variance(squares[:count], guess[v])
+        variance, guess[v] = robust_variance(squares[:count], guess[v], np.float32)
         scale[v] = widen * CAUCHY_TUNING * max(math.sqrt(variance), MIN_DEVIATION * level[v])
 
 

@@ -22,7 +22,7 @@ Ten = tuple[float, float, float, float, float, float, float, float, float, float
 # Samples of a tile: a choice, two cache lines of float32 a row.
 TILE = 32
 
-# As in ``photometry.bilinear`` and ``photometry.quadratics``.
+# As in ``photometry.bilinear``, and as ``photometry.quadratics`` has it in float64.
 _ROUNDING = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
 

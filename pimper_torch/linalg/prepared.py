@@ -103,7 +103,7 @@ class PreparedMatrix(ABC):
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
+        ctx: Any,
         prepared: PreparedMatrix,
         values: Float[Tensor, " entry"],
         rhs: Float[Tensor, "unknown ..."],
@@ -115,8 +115,7 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     def backward(
-        ctx: Any,  # noqa: ANN401
-        upstream: Float[Tensor, "unknown ..."],
+        ctx: Any, upstream: Float[Tensor, "unknown ..."]
     ) -> tuple[None, Float[Tensor, " entry"] | None, Float[Tensor, "unknown ..."]]:
         values, solution = ctx.saved_tensors
         prepared: PreparedMatrix = ctx.prepared

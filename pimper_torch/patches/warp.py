@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import interpolate, normalize
@@ -16,7 +17,7 @@ from pimper_torch.failures import over_patches
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.kernels.arrays import as_array
+from pimper_torch.kernels.arrays import FractionRows, PictureRows, Projection, Samples, as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
@@ -43,6 +44,10 @@ from pimper_torch.records import (
 )
 from pimper_torch.stage import Stage
 
+_Array = NDArray[Any]
+# Arguments of the kernel.
+_Call = tuple[PictureRows, FractionRows, _Array, Projection, Samples, _Array, _Array, float, float]
+
 
 def resampled(
     cameras: Cameras,
@@ -67,10 +72,10 @@ def resampled(
     images, projection = sources.images, image_from_patch(cameras, templates.patch_from_world)
     inputs = images.finest, images.coarser, projection, templates.origin, templates.spacing
     geometry = kernel_geometry(cameras, rows, templates, outward, projection)
-    call = images.pictures, as_array(images.table), *geometry
+    call = images.pictures, sources.unusable.fractions, as_array(images.table), *geometry
     limits = as_array(cameras.sizes_px), as_array(templates.inside), min_facing, dark_level
     radiance, valid = _Resampled.apply(  # type: ignore[no-untyped-call]
-        call, (sources.unusable.fractions, *limits), *inputs, templates.depth
+        (*call, *limits), *inputs, templates.depth
     )
     return Observations(radiance=radiance, valid=valid)
 
@@ -79,33 +84,14 @@ class _Resampled(torch.autograd.Function):
     """Samples as a function of pictures and geometry, by a kernel and its adjoint."""
 
     @staticmethod
-    def forward(
-        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
-        call: tuple[Any, ...],
-        given: tuple[Any, ...],
-        *inputs: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, call: _Call, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the samples, and which of them are valid."""
         from pimper_torch.kernels import resampling
 
         finest, depth, (num_patches, num_views) = inputs[0], inputs[5], inputs[2].shape[:2]
         radiance = torch.empty(num_patches, num_views, finest.shape[1], *depth.shape[1:])
         valid = torch.empty(num_patches, num_views, *depth.shape[1:], dtype=torch.bool)
-        pictures, levels, projection, samples = call
-        unusable, sizes_px, inside, min_facing, dark_level = given
-        resampling.register(
-            pictures,
-            unusable,
-            levels,
-            projection,
-            samples,
-            sizes_px,
-            inside,
-            min_facing,
-            dark_level,
-            as_array(radiance),
-            as_array(valid),
-        )
+        resampling.register(*call, as_array(radiance), as_array(valid))
         ctx.call = call
         ctx.save_for_backward(valid, *inputs)
         ctx.mark_non_differentiable(valid)
@@ -113,23 +99,19 @@ class _Resampled(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any,  # noqa: ANN401
-        on_radiance: Tensor,
-        _: Tensor,
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of pictures and geometry."""
         from pimper_torch.kernels import resampling_adjoint
 
         valid, *inputs = ctx.saved_tensors
         # Pictures take memory: they have no gradient where none is asked for.
-        of_pictures = any(ctx.needs_input_grad[2:4])
+        of_pictures = any(ctx.needs_input_grad[1:3])
         shapes = [(1, 1)] * 2 if not of_pictures else [each.shape for each in inputs[:2]]
         kinds = [torch.float32] * 2 + [torch.float64] * 3 + [torch.float32]
         shapes += [each.shape for each in inputs[2:]]
         found = [torch.zeros(shape, dtype=kind) for shape, kind in zip(shapes, kinds, strict=True)]
         finest, coarser, projection, *others = found
-        pictures, levels, placed, samples = ctx.call
+        pictures, _, levels, placed, samples, *_ = ctx.call
         resampling_adjoint.pull_back(
             pictures,
             levels,
@@ -146,7 +128,7 @@ class _Resampled(torch.autograd.Function):
             ),
         )
         given = [one.to(each) for one, each in zip(found, inputs, strict=True)]
-        return None, None, *(given if of_pictures else [None, None, *given[2:]])
+        return None, *(given if of_pictures else [None, None, *given[2:]])
 
 
 def occluded(

@@ -79,6 +79,17 @@ class Bilinear(Record):
         data = (self.radiance, self.weight, self.anchor, self.regularization, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
+    @property
+    def has_kernel(self) -> bool:
+        """Whether compiled kernels know its manifold and loss."""
+        return isinstance(self.manifold, Cone) and self.loss.code is not None
+
+    @property
+    def dense_prior(self) -> Float[Tensor, "patch packed sample"]:
+        """``P``, zero where there is none, as kernels take it."""
+        patches, _, samples = self.radiance.shape
+        return self.radiance.new_zeros(patches, 10, samples) if self.prior is None else self.prior
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Factors(Record):

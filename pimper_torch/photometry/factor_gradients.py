@@ -29,7 +29,6 @@ from pimper_torch.photometry.bilinear import (
     robust_weights,
     root_mean_square,
 )
-from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.quadratics import (
     apply_packed,
     combination,
@@ -63,13 +62,10 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     the solver is compiled, so are refinement and adjoint
     (:mod:`~pimper_torch.kernels.factor_adjoint`), which is differentiable once.
     """
-    if compiled_for(problem.radiance.detach()) and _has_kernel(problem):
-        prior = problem.prior
-        if prior is None:
-            prior = problem.radiance.new_zeros(len(problem.radiance), 10, problem.radiance.shape[2])
-        data = problem.radiance, problem.weight, problem.anchor, problem.regularization, prior
+    if problem.has_kernel and compiled_for(problem.radiance.detach()):
+        data = problem.radiance, problem.weight, problem.anchor, problem.regularization
         lights, shading, weight, residual = _Compiled.apply(  # type: ignore[no-untyped-call]
-            problem.detach(), factors, *data
+            problem.detach(), factors, *data, problem.dense_prior
         )
         convergence = factors.convergence.replace(residual=residual)
         return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
@@ -94,10 +90,7 @@ class _Compiled(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401 - saved tensors and more
-        problem: Bilinear,
-        factors: Factors,
-        *data: Tensor,
+        ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Refine the solution; return lights, shading, weights and residuals."""
         from pimper_torch.kernels import factor_adjoint
@@ -121,10 +114,7 @@ class _Compiled(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any,  # noqa: ANN401
-        *cotangents: Tensor,
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         """Return gradients of the data."""
         from pimper_torch.kernels import factor_adjoint
 
@@ -143,10 +133,6 @@ class _Compiled(torch.autograd.Function):
             factor_adjoint.FactorData(*map(as_array, found)),
         )
         return None, None, *(each.to(data[0]) for each in found)
-
-
-def _has_kernel(problem: Bilinear) -> bool:
-    return isinstance(problem.manifold, Cone) and problem.loss.code is not None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

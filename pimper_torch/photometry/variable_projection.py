@@ -43,7 +43,6 @@ from pimper_torch.photometry.bilinear import (
     robust_weights,
     update_shading,
 )
-from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, StopCause
@@ -87,7 +86,8 @@ def solve_variable_projection(
     solved by a compiled kernel (:mod:`pimper_torch.kernels.factorization`), with the same result
     up to rounding; there, samples without weight keep their initial values.
     """
-    if _has_kernel(problem):
+    kernel = problem.has_kernel and problem.radiance.dtype == torch.float32
+    if kernel and compiled_for(problem.radiance):
         return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
@@ -261,16 +261,6 @@ def _is_free(problem: Bilinear) -> bool:
     return problem.manifold.flat and not bool((problem.regularization > 0).any())
 
 
-def _has_kernel(problem: Bilinear) -> bool:
-    """Return whether the compiled kernel applies: first-order light in float32, a loss it knows."""
-    return (
-        compiled_for(problem.radiance)
-        and problem.radiance.dtype == torch.float32
-        and isinstance(problem.manifold, Cone)
-        and problem.loss.code is not None
-    )
-
-
 def _solve_by_kernel(
     problem: Bilinear,
     max_iterations: int,
@@ -280,10 +270,8 @@ def _solve_by_kernel(
 ) -> Factors:
     from pimper_torch.kernels import factorization
 
-    J, prior, code = problem.radiance, problem.prior, problem.loss.code
+    J, code = problem.radiance, problem.loss.code
     assert code is not None  # the caller asks
-    if prior is None:
-        prior = J.new_zeros(len(J), 10, J.shape[2])
     lights, shading = (
         each.detach().clone(memory_format=torch.contiguous_format)
         for each in (problem.lights, problem.shading)
@@ -291,7 +279,7 @@ def _solve_by_kernel(
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
-    data = J, problem.weight, problem.anchor, problem.regularization, prior
+    data = J, problem.weight, problem.anchor, problem.regularization, problem.dense_prior
     results = lights, shading, weight, taken, residual, cause
     factorization.solve_on_cone(
         factorization.ConeProblem(*map(as_array, data)),

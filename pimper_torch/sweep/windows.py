@@ -42,9 +42,7 @@ class _Blurred(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,  # noqa: ANN401 - torch gives contexts no usable type
-        flat: Float[Tensor, "item 1 height width"],
-        kernel: Float[Tensor, " tap"],
+        ctx: Any, flat: Float[Tensor, "item 1 height width"], kernel: Float[Tensor, " tap"]
     ) -> Float[Tensor, "item 1 height width"]:
         """Sum along columns, then along rows."""
         ctx.save_for_backward(kernel)
@@ -54,8 +52,7 @@ class _Blurred(torch.autograd.Function):
 
     @staticmethod
     def backward(
-        ctx: Any,  # noqa: ANN401
-        upstream: Float[Tensor, "item 1 height width"],
+        ctx: Any, upstream: Float[Tensor, "item 1 height width"]
     ) -> tuple[Float[Tensor, "item 1 height width"], None]:
         """Sum the gradients in the same way."""
         return _Blurred.apply(upstream, *ctx.saved_tensors), None  # type: ignore[no-untyped-call]
