@@ -71,6 +71,22 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
         assert (bucket.confidence <= 1).all()
 
 
+@pytest.mark.parametrize("loss", factorize.LOSSES)
+def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
+    true = scene(bumps=0.2)
+    config = FactorizeConfig(loss=loss, geometry_weight=0.0)
+    first, *others = true.seen.to(torch.float32).buckets
+    radiance = first.radiance.clone().requires_grad_()
+    seen = true.seen.to(torch.float32)
+    seen = seen.replace(buckets=(first.replace(radiance=radiance), *others))
+    found = Factorize(config)(seen)
+    assert median_error(found, true) < 3  # of a start 10 degrees off
+    total = sum(bucket.albedo.square().sum() for bucket in found.buckets)
+    (slope,) = torch.autograd.grad(total, radiance)
+    assert slope.isfinite().all()
+    assert slope.any()
+
+
 def test_the_published_method_stays_at_the_ambiguity_of_its_start(scene):
     true = scene(bumps=0.3)
     paper = load_config("paper").factorize

@@ -107,3 +107,36 @@ def test_gradients_of_lights_that_are_fitted_in_groups_are_those_of_differences(
     step = 1e-4
     difference = (told(step)[0] - told(-step)[0]).detach() / (2 * step)
     assert_close((gradient * change).sum(), difference, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("model", ["soft", "point_light"])
+def test_gradients_of_a_light_field_are_those_of_differences(generator, model):
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    normals = normalize(draw(300, 3), dim=1)
+    points = normals + 0.1 * draw(300, 3)
+    away = 4 * normalize(draw(6, 3), dim=1) - points[:, None]
+    facing = (normals[:, None] * away).sum(dim=2).clamp_min(0) / away.norm(dim=2) ** 3
+    albedo = 0.3 + torch.rand(300, generator=generator, dtype=torch.float64)
+    radiance = albedo[:, None] * (0.02 + 10 * facing) + 0.003 * draw(300, 6)
+    seen = torch.rand(radiance.shape, generator=generator) < 0.8
+    weights = draw(6, 9), draw(6, 3), draw(6)
+    data = {"radiance": radiance, "normals": normals, "points": points}
+
+    def told(values):
+        leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+        field = fit_light_field(seen=seen, model=model, **leaves)
+        parts = field.soft, field.point_light, field.closeness
+        total = sum((a * b).sum() for a, b in zip(weights, parts, strict=True))
+        return total, leaves
+
+    total, leaves = told(data)
+    slopes = dict(zip(data, torch.autograd.grad(total, leaves.values()), strict=True))
+    step = 1e-6
+    for name, value in data.items():
+        way = draw(*value.shape)
+        ends = [told(data | {name: value + sign * step * way})[0].detach() for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / (2 * step)
+        # Central differences leave six digits.
+        assert_close((slopes[name] * way).sum(), expected, rtol=1e-5, atol=1e-6)
