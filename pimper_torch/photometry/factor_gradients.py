@@ -12,6 +12,7 @@ eliminated, as in :mod:`~pimper_torch.photometry.variable_projection`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -36,7 +37,7 @@ from pimper_torch.photometry.quadratics import (
     outer,
     unpacked,
 )
-from pimper_torch.photometry.robust import Squares
+from pimper_torch.photometry.robust import Squares, with_slope
 from pimper_torch.records import Record
 
 # The step of the lights, over these, that ends Newton's method: a choice.
@@ -245,14 +246,9 @@ def _by_deviation(
 ]:
     """Return the deviation's derivatives by the residuals, and the gradient's by the deviation."""
     residual = problem.radiance.double() - hessian.lights @ hessian.shading
-    with torch.enable_grad():
-        at = residual.detach().requires_grad_()
-        deviation = residual_deviation(problem, at)
-        deviation_slope = torch.zeros_like(at)
-        if deviation.requires_grad:
-            (deviation_slope,) = torch.autograd.grad(deviation.sum(), at)
+    deviation, deviation_slope = with_slope(partial(residual_deviation, problem), residual)
     # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
-    deviation = deviation.detach()[:, None, None].clamp_min(1e-300)
+    deviation = deviation[:, None, None].clamp_min(1e-300)
     weighted_residual = (hessian.weighted_residual - hessian.loss_curvature * residual) / deviation
     return deviation_slope, (
         weighted_residual @ hessian.shading.mT,

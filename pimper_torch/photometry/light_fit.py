@@ -15,6 +15,7 @@ from torch.nn.functional import pad
 
 from pimper_torch.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
+from pimper_torch.photometry.robust import with_slope
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's
@@ -187,13 +188,8 @@ def _newton_matrix(
     num_views, size = lights.shape
     shading, jacobian = model.shade(lights), model.jacobian(lights)
     residual = samples.residual(albedo, shading)
-    with torch.enable_grad():
-        at = residual.detach().requires_grad_()
-        scale = samples.scale(at)
-        by_residual = torch.zeros_like(at)
-        if scale.requires_grad:
-            (by_residual,) = torch.autograd.grad(scale.sum(), at)
-    weight, scale = samples.weights(residual, scale.detach()), scale.detach()
+    scale, by_residual = with_slope(samples.scale, residual)
+    weight = samples.weights(residual, scale)
     weighted, bend = weight * residual, weight * (2 * weight - 1)
     slope = albedo[:, None, None] * jacobian
     blocks = (bend[..., None] * slope).permute(1, 2, 0) @ slope.transpose(0, 1)

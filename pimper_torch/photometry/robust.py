@@ -1,6 +1,7 @@
 """Robust losses, and robust estimates of scale."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -52,10 +53,7 @@ class Loss(ABC):
 
     def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Return the derivative of :meth:`weight`, by autograd."""
-        with torch.enable_grad():
-            at = square.detach().requires_grad_()
-            (found,) = torch.autograd.grad((self.weight(at) + 0 * at).sum(), at)
-        return found
+        return with_slope(self.weight, square)[1]
 
     def weights(
         self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
@@ -139,6 +137,20 @@ class Huber(Loss):
     def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         r"""Return 1, and :math:`1 / \sqrt u` beyond."""
         return square.clamp_min(1).rsqrt()
+
+
+def with_slope(
+    function: Callable[[Float[Tensor, "*batch"]], Float[Tensor, "..."]],
+    at: Float[Tensor, "*batch"],
+) -> tuple[Float[Tensor, "..."], Float[Tensor, "*batch"]]:
+    """Return a function's values and the derivative of their sum, both constant to autograd."""
+    with torch.enable_grad():
+        at = at.detach().requires_grad_()
+        found = function(at)
+        if not found.requires_grad:
+            return found, torch.zeros_like(at)
+        (slope,) = torch.autograd.grad(found.sum(), at)
+    return found.detach(), slope
 
 
 def median_deviation(
