@@ -64,11 +64,11 @@ def tracked(arguments: Any) -> tuple[Any, list[Tensor]]:  # noqa: ANN401 - recor
 def pulled_back(result: Any, inputs: list[Tensor]) -> list[Tensor]:  # noqa: ANN401
     """Return the gradients of the sum of squares of all finite values that a stage gives."""
     leaves = [leaf for leaf in pytree.tree_leaves(result) if isinstance(leaf, Tensor)]
-    finite = [leaf[leaf.isfinite()] for leaf in leaves if leaf.requires_grad]
-    total = sum(leaf.square().sum() for leaf in finite if leaf.numel())
-    if not isinstance(total, Tensor):
+    tracked = [leaf for leaf in leaves if leaf.requires_grad]
+    if not tracked:
         return []  # constants to autograd
-    found = torch.autograd.grad(total, inputs, allow_unused=True)
+    sides = [torch.where(leaf.isfinite(), 2 * leaf, 0).detach() for leaf in tracked]
+    found = torch.autograd.grad(tracked, inputs, sides, allow_unused=True)
     return [slope for slope in found if slope is not None]
 
 
@@ -93,8 +93,9 @@ def peak_gigabytes() -> float:
 def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Cost:
     """Measure a stage."""
 
+    given, inputs = tracked(arguments)
+
     def with_gradients() -> list[Tensor]:
-        given, inputs = tracked(arguments)
         return pulled_back(stage(*given), inputs)
 
     stage(*arguments)  # loads kernels
