@@ -1,5 +1,6 @@
 """Tensors as contiguous arrays on the CPU, and records of arrays that kernels take."""
 
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ Floats5 = Annotated[NDArray[Any], "float32[:,:,:,:,::1]"]
 Doubles1 = Annotated[NDArray[Any], "float64[::1]"]
 Doubles2 = Annotated[NDArray[Any], "float64[:,::1]"]
 Doubles3 = Annotated[NDArray[Any], "float64[:,:,::1]"]
+Doubles4 = Annotated[NDArray[Any], "float64[:,:,:,::1]"]
 Integers1 = Annotated[NDArray[Any], "int64[::1]"]
 Integers2 = Annotated[NDArray[Any], "int64[:,::1]"]
 Bytes2 = Annotated[NDArray[Any], "uint8[:,::1]"]
@@ -61,3 +63,22 @@ class Samples(NamedTuple):
 def as_array(values: Tensor, dtype: torch.dtype | None = None) -> NDArray[Any]:
     """Share a tensor's memory if it has the type and is contiguous on the CPU, else copy it."""
     return values.detach().to("cpu", dtype).contiguous().numpy()
+
+
+def pulled_back(
+    adjoint: Callable[..., None], inputs: Sequence[Tensor], of_pictures: bool
+) -> list[Tensor | None]:
+    """Return the gradients that an adjoint adds up.
+
+    Args:
+        adjoint: Adds to arrays of the shapes of ``inputs``.
+        inputs: The finest level of pictures, the coarser ones, and what else was given.
+        of_pictures: Whether gradients of pictures are wanted; they take memory. The adjoint gets
+            arrays of one pixel where not.
+    """
+    shapes = [each.shape if of_pictures else (1, 1) for each in inputs[:2]]
+    found = [torch.zeros(shape) for shape in shapes]
+    found += [torch.zeros(each.shape, dtype=torch.float64) for each in inputs[2:]]
+    adjoint(*map(as_array, found))
+    pictures = found[:2] if of_pictures else [None, None]
+    return [*pictures, *(one.to(each) for one, each in zip(found[2:], inputs[2:], strict=True))]

@@ -38,7 +38,7 @@ SURFACE = (
 )
 
 # Of gradients alone: compiled where a run first asks for them.
-GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint")
+GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_adjoint")
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.

@@ -10,7 +10,6 @@ from pimper_torch.kernels.arrays import (
     Doubles2,
     Doubles3,
     Floats2,
-    Floats3,
     Floats5,
     Integers2,
     Masks4,
@@ -32,7 +31,7 @@ class ViewGradients(NamedTuple):
     image_from_patch: Doubles3
     origin: Doubles2
     spacing: Doubles1
-    depth: Floats3
+    depth: Doubles3
 
 
 @compiled(annotated=True)

@@ -221,12 +221,19 @@ def image_from_patch(
     return image_from_world @ invert_rigid(patch_from_world.double())[:, None]
 
 
+def centers_in_patches(
+    cameras: Cameras, patch_from_world: Float[Tensor, "patch 4 4"]
+) -> Float[Tensor, "patch view 3"]:
+    """Return centres of cameras in the frames of patches, in float64; differentiable."""
+    return transform(patch_from_world.double(), cameras.to(torch.float64).centers_world)
+
+
 def kernel_geometry(
-    cameras: Cameras,
     rows: Int[Tensor, " view"],
     templates: Templates,
     outward: Float[Tensor, "patch height width 3"],
     projections: Float[Tensor, "patch view 3 4"],
+    centers: Float[Tensor, "patch view 3"],
 ) -> tuple[Projection, Samples]:
     """Lay cameras and samples out for kernels; pixels are computed in float64.
 
@@ -234,12 +241,10 @@ def kernel_geometry(
         rows: Where each camera's photograph is among the sources.
         outward: Unit normals of the samples, patch frame.
         projections: See :func:`image_from_patch`.
+        centers: See :func:`centers_in_patches`.
     """
-    centers = cameras.to(torch.float64).centers_world
     projection = Projection(
-        as_array(rows),
-        as_array(projections.flatten(0, 1)),
-        as_array(transform(templates.patch_from_world.double(), centers).flatten(0, 1)),
+        as_array(rows), as_array(projections.flatten(0, 1)), as_array(centers.flatten(0, 1))
     )
     samples = Samples(
         as_array(templates.origin, torch.float64),

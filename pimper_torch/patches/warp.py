@@ -17,7 +17,14 @@ from pimper_torch.failures import over_patches
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.kernels.arrays import FractionRows, PictureRows, Projection, Samples, as_array
+from pimper_torch.kernels.arrays import (
+    FractionRows,
+    PictureRows,
+    Projection,
+    Samples,
+    as_array,
+    pulled_back,
+)
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
@@ -25,6 +32,7 @@ from pimper_torch.patches.sources import (
     LEVELS,
     PriorMaps,
     Sources,
+    centers_in_patches,
     image_from_patch,
     kernel_geometry,
     look_up,
@@ -70,12 +78,19 @@ def resampled(
     if outward is None:
         outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
     images, projection = sources.images, image_from_patch(cameras, templates.patch_from_world)
-    inputs = images.finest, images.coarser, projection, templates.origin, templates.spacing
-    geometry = kernel_geometry(cameras, rows, templates, outward, projection)
+    centers = centers_in_patches(cameras, templates.patch_from_world)
+    geometry = kernel_geometry(rows, templates, outward, projection, centers)
     call = images.pictures, sources.unusable.fractions, as_array(images.table), *geometry
     limits = as_array(cameras.sizes_px), as_array(templates.inside), min_facing, dark_level
     radiance, valid = _Resampled.apply(  # type: ignore[no-untyped-call]
-        (*call, *limits), *inputs, templates.depth
+        (*call, *limits),
+        images.finest.shape[1],
+        images.finest.flatten(1),
+        images.coarser,
+        projection.flatten(0, 1),
+        templates.origin,
+        templates.spacing,
+        templates.depth,
     )
     return Observations(radiance=radiance, valid=valid)
 
@@ -84,13 +99,14 @@ class _Resampled(torch.autograd.Function):
     """Samples as a function of pictures and geometry, by a kernel and its adjoint."""
 
     @staticmethod
-    def forward(ctx: Any, call: _Call, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, call: _Call, channels: int, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the samples, and which of them are valid."""
         from pimper_torch.kernels import resampling
 
-        finest, depth, (num_patches, num_views) = inputs[0], inputs[5], inputs[2].shape[:2]
-        radiance = torch.empty(num_patches, num_views, finest.shape[1], *depth.shape[1:])
-        valid = torch.empty(num_patches, num_views, *depth.shape[1:], dtype=torch.bool)
+        projection, depth = call[3], inputs[-1]
+        num_patches, *raster = depth.shape
+        radiance = torch.empty(num_patches, len(projection.rows), channels, *raster)
+        valid = torch.empty(num_patches, len(projection.rows), *raster, dtype=torch.bool)
         resampling.register(*call, as_array(radiance), as_array(valid))
         ctx.call = call
         ctx.save_for_backward(valid, *inputs)
@@ -101,34 +117,17 @@ class _Resampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of pictures and geometry."""
-        from pimper_torch.kernels import resampling_adjoint
+        from pimper_torch.kernels import resampling_adjoint as adjoint
 
         valid, *inputs = ctx.saved_tensors
-        # Pictures take memory: they have no gradient where none is asked for.
-        of_pictures = any(ctx.needs_input_grad[1:3])
-        shapes = [(1, 1)] * 2 if not of_pictures else [each.shape for each in inputs[:2]]
-        kinds = [torch.float32] * 2 + [torch.float64] * 3 + [torch.float32]
-        shapes += [each.shape for each in inputs[2:]]
-        found = [torch.zeros(shape, dtype=kind) for shape, kind in zip(shapes, kinds, strict=True)]
-        finest, coarser, projection, *others = found
-        pictures, _, levels, placed, samples, *_ = ctx.call
-        resampling_adjoint.pull_back(
-            pictures,
-            levels,
-            placed,
-            samples,
-            as_array(valid),
-            as_array(on_radiance),
-            int(of_pictures),
-            resampling_adjoint.ViewGradients(
-                as_array(finest.flatten(1)),
-                as_array(coarser),
-                as_array(projection.flatten(0, 1)),
-                *map(as_array, others),
-            ),
-        )
-        given = [one.to(each) for one, each in zip(found, inputs, strict=True)]
-        return None, *(given if of_pictures else [None, None, *given[2:]])
+        pictures, _, levels, projection, samples, *_ = ctx.call
+        call = pictures, levels, projection, samples, as_array(valid), as_array(on_radiance)
+        of_pictures = any(ctx.needs_input_grad[2:4])
+
+        def add_to(*found: _Array) -> None:
+            adjoint.pull_back(*call, int(of_pictures), adjoint.ViewGradients(*found))
+
+        return None, None, *pulled_back(add_to, inputs, of_pictures)
 
 
 def occluded(

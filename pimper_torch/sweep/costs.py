@@ -1,21 +1,33 @@
 """Costs of a bucket's samples at all heights, under the fitted light.
 
-Without gradients on the CPU a kernel computes them; the torch functions here are its reference.
+On the CPU a kernel computes them in float32, and its adjoint the gradients; the torch functions
+here are its reference.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.kernels.arrays import as_array
+from pimper_torch.kernels.arrays import PictureRows, Projection, Samples, as_array, pulled_back
 from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.patches.sources import Sources, image_from_patch, kernel_geometry, look_up
+from pimper_torch.patches.sources import (
+    Sources,
+    centers_in_patches,
+    image_from_patch,
+    kernel_geometry,
+    look_up,
+)
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
+
+_Array = NDArray[Any]
 
 
 def inconsistency(
@@ -158,6 +170,11 @@ class Hypotheses(Record):
         return lights * gains[..., None], gains
 
 
+if TYPE_CHECKING:
+    from pimper_torch.kernels.sweep_costs import Shading, Trial
+
+    _Call = tuple[PictureRows, _Array, Projection, _Array, Samples, Shading, Trial]
+
 Costs = tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]
 
 
@@ -168,25 +185,14 @@ def costs_of(given: Hypotheses, num_views: int, min_views: int) -> Costs:
         num_views: Largest number of views that a sample is compared in.
         min_views: Least number of them for a sample that is swept.
     """
-    gray, templates, photometry = given.sources.gray.finest, given.templates, given.photometry
-    fast = gray.dtype == torch.float32 and compiled_for(
-        gray,
-        given.cameras.cam_from_world,
-        given.cameras.intrinsics,
-        templates.depth,
-        templates.patch_from_world,
-        given.outward,
-        photometry.normals_patch,
-        photometry.lights_patch,
-        photometry.convergence.residual,
-    )
-    if fast:
+    gray = given.sources.gray.finest
+    if gray.dtype == torch.float32 and compiled_for(gray.detach()):
         return _compiled_costs(given, num_views, min_views)
     samples = _compared(given, num_views, min_views)
     cost = inconsistency(
         _look_up(given, samples), samples.shading, samples.seen, given.scale[samples.patch]
     )
-    raster = templates.depth
+    raster = given.templates.depth
     flat = cost.new_zeros(raster.numel(), cost.shape[1]).index_copy(0, samples.index, cost)
     swept = torch.zeros_like(raster).flatten().index_fill(0, samples.index, 1.0)
     return flat.reshape(*raster.shape, -1).movedim(-1, 1), swept.reshape(raster.shape)
@@ -195,21 +201,13 @@ def costs_of(given: Hypotheses, num_views: int, min_views: int) -> Costs:
 def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
     from pimper_torch.kernels import sweep_costs
 
-    templates, photometry = given.templates, given.photometry
+    templates, photometry, gray = given.templates, given.photometry, given.sources.gray
+    to_patches = given.cameras, templates.patch_from_world
+    projection, centers = image_from_patch(*to_patches), centers_in_patches(*to_patches)
     intrinsics = given.cameras.intrinsics.double()
-    projection, samples = kernel_geometry(
-        given.cameras,
-        given.images,
-        templates,
-        given.outward,
-        image_from_patch(given.cameras, templates.patch_from_world),
-    )
-    lights, gains = given.lights
-    shading = sweep_costs.Shading(
-        as_array(photometry.normals_patch, torch.float32),
-        as_array(lights, torch.float32),
-        as_array(gains, torch.float32),
-    )
+    focals = (intrinsics[:, 0, 0] * intrinsics[:, 1, 1]).sqrt()
+    placed, samples = kernel_geometry(given.images, templates, given.outward, projection, centers)
+    light = photometry.normals_patch, *given.lights
     trial = sweep_costs.Trial(
         as_array(photometry.observed & templates.inside),
         as_array(given.registered.valid),
@@ -220,21 +218,57 @@ def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
         min_views,
         _MIN_FACING,
     )
-    shape = templates.depth.shape
-    cost = torch.zeros(shape[0], len(given.ladder), *shape[1:])
-    swept = torch.zeros(shape)
-    sweep_costs.costs(
-        given.sources.gray.pictures,
-        as_array(given.sources.gray.table),
-        projection,
-        as_array((intrinsics[:, 0, 0] * intrinsics[:, 1, 1]).sqrt()),
-        samples,
-        shading,
-        trial,
-        as_array(cost),
-        as_array(swept),
+    shading = sweep_costs.Shading(*(as_array(each, torch.float32) for each in light))
+    call = gray.pictures, as_array(gray.table), placed, as_array(focals), samples, shading, trial
+    cost, swept = _Compiled.apply(  # type: ignore[no-untyped-call]
+        call,
+        gray.finest.flatten(1),
+        gray.coarser,
+        projection.flatten(0, 1),
+        centers.flatten(0, 1),
+        focals,
+        templates.origin,
+        templates.spacing,
+        templates.depth,
+        given.outward,
+        *light,
+        given.scale,
     )
     return cost.to(templates.depth), swept.to(templates.depth)
+
+
+class _Compiled(torch.autograd.Function):
+    """Costs as a function of pictures, geometry and light, by a kernel and its adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, call: "_Call", *inputs: Tensor) -> Costs:
+        """Return the costs, and which samples are swept."""
+        from pimper_torch.kernels import sweep_costs
+
+        trial = call[-1]
+        num_patches, _, *raster = trial.valid.shape
+        cost = torch.zeros(num_patches, len(trial.ladder), *raster)
+        swept = torch.zeros(num_patches, *raster)
+        sweep_costs.costs(*call, as_array(cost), as_array(swept))
+        ctx.call = call
+        ctx.save_for_backward(*inputs)
+        ctx.mark_non_differentiable(swept)
+        return cost, swept
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_cost: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Return gradients of pictures, geometry and light."""
+        from pimper_torch.kernels import sweep_adjoint as adjoint
+
+        of_pictures = any(ctx.needs_input_grad[1:3])
+
+        def add_to(*found: _Array) -> None:
+            call: _Call = ctx.call
+            drawn = as_array(on_cost), int(of_pictures)
+            adjoint.pull_back(*call, *drawn, adjoint.CostGradients(*found))
+
+        return None, *pulled_back(add_to, ctx.saved_tensors, of_pictures)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -7,6 +7,7 @@ from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.patches.sources import prepare
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.records import Mesh
+from pimper_torch.sweep.costs import Hypotheses, costs_of
 from pimper_torch.sweep.sweep import Sweep
 
 
@@ -132,6 +133,68 @@ def test_heights_are_swept_as_in_torch(photographed):
         assert torch.equal(one.num_views, other.num_views)
 
 
+def hypotheses(views, cameras, lifted, coarser):
+    """What a bucket is swept on, and the leaves of its gradients."""
+    bucket, photometry = lifted.seen.patches.buckets[0], lifted.photometric.buckets[0]
+    generator = torch.Generator().manual_seed(3)
+    drawn = torch.rand(photometry.lights_patch.shape[:2], generator=generator)
+    given = {
+        "images": views.images,
+        "cam_from_world": cameras.cam_from_world,
+        "intrinsics": cameras.intrinsics,
+        "depth": height_field(bucket),
+        "spacing": coarser * bucket.spacing,
+        "origin": bucket.origin,
+        "turned": torch.zeros_like(bucket.patch_from_world),
+        "outward": photometry.normals_patch + 0.1,
+        "normals": photometry.normals_patch,
+        "lights": photometry.lights_patch,
+        "exposure": 0.8 + 0.4 * drawn,
+        "scale": 0.02 + 0.01 * torch.rand(len(bucket.depth), generator=generator),
+    }
+    leaves = {name: each.detach().clone().requires_grad_() for name, each in given.items()}
+    turned = torch.matrix_exp(leaves["turned"] - leaves["turned"].mT)[:, :3]
+    rigid = torch.cat([turned @ bucket.patch_from_world, bucket.patch_from_world[:, 3:]], dim=1)
+    placed = {name: leaves[name] for name in ("depth", "spacing", "origin")}
+    found = Hypotheses(
+        templates=bucket.replace(patch_from_world=rigid, **placed),
+        registered=lifted.seen.buckets[0],
+        photometry=photometry.replace(
+            normals_patch=leaves["normals"],
+            lights_patch=leaves["lights"],
+            exposure=leaves["exposure"],
+        ),
+        outward=torch.nn.functional.normalize(leaves["outward"], dim=-1),
+        cameras=cameras.replace(**{n: leaves[n] for n in ("cam_from_world", "intrinsics")}),
+        sources=prepare(views.replace(images=leaves["images"])),
+        images=torch.arange(cameras.num_views),
+        poses=None,
+        ladder=torch.arange(-3, 4.0),
+        scale=leaves["scale"],
+    )
+    return found, leaves
+
+
+@pytest.mark.parametrize("coarser", [1.0, 2.5])
+def test_costs_of_heights_and_their_gradients_are_those_of_torch(photographed, coarser):
+    views, cameras, lifted = photographed
+    found = []
+    for how in ("numba", "torch"):
+        given, leaves = hypotheses(views, cameras, lifted, coarser)
+        with using(how):
+            cost, swept = costs_of(given, num_views=6, min_views=3)
+        probes = torch.randn(cost.shape, generator=torch.Generator().manual_seed(5))
+        slopes = torch.autograd.grad((probes * cost).sum(), [*leaves.values()])
+        found.append((cost, swept, dict(zip(leaves, slopes, strict=True))))
+    (one, own, kernel), (other, wanted, reference) = found
+    assert own.any()
+    assert torch.equal(own, wanted)
+    assert_close(one, other, rtol=0, atol=1e-5 * float(other.detach().max()))
+    for name, slope in reference.items():
+        off = float((kernel[name] - slope).norm() / slope.norm())
+        assert off < 1e-4, name
+
+
 def test_buckets_by_themselves_give_what_all_give_together(photographed):
     views, cameras, lifted = photographed
     patches, warp, sweep = lifted.seen.patches, Warp(), Sweep()
@@ -145,7 +208,7 @@ def test_buckets_by_themselves_give_what_all_give_together(photographed):
         photometric = lifted.photometric.replace(
             patches=part, buckets=(lifted.photometric.buckets[place],)
         )
-        before = lifted.seen.replace(patches=part, buckets=(lifted.seen.buckets[place],))
+        before = lifted.seen.replace(patches=part, buckets=(lifted.seen.buckets[0],))
         (found,) = sweep(views, cameras, before, photometric, sources).buckets
         assert torch.equal(found.offset, swept.buckets[place].offset)
 
