@@ -5,8 +5,8 @@
 SCENE is a folder of `pimper render`; cameras and masks are true. Each stage is called with what the
 chain hands it in its last pass: without gradients, then with gradients of all its results (the sum
 of their squares) by all tensors that it is handed. Seconds are of the clock, the better of two
-calls; memory is what the process grows by during the call, at most, where Linux tells. Gradients
-that are not finite are counted.
+calls; memory is what the process grows by during the call, at most, where Linux tells, and what it
+then takes in all. Gradients that are not finite are counted.
 """
 
 import argparse
@@ -37,6 +37,7 @@ class Cost:
 
     seconds: tuple[float, float]
     gigabytes: tuple[float, float]
+    in_all: tuple[float, float]
     not_finite: int
     gradients: int
 
@@ -44,6 +45,8 @@ class Cost:
         """Return a row of the table."""
         (plain, tracked), (least, most) = self.seconds, self.gigabytes
         cells = [name, f"{plain:.2f}", f"{tracked:.2f}", f"{tracked / plain:.1f}"]
+        cells += [f"{least:.2f}", f"{most:.2f}"]
+        (least, most) = self.in_all
         cells += [f"{least:.2f}", f"{most:.2f}", f"{most / max(least, 1e-3):.1f}"]
         return "| " + " | ".join([*cells, f"{self.not_finite} of {self.gradients}"]) + " |"
 
@@ -72,15 +75,16 @@ def pulled_back(result: Any, inputs: list[Tensor]) -> list[Tensor]:  # noqa: ANN
     return [slope for slope in found if slope is not None]
 
 
-def measured(work: Callable[[], Any]) -> tuple[float, float, Any]:
-    """Return seconds, the peak of memory in gigabytes, and the result."""
+def measured(work: Callable[[], Any]) -> tuple[float, float, float, Any]:
+    """Return seconds, growth and peak of memory in gigabytes, and the result."""
     reset = Path("/proc/self/clear_refs")
     if reset.exists():
         release_memory()
         reset.write_text("5")  # the peak becomes the present size
     before, began = peak_gigabytes(), time.perf_counter()
     result = work()
-    return time.perf_counter() - began, peak_gigabytes() - before, result
+    seconds, peak = time.perf_counter() - began, peak_gigabytes()
+    return seconds, peak - before, peak, result
 
 
 def peak_gigabytes() -> float:
@@ -92,20 +96,23 @@ def peak_gigabytes() -> float:
 
 def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Cost:
     """Measure a stage."""
-
     given, inputs = tracked(arguments)
 
     def with_gradients() -> list[Tensor]:
         return pulled_back(stage(*given), inputs)
 
     stage(*arguments)  # loads kernels
-    plain = [measured(lambda: stage(*arguments))[:2] for _ in range(2)]
+    plain = [measured(lambda: stage(*arguments))[:3] for _ in range(2)]
     with_gradients()
     found = [measured(with_gradients) for _ in range(2)]
-    slopes = found[-1][2]
+    slopes = found[-1][3]
+    seconds, gigabytes, in_all = (
+        (min(each[i] for each in plain), min(each[i] for each in found)) for i in range(3)
+    )
     return Cost(
-        seconds=(min(each[0] for each in plain), min(each[0] for each in found)),
-        gigabytes=(min(each[1] for each in plain), min(each[1] for each in found)),
+        seconds=seconds,
+        gigabytes=gigabytes,
+        in_all=in_all,
         not_finite=sum(int((~slope.isfinite()).sum()) for slope in slopes),
         gradients=sum(slope.numel() for slope in slopes),
     )
@@ -135,8 +142,8 @@ def main() -> None:
     load = pt.load_chain("default", {"scales": options.scales})
     scene = load.reconstruct(views, options.scene / "truth" / "sparse")
     given = calls(load, scene)
-    say("| stage | s | with gradients | times | GB | with gradients | times | not finite |")
-    say("|---|--:|--:|--:|--:|--:|--:|--:|")
+    say("| stage | s | with | times | GB more | with | GB in all | with | times | not finite |")
+    say("|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
     for name in [name for name in STAGES if name in options.only and name in given]:
         say(cost(getattr(load, name), given[name]).row(name))
     if "chain" in options.only:

@@ -3,14 +3,21 @@
 import ctypes
 import math
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar, TypeVarTuple
+
+from torch.utils.checkpoint import checkpoint
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.mapped import drop_pages
 from pimper_torch.records import PatchSet
+
+Given = TypeVarTuple("Given")
+Result = TypeVar("Result")
 
 # Bytes that the fusion's last round takes for each vertex, on top of what the process holds when
 # the first round begins: 0.8 kB in the demo and for a jar of 0.7 million vertices, 1.2 for one of
@@ -106,3 +113,15 @@ def release_memory() -> None:
     drop_pages()
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def recomputed(work: Callable[[*Given], Result], *given: *Given) -> Result:
+    """Call a function whose intermediate results the pass backward computes again.
+
+    They are most of the memory that autograd would hold.
+
+    Args:
+        work: Fast, and without side effects.
+    """
+    found: Result = checkpoint(work, *given, use_reentrant=False, preserve_rng_state=False)
+    return found

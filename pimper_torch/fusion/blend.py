@@ -22,6 +22,7 @@ from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ledger import leave_out
+from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import (
     CoarseMesh,
@@ -137,7 +138,8 @@ def blend_patches(
     def of_bucket(bucket: tuple[Templates, Depths, Photometry, Heights | None]) -> _Estimates:
         def of_some(some: slice) -> _Estimates:
             templates, height_field, photometry, offsets = bucket
-            return _estimates(
+            return recomputed(
+                _estimates,
                 coarse,
                 templates.take(some),
                 height_field.take(some),

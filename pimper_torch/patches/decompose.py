@@ -15,6 +15,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
+from pimper_torch.memory import recomputed
 from pimper_torch.patches.transfer import transfer
 from pimper_torch.patches.view_choice import view_blocks
 from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
@@ -231,8 +232,8 @@ def _templates(
     height, width = raster
     grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
     positions = low[facets, None, None] + grid
-    barycentric = barycentric_2d(positions, corners[facets, None, None])
-    within = barycentric_2d(positions, enlarged[facets, None, None])
+    barycentric = recomputed(barycentric_2d, positions, corners[facets, None, None])
+    within = barycentric_2d(positions.detach(), enlarged.detach()[facets, None, None])
     return Templates(
         facet=facets,
         patch_from_world=patch_from_world[facets],

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
 
@@ -74,20 +75,41 @@ def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
 def _transferred(
     surface: Mesh, normals: Float[Tensor, "vertex 3"], caster: RayCaster, templates: Templates
 ) -> Templates:
-    num, height, width = templates.depth.shape
+    with torch.no_grad():
+        # A little further, so that rounding does not decide.
+        hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
+    return recomputed(_on_surface, surface, normals, templates, hits, met)
+
+
+def _lines(
+    templates: Templates,
+) -> tuple[Float[Tensor, "patch sample 3"], Float[Tensor, "patch sample 3"]]:
+    """Return places on the facets' planes, and the way inward through them; world."""
     world_from_patch = invert_rigid(templates.patch_from_world)
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
-    positions = transform(world_from_patch, flat.reshape(num, -1, 3))
-    inward = world_from_patch[:, None, :3, 2].expand_as(positions)
-    reach = 0.5 * templates.spacing * max(height, width)
-    # A little further, so that rounding does not decide.
-    hits, met = _nearest(caster, positions, inward, surface, 1.01 * reach[:, None])
+    positions = transform(world_from_patch, flat.flatten(1, 2))
+    return positions, world_from_patch[:, None, :3, 2].expand_as(positions)
+
+
+def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
+    return 0.5 * templates.spacing[:, None] * max(templates.depth.shape[1:])
+
+
+def _on_surface(
+    surface: Mesh,
+    normals: Float[Tensor, "vertex 3"],
+    templates: Templates,
+    hits: Hits,
+    met: Bool[Tensor, "patch sample"],
+) -> Templates:
+    """Put samples where their lines meet given faces of a surface."""
+    positions, inward = _lines(templates)
     hits = hits.refined(surface.vertices_world, surface.faces, positions, inward)
     found = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, found)[..., 2]
     rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
-    met = met & (depth.abs() <= reach[:, None])
-    raster = (num, height, width)
+    met = met & (depth.abs() <= _reach(templates))
+    raster = templates.depth.shape
     return templates.replace(
         depth=torch.where(met, depth, 0).reshape(raster),
         normals_patch=normalize(
@@ -109,7 +131,7 @@ def _nearest(
 
     def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
         met = surface.faces[hits.face.clamp_min(0).flatten()]
-        outward = face_normals(surface.vertices_world.detach(), met).reshape(inward.shape)
+        outward = face_normals(surface.vertices_world, met).reshape(inward.shape)
         return (hits.face >= 0) & ((outward * inward).sum(dim=-1) < 0)
 
     one, other = looking_out(below), looking_out(above)

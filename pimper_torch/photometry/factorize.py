@@ -16,6 +16,7 @@ from pimper_torch.failures import over_patches, skipped_patches
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
+from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
@@ -337,7 +338,7 @@ class Factorize(Stage):
         shown = rows.seen.sum(dim=2)
         at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
-        anchor = torch.where(refused[:, None, None], _exposed(rows, anchor), anchor)
+        anchor = torch.where(refused[:, None, None], recomputed(_exposed, rows, anchor), anchor)
         variance = light.guess_variance
         problem = self._problem(rows, anchor, refused, raster, bucket.registered, variance)
         return rows, status, problem
@@ -349,7 +350,7 @@ class Factorize(Stage):
         factors = self._solve(problem)
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
-        estimates = refine_on_manifold(problem, factors)
+        estimates = recomputed(refine_on_manifold, problem, factors)
         views = rows.seen.shape[1]  # a view beyond them stands for known albedo
         lights, weight = factors.lights[:, :views], factors.weight[:, :views]
         anchor, given = problem.anchor[:, :views], problem.weight[:, :views]
@@ -369,7 +370,8 @@ class Factorize(Stage):
         lights = lights * rows.seen.any(dim=2)[..., None]
         normals = torch.where(valid[..., None], estimates.normals, rows.normals)
         weight = torch.where(determined[..., None], weight, given)
-        albedo = fit_albedo(rows.radiance, weight, lights, harmonics(normals).mT)
+        basis = harmonics(normals).mT
+        albedo = recomputed(fit_albedo, rows.radiance, weight, lights, basis)
         blank = torch.zeros_like(bucket.normals[..., 0])
         black = blank[..., None].expand(-1, -1, -1, albedo.shape[1])
         residual = factors.convergence.residual
@@ -396,7 +398,8 @@ class Factorize(Stage):
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
-        shading = initial_shading(gray, rows.seen, field, harmonics(rows.normals).mT)
+        basis = harmonics(rows.normals).mT
+        shading = recomputed(initial_shading, gray, rows.seen, field, basis)
         samples = _samples(rows, gray, field, shading[:, 0], registered, variance)
         known = [cast("Known", prior(samples)) for prior in self.priors]
         for each in known:
@@ -630,6 +633,7 @@ def _lost(bucket: _Bucket, some: slice) -> Photometry:
     )
 
 
+@torch.no_grad()
 def _illuminated(
     bucket: _Bucket, light: Illumination
 ) -> tuple[Bool[Tensor, "patch view height width"], Bool[Tensor, "patch view height width"]]:
