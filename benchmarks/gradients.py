@@ -1,17 +1,18 @@
 """Compare the gradients of every stage, and of the chain whole, with finite differences.
 
 Run as ``python benchmarks/gradients.py``; prints a Markdown table. On a small closed-form scene in
-float64: the derivative of a random sum of each output along random directions of each input, by
-autograd over by central differences. ``--config`` and ``--scales`` choose the chain, ``--only`` the
-stages.
+float64, or on ``--scene``, a folder of `pimper render`: the derivative of a random sum of each
+output along random directions of each input, by autograd over by central differences. ``--config``
+and ``--scales`` choose the chain, ``--only`` the stages.
 """
 
 import argparse
 import sys
 import warnings
+from pathlib import Path
 
 import torch
-from probes import probes, small_scene
+from probes import probes, rendered_scene, small_scene
 
 import pimper_torch as pt
 from pimper_torch.errors import PimperWarning
@@ -21,6 +22,7 @@ def main() -> None:
     """Read the command line, check, print a row for each pair of input and output."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", default="default", help="preset or YAML file")
+    parser.add_argument("--scene", type=Path, help="the closed-form one if not given")
     parser.add_argument("--scales", nargs="*", type=float, help="of the photographs")
     parser.add_argument("--only", nargs="*", default=[], help="stages, or chain")
     parser.add_argument("--directions", type=int, default=3, help="random ones of each input")
@@ -31,9 +33,10 @@ def main() -> None:
     warnings.simplefilter("ignore", PimperWarning)
     changes = {} if options.scales is None else {"scales": options.scales}
     chain = pt.load_chain(options.config, changes)
+    scene = rendered_scene(options.scene) if options.scene else small_scene()
     say("| stage | by | of | ratio | median | farthest from 1 | directions | jump or bend, % |")
     say("|---|---|---|--:|--:|--:|--:|--:|")
-    for stage, probe in probes(chain, *small_scene()).items():
+    for stage, probe in probes(chain, *scene).items():
         if options.only and stage not in options.only:
             continue
         found = probe.check(

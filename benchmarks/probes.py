@@ -7,6 +7,7 @@ the coarse mesh is given in place of structure from motion.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from derivatives import DerivativeCheck, Tensors, check_derivatives
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pimper_torch import load_chain, load_views
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
 from pimper_torch.evidence.scenes import render_shape, sparse_scene
@@ -100,6 +102,15 @@ def small_scene(
     scene = sparse_scene(rendered, 120, generator, dtype=torch.float64)
     coarse: CoarseMesh = Triangulate(TriangulateConfig(num_points=num_points))(scene)
     return scene, coarse
+
+
+def rendered_scene(folder: Path) -> tuple[SparseScene, CoarseMesh]:
+    """Read a scene of ``pimper render`` with true cameras and masks, and facets on its surface."""
+    views = load_views(folder / "photos", masks=folder / "masks")
+    chain = load_chain("default", {"scales": [0.25]})
+    scene = chain.reconstruct(views, folder / "truth" / "sparse")
+    coarse = chain(scene).patches.photometric.patches.coarse
+    return scene.to(torch.float64), coarse.to(torch.float64)
 
 
 AnyChain = CoarseToFine | Published

@@ -5,7 +5,7 @@ here are its reference.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.kernels.arrays import PictureRows, Projection, Samples, as_array, pulled_back
+from pimper_torch.kernels.arrays import as_array, pulled_back
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.patches.sources import (
     Sources,
@@ -170,11 +170,6 @@ class Hypotheses(Record):
         return lights * gains[..., None], gains
 
 
-if TYPE_CHECKING:
-    from pimper_torch.kernels.sweep_costs import Shading, Trial
-
-    _Call = tuple[PictureRows, _Array, Projection, _Array, Samples, Shading, Trial]
-
 Costs = tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]
 
 
@@ -241,7 +236,7 @@ class _Compiled(torch.autograd.Function):
     """Costs as a function of pictures, geometry and light, by a kernel and its adjoint."""
 
     @staticmethod
-    def forward(ctx: Any, call: "_Call", *inputs: Tensor) -> Costs:
+    def forward(ctx: Any, call: Any, *inputs: Tensor) -> Costs:
         """Return the costs, and which samples are swept."""
         from pimper_torch.kernels import sweep_costs
 
@@ -249,7 +244,7 @@ class _Compiled(torch.autograd.Function):
         num_patches, _, *raster = trial.valid.shape
         cost = torch.zeros(num_patches, len(trial.ladder), *raster)
         swept = torch.zeros(num_patches, *raster)
-        sweep_costs.costs(*call, as_array(cost), as_array(swept))
+        sweep_costs.costs(*(*call, as_array(cost), as_array(swept)))
         ctx.call = call
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(swept)
@@ -264,9 +259,8 @@ class _Compiled(torch.autograd.Function):
         of_pictures = any(ctx.needs_input_grad[1:3])
 
         def add_to(*found: _Array) -> None:
-            call: _Call = ctx.call
-            drawn = as_array(on_cost), int(of_pictures)
-            adjoint.pull_back(*call, *drawn, adjoint.CostGradients(*found))
+            gradients = adjoint.CostGradients(*found)
+            adjoint.pull_back(*(*ctx.call, as_array(on_cost), int(of_pictures), gradients))
 
         return None, *pulled_back(add_to, ctx.saved_tensors, of_pictures)
 
