@@ -32,7 +32,8 @@ SOURCES = [path for path in sorted(PACKAGE.rglob("*.py")) if CODE.search(path.re
 
 
 def named(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
+    inside = path.is_relative_to(PACKAGE)  # which may be installed elsewhere
+    return path.relative_to(PACKAGE.parent if inside else ROOT).as_posix()
 
 
 REFUSALS = (AssertionError, PimperError, AttributeError, TypeError, ImportError, SyntaxError)
