@@ -95,7 +95,8 @@ def check_derivatives(
         inputs: In float64. Entries that are zero throughout a tensor of ``scales`` are moved, too.
         scales: Length of a unit step of each input, per element; the root mean square of its
             elements where not given.
-        weights: Random sums of each output's elements.
+        weights: Random sums of each output's elements; 0 for one sum a direction, of the absolute
+            differences, in which nothing cancels.
         steps: The two sizes, in scales. Derivatives are those of the smaller one.
 
     Returns:
@@ -131,6 +132,9 @@ def check_derivatives(
             numeric = torch.stack([fine[output].flatten() for fine, _ in moving[name]])
             # A jump elsewhere may be infinite.
             numeric = torch.where(jumping, 0, numeric)
+            if weights == 0:
+                sums = numeric.sign()
+                grads = [_gradients(values, some, {name: live[name]}) for some in sums]
             analytic = torch.stack([grad[name].flatten() for grad in grads])
             analytic = analytic @ paths[name].reshape(directions, -1).mT
             none = analytic.abs() <= _rounding(values.detach(), steps[1]) * values.numel() ** 0.5
