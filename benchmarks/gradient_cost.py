@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from probes import Whole
+from probes import calls, stage_of
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
 from pimper_torch.errors import PimperWarning
 from pimper_torch.memory import release_memory
-from pimper_torch.records import SparseScene
 
 STAGES = ("warp", "factorize", "sweep", "fuse", "repair", "remesh", "decompose", "extract")
 
@@ -118,18 +117,6 @@ def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Cost:
     )
 
 
-def calls(chain: pt.CoarseToFine, scene: SparseScene) -> dict[str, tuple[Any, ...]]:
-    """Run the chain; return the arguments of each stage's last call."""
-    found: dict[str, tuple[Any, ...]] = {}
-    own = chain.factorize
-    chain.factorize = Whole(own)
-    for name, stage in chain.named_children():
-        stage.register_forward_pre_hook(lambda _, given, name=name: found.update({name: given}))
-    chain(scene)
-    chain.factorize = own
-    return found
-
-
 def main() -> None:
     """Print a Markdown table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -141,11 +128,11 @@ def main() -> None:
     views = pt.load_views(options.scene / "photos", masks=options.scene / "masks")
     load = pt.load_chain("default", {"scales": options.scales})
     scene = load.reconstruct(views, options.scene / "truth" / "sparse")
-    given = calls(load, scene)
+    given = calls(load, lambda: load(scene))
     say("| stage | s | with | times | GB more | with | GB in all | with | times | not finite |")
     say("|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
     for name in [name for name in STAGES if name in options.only and name in given]:
-        say(cost(getattr(load, name), given[name]).row(name))
+        say(cost(stage_of(load, name), given[name]).row(name))
     if "chain" in options.only:
         chain = pt.load_chain("default", {"scales": options.scales})
         say(cost(chain, (scene,)).row("chain"))

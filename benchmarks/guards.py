@@ -84,7 +84,7 @@ PATCHES: dict[str, dict[str, object]] = {
     "extract.borders": {"meshing.extract.protruding": nothing(1)},
 }
 CHANGES: dict[str, dict[str, object]] = {
-    "photometry.shadows": {"factorize": {"shadows": False}},
+    "photometry.shadows": {"light": {"shadows": False}},
     "photometry.robust": {"factorize": {"loss": "squares"}},
     "extract.expected_error": {"extract": {"max_expected_error": math.inf}},
     "extract.pieces": {"extract": {"min_piece": 0.0}},

@@ -117,15 +117,42 @@ AnyChain = CoarseToFine | Published
 
 
 class Whole(Stage):
-    """A factorization that is called with all patches at once."""
+    """The photometry of a chain, of all patches at once: light, factorization and gauge."""
 
-    def __init__(self, factorize: Callable[[PatchViews], PhotometricPatches]) -> None:
+    def __init__(self, chain: AnyChain) -> None:
         super().__init__()
-        self.factorize = factorize
+        self.light, self.factorize, self.gauge = chain.light, chain.factorize, chain.gauge
 
     def forward(self, seen: PatchViews) -> PhotometricPatches:
-        """Call it."""
-        return self.factorize(seen)
+        """Call the stages."""
+        return self.gauge(self.factorize(seen, self.light(seen)))
+
+
+def calls(chain: AnyChain, run: Callable[[], object]) -> dict[str, tuple[Any, ...]]:
+    """Run a chain; return the arguments of each stage's last call, with all patches at once."""
+    found: dict[str, tuple[Any, ...]] = {}
+
+    def keep(name: str) -> Callable[[nn.Module, tuple[Any, ...]], None]:
+        return lambda _, arguments: found.update({name: arguments})
+
+    hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in chain.named_children()]
+    run()
+    for hook in hooks:
+        hook.remove()
+    if "sweep" in found:
+        views, cameras, _, sources = found["warp"]
+        patches = found["fuse"][0].patches
+        found["warp"] = views, cameras, patches, sources
+        seen = chain.warp(*found["warp"])
+        found["sweep"] = views, cameras, seen, Whole(chain)(seen), sources
+    else:
+        seen, _ = found["factorize"]
+    return found | {"factorize": (seen,)}
+
+
+def stage_of(chain: AnyChain, name: str) -> Callable[..., Any]:
+    """Return a stage as :func:`calls` has its arguments."""
+    return Whole(chain) if name == "factorize" else getattr(chain, name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,36 +323,21 @@ def probes(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str,
         scene: Float64.
         coarse: In the same frame.
     """
-    calls = _calls(chain, scene, coarse)
+    _substitute(chain, scene, coarse)
+    given = calls(chain, lambda: chain(scene))
 
     def whole(scene: SparseScene, coarse: CoarseMesh) -> Reconstruction:
         _substitute(chain, scene, coarse)
         return chain(scene)
 
-    if "remesh" not in calls:
-        del calls["decompose"]  # templates carry no surface, and facets are constants
+    if "remesh" not in given:
+        del given["decompose"]  # templates carry no surface, and facets are constants
     found = {
-        name: _probe(paths, getattr(chain, name), calls[name])
+        name: _probe(paths, stage_of(chain, name), given[name])
         for name, paths in _STAGES.items()
-        if name in calls
+        if name in given
     }
     return {**found, "chain": _probe(_CHAIN, whole, (scene, coarse))}
-
-
-def _calls(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> dict[str, tuple[Any, ...]]:
-    """Run the chain, and keep the arguments of each stage's last call."""
-    calls: dict[str, tuple[Any, ...]] = {}
-
-    def keep(name: str) -> Callable[[nn.Module, tuple[Any, ...]], None]:
-        return lambda _, arguments: calls.update({name: arguments})
-
-    _substitute(chain, scene, coarse)
-    chain.factorize = Whole(chain.factorize)
-    hooks = [stage.register_forward_pre_hook(keep(name)) for name, stage in chain.named_children()]
-    chain(scene)
-    for hook in hooks:
-        hook.remove()
-    return calls
 
 
 def _substitute(chain: AnyChain, scene: SparseScene, coarse: CoarseMesh) -> None:

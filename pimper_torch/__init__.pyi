@@ -48,6 +48,10 @@ from .patches.decompose import Decompose as Decompose
 from .patches.warp import Warp as Warp
 from .photometry.factorize import Factorize as Factorize
 from .photometry.factorize import FactorizeConfig as FactorizeConfig
+from .photometry.fit_light import FitLight as FitLight
+from .photometry.fit_light import FitLightConfig as FitLightConfig
+from .photometry.fit_light import Illumination as Illumination
+from .photometry.gauge import FixGauge as FixGauge
 from .prior_files.read_maps import read_depth as read_depth
 from .prior_files.read_maps import read_normals as read_normals
 from .prior_files.read_silhouettes import object_at as object_at
@@ -91,6 +95,7 @@ from .size.scale import Scale as Scale
 from .size.scaled import scaled as scaled
 from .stage import Given as Given
 from .stage import Stage as Stage
+from .stage import Then as Then
 from .store.user_cache import user_cache as user_cache
 from .sweep.sweep import Sweep as Sweep
 from .viewer.show import show as show

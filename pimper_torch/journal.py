@@ -29,6 +29,7 @@ class Journal:
         fail: Whether a failure ends the run.
         quiet: Whether cautions are events alone, and no warnings.
         observer: Hears of stages; ``None`` within a stage, whose parts are no stages.
+        figures: Of the stage that runs, so far.
         began: When the stages began, as :func:`time.perf_counter` counts.
         aside: Seconds by line of what no stage does.
         progress: Hears how many steps of how many are done.
@@ -41,6 +42,7 @@ class Journal:
     fail: bool = False
     quiet: bool = False
     observer: Any = None
+    figures: dict[str, int | float] = field(default_factory=dict)
     began: float = 0.0
     aside: dict[str, float] = field(default_factory=dict)
     progress: Callable[[int, int], None] | None = None

@@ -3,10 +3,11 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import singledispatch
+from threading import Lock
 from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -14,7 +15,6 @@ from torch import Tensor
 
 from pimper_torch.geometry.topology import boundary_loops
 from pimper_torch.journal import HASH, KEEP, Journal, current, writing
-from pimper_torch.patches.warp import missing_fraction
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
@@ -31,6 +31,8 @@ from pimper_torch.records import (
 from pimper_torch.silhouettes.contours import Contours
 
 R = TypeVar("R")
+
+_telling = Lock()
 
 
 @runtime_checkable
@@ -141,12 +143,28 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     events = journal.so_far()
     before = len(events)
     journal.observer.started(name)
-    with writing(replace(journal, observer=None)):
+    with writing(replace(journal, observer=None, figures=told)):
         yield told
     report = reported(name, time.perf_counter() - began, told)
     events[before:] = [one for one in events[before:] if not isinstance(one, StageReport)]
     events.append(report)
     journal.observer.finished(report)
+
+
+@contextmanager
+def part(name: str) -> Iterator[None]:
+    """Add the seconds of the ``with`` block, in whichever thread, to the figures of its stage."""
+    began = time.perf_counter()
+    yield
+    tell({f"{name}_seconds": time.perf_counter() - began})
+
+
+def tell(counts: Mapping[str, int | float]) -> None:
+    """Add counts to the figures of the stage that runs, from any of its threads."""
+    told = current().figures
+    with _telling:
+        for name, count in counts.items():
+            told[name] = told.get(name, 0) + count
 
 
 def called(name: str, call: Callable[..., R], *inputs: object) -> R:
@@ -219,9 +237,10 @@ def _(patches: PatchSet) -> dict[str, int | float]:
 
 @figures.register
 def _(seen: PatchViews) -> dict[str, int | float]:
-    pairs = zip(seen.patches.buckets, seen.buckets, strict=True)
+    pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
     samples = sum(int(bucket.inside.sum()) * views.valid.shape[1] for bucket, views in pairs)
-    return {"samples": samples, "missing_fraction": missing_fraction(seen)}
+    valid = sum(int(views.valid.count_nonzero()) for _, views in pairs)
+    return {"samples": samples, "missing_samples": samples - valid}
 
 
 @figures.register

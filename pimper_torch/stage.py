@@ -81,6 +81,24 @@ class Given(Stage, Generic[T]):
         return self.record
 
 
+class Then(Stage):
+    """A stage, and others behind it, each of which is handed the record of the one before.
+
+    ``load_chain("default", warp=Then(Warp(), Mine()))`` puts a stage into the gap behind the warp.
+    """
+
+    def __init__(self, stage: nn.Module, *others: nn.Module) -> None:
+        super().__init__()
+        self.stage, self.others = stage, nn.ModuleList(others)
+
+    def forward(self, *given: object) -> object:
+        """Return the record of the last one."""
+        record = self.stage(*given)
+        for other in self.others:
+            record = other(record)
+        return record
+
+
 def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
     """Refuse records of other types than a stage takes, and those that cannot be used."""
     where = type(stage).__name__

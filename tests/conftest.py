@@ -198,7 +198,7 @@ def reconstruction():
                 name="warp",
                 seconds=1.5,
                 peak_memory_mb=300.0,
-                figures={"samples": 96, "missing_fraction": 0.25},
+                figures={"samples": 96, "missing_samples": 24},
             ),
             StageReport(name="extract", seconds=0.5, peak_memory_mb=310.0, figures={}),
         ),

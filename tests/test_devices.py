@@ -29,7 +29,9 @@ def given():
     contours = stages.TraceContours()(pt.Silhouettes.everything(scene.views), scene.cameras)
     patches = stages.Decompose()(coarse, scene.cameras)
     seen = stages.Warp()(scene.views, scene.cameras, patches)
-    solved = stages.Factorize()(seen)
+    light = stages.FitLight()(seen)
+    factorized = stages.Factorize()(seen, light)
+    solved = stages.FixGauge()(factorized)
     swept = stages.Sweep()(scene.views, scene.cameras, seen, solved)
     surface = stages.Fuse()(swept, contours)
     integrated = Integrate()(solved)
@@ -66,7 +68,9 @@ STAGES = [
     (stages.Triangulate, given, "scene"),
     (stages.Decompose, given, "coarse scene.cameras"),
     (stages.Warp, given, "scene.views scene.cameras patches"),
-    (stages.Factorize, given, "few"),
+    (stages.FitLight, given, "few"),
+    (stages.Factorize, given, "few light"),
+    (stages.FixGauge, given, "factorized"),
     (stages.Sweep, given, "scene.views scene.cameras seen solved"),
     (stages.Fuse, given, "swept contours"),
     (stages.Repair, given, "surface"),

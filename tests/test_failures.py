@@ -10,7 +10,7 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.chains.streaming import photometry_and_heights
+from pimper_torch.chains.photometric import Photometric
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.failures import (
     by_data,
@@ -29,6 +29,7 @@ from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry import factorize as factorization
 from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.photometry.fit_light import FitLight
 from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
 from pimper_torch.sfm.sparse_scene import sound
 from pimper_torch.silhouettes.find import FindSilhouettes
@@ -268,8 +269,8 @@ def given():
 def streamed(given):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)  # of patches under too little light
-        sources = Warp().prepare(given[0]).hidden_by(given[2].coarse.mesh)
-        return photometry_and_heights(Warp(), Factorize(), Sweep(), *given, sources)
+        light = FitLight()(Warp()(*given))
+        return Photometric(Warp(), Factorize(), Sweep())(*given, light)
 
 
 @pytest.fixture(scope="module")
@@ -341,17 +342,17 @@ def test_a_patch_that_cannot_be_factorized_keeps_its_coarse_normals(
         part = given[2].replace(buckets=(given[2].buckets[bucket],))
         solver(noted, noting)
         seen = Warp()(given[0], given[1], part)
-        light = Factorize().light(Warp()(*given))
-        Factorize().solve(seen, light)
+        light = FitLight()(Warp()(*given))
+        Factorize()(seen, light)
     ((_, shading),) = shadings.items()
     solver(monkeypatch, broken_for(shading[row], error))
     with collecting() as failures:
-        found = Factorize().solve(seen, light)
+        found = Factorize()(seen, light)
     assert [(each.stage, each.name) for each in failures] == [("factorize", str(facet))]
     assert found.buckets[0].status[row] == int(PatchStatus.FAILED)
     assert not found.buckets[0].valid[row].any()
     with pytest.raises(ReconstructionError, match=f"patch {facet} "), collecting("fail"):
-        Factorize().solve(seen, light)
+        Factorize()(seen, light)
 
 
 def test_a_solution_that_is_not_finite_changes_no_other_patch(given, expected, monkeypatch):

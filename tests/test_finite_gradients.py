@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from gradient_cost import STAGES, calls, pulled_back, tracked
+from gradient_cost import STAGES, pulled_back, tracked
 from priors import prior_of
+from probes import calls, stage_of
 
 import pimper_torch as pt
 from pimper_torch.evidence.datasets.rendered import read_rendered
@@ -59,10 +60,10 @@ def assert_finite(slopes, where):
 
 def assert_stages_finite(chain, scene):
     """Check every stage on what the chain hands it; return what the factorization is handed."""
-    given = calls(chain, scene)
+    given = calls(chain, lambda: chain(scene))
     for stage in [stage for stage in STAGES if stage in given]:
         arguments, inputs = tracked(given[stage])
-        assert_finite(pulled_back(getattr(chain, stage)(*arguments), inputs), stage)
+        assert_finite(pulled_back(stage_of(chain, stage)(*arguments), inputs), stage)
     return given
 
 
@@ -78,7 +79,9 @@ def test_gradients_are_finite_where_values_are(rendered, name, dtype):
     chain = pt.load_chain("default", {"scales": [0.25, 0.5]})
     given = assert_stages_finite(chain, scene)
     (seen,), _ = tracked(given["factorize"])
-    total = sum(bucket.albedo.square().sum() for bucket in chain.factorize(seen).buckets)
+    total = sum(
+        bucket.albedo.square().sum() for bucket in stage_of(chain, "factorize")(seen).buckets
+    )
     slopes = torch.autograd.grad(total, [bucket.radiance for bucket in seen.buckets])
     for slope, bucket, templates in zip(slopes, seen.buckets, seen.patches.buckets, strict=True):
         counts = (bucket.valid & templates.inside[:, None])[:, :, None]

@@ -25,8 +25,8 @@ class Scaled(pt.Stage):
         self.factorize = pt.Factorize()
         self.gain = nn.Parameter(torch.ones(1))
 
-    def forward(self, seen: pt.PatchViews) -> pt.PhotometricPatches:
-        return self.factorize(seen)
+    def forward(self, seen: pt.PatchViews, light: pt.stages.Illumination) -> pt.PhotometricPatches:
+        return self.factorize(seen, light)
 
 
 @functools.cache

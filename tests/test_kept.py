@@ -17,8 +17,8 @@ from pimper_torch.store import digest
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
 
 # Of two passes over given facets, in order.
-STAGES = ["silhouettes", "sweep", "fuse", "remesh"]
-STAGES += ["sweep", "fuse", "extract"]
+STAGES = ["silhouettes", "light", "photometry", "fuse", "remesh"]
+STAGES += ["light", "photometry", "fuse", "extract"]
 
 
 class Listener(Silent):
@@ -88,9 +88,8 @@ def test_a_run_goes_on_after_any_stage_to_the_same_bits(given, whole, tmp_path, 
             (tmp_path / file.name).write_bytes(file.read_bytes())
     result, listener = run(given, tmp_path)
     assert bits(result) == bits(expected)
-    names = [name.replace("sweep", "photometry") for name in STAGES]
-    assert listener.kept == names[:done]
-    assert [name for name in listener.done if name in names] == names[done:]
+    assert listener.kept == STAGES[:done]
+    assert [name for name in listener.done if name in STAGES] == STAGES[done:]
 
 
 def test_a_changed_setting_runs_what_depends_on_it(given, whole):
@@ -99,10 +98,10 @@ def test_a_changed_setting_runs_what_depends_on_it(given, whole):
     assert "extract" in listener.done
     assert listener.kept.count("photometry") == 2
     _, listener = run(given, folder, factorize={"light_prior": 2.0})
-    assert listener.kept == ["silhouettes"]
+    assert listener.kept == ["silhouettes", "light"]
     # What the first pass gives doesn't depend on the second one's scale.
     _, listener = run(given, folder, scales=[0.25, 0.4])
-    assert listener.kept == ["silhouettes", "photometry", "fuse", "remesh"]
+    assert listener.kept == ["silhouettes", "light", "photometry", "fuse", "remesh"]
 
 
 def test_other_photographs_are_another_run(given, whole):

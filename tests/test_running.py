@@ -3,7 +3,7 @@
 import pytest
 from torch import nn
 
-from pimper_torch.chains.running import Later, Running
+from pimper_torch.chains.running import Running
 from pimper_torch.errors import PimperWarning, caution
 
 
@@ -25,29 +25,8 @@ def stages():
     return {name: Noting() for name in ("warp", "factorize", "sweep", "fuse")}
 
 
-def running(stages, *put_off):
-    return Running(names={one: name for name, one in stages.items()}, store=None, put_off=put_off)
-
-
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
-def test_what_is_put_off_is_made_once_by_the_stage_that_asks_for_it(stages):
-    run = running(stages, "warp", "factorize")
-    seen = run(stages["warp"], "views", "cameras", "patches")
-    photometric = run(stages["factorize"], seen)
-    assert isinstance(seen, Later)
-    assert stages["warp"].calls == stages["factorize"].calls == 0
-    samples = ["views", "cameras", "patches", None]
-    heights = run(stages["sweep"], "views", "cameras", seen, photometric)
-    assert heights == ["views", "cameras", samples, [samples], None]
-    assert {one.calls for one in stages.values()} == {0, 1}
-
-
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
-def test_samples_that_were_put_off_come_with_the_other_records(stages):
-    run = running(stages, "warp")
-    seen = run(stages["warp"], "views", "cameras", "patches")
-    found = run(stages["factorize"], "before", seen, "after")
-    assert found == ["before", ["views", "cameras", "patches", None], "after"]
+def running(stages):
+    return Running(names={one: name for name, one in stages.items()}, store=None)
 
 
 def test_passes_but_the_last_are_silent_unless_they_fail(stages):

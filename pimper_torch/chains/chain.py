@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from torch import nn
 
@@ -105,8 +105,6 @@ class Chain(Stage):
     held out.
     """
 
-    put_off: ClassVar[tuple[str, ...]] = ()
-    """Stages that work when another one asks for their records, see :class:`Running`."""
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
     silhouettes: Callable[[SparseScene], Silhouettes]
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
@@ -136,7 +134,7 @@ class Chain(Stage):
     def running(self) -> Running:
         """Return how stages are called in a run."""
         names = {module: name for name, module in self.named_children()}
-        return Running(names=names, store=self.store, put_off=self.put_off)
+        return Running(names=names, store=self.store)
 
     def references(self) -> Iterator[str]:
         """List the photographs that stages were asked to take for the reference view."""

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.photometric import Factorizing, Photometric, Sweeping, Warping
 from pimper_torch.chains.running import Running
-from pimper_torch.chains.streaming import Factorizing, Sweeping, Warping
 from pimper_torch.coarse.remesh import Remesh, RemeshConfig
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import Range, require, require_ranges
@@ -21,8 +21,12 @@ from pimper_torch.memory import bytes_of, largest_problem
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.patches.sources import prepare
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.photometry.gauge import FixGauge
+from pimper_torch.photometry.lights import thinned
 from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
@@ -30,6 +34,8 @@ from pimper_torch.records import (
     CoarseMesh,
     Mesh,
     PatchSet,
+    PatchViews,
+    PhotometricPatches,
     Silhouettes,
     SparseScene,
     Surface,
@@ -104,6 +110,7 @@ class CoarseToFineConfig:
     coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
+    light: FitLightConfig = field(default_factory=FitLightConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
     sweep: SweepConfig = field(default_factory=SweepConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
@@ -120,13 +127,7 @@ class CoarseToFineConfig:
 
 
 class CoarseToFine(Chain):
-    """A closed surface of what all views see, remeshed and fused again at every scale.
-
-    Patches come a few at a time to a factorization that can be called so
-    (:class:`~pimper_torch.chains.streaming.InParts`), and all at once to others.
-    """
-
-    put_off = ("warp", "factorize")
+    """A closed surface of what all views see, remeshed and fused again at every scale."""
 
     def __init__(
         self,
@@ -146,8 +147,10 @@ class CoarseToFine(Chain):
         )
         self.decompose = Decompose(config.decompose)
         self.warp: Warping = Warp(config.warp)
+        self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
+        self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
         self.fuse: Callable[..., Surface] = Fuse(config.fuse)
         self.repair: Callable[[Surface], Surface] = Repair()
         self.remesh: Callable[[SweptPatches, Surface, Contours], CoarseMesh] = Remesh(config.remesh)
@@ -176,16 +179,21 @@ class CoarseToFine(Chain):
         if shown is not scene:
             coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         self.show(scene, coarse)
-        cameras = scene.cameras
-        surface: Surface | None = None
+        cameras, surface = scene.cameras, None
+        sources = run(prepare, scene.views, self.config.warp.saturation_level)
+        photometric = Photometric(self.warp, self.factorize, self.sweep)
         by_blocks: tuple[float, ...] = ()
         for scale, last in run.passes(self.config.scales):
             patches = run(self.decompose, coarse, cameras, surface, scale)
             if surface is None:
                 by_blocks = self._by_blocks(patches)
-            seen = run(self.warp, scene.views, cameras, patches)  # samples J
-            photometric = run(self.factorize, seen)  # J = L N: lights, albedo and normals
-            heights = run(self.sweep, scene.views, cameras, seen, photometric)
+            seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
+            light = run(self.light, seen)
+            del seen
+            heights = run(photometric, scene.views, cameras, patches, light, sources)
+            heights = heights.replace(photometric=run(self.gauge, heights.photometric))
+            if last:
+                del sources  # as much memory as the photographs themselves
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
             yield Step(

@@ -8,8 +8,8 @@ from typing import ClassVar
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
+from pimper_torch.chains.photometric import Factorizing, Warping
 from pimper_torch.chains.running import Running
-from pimper_torch.chains.streaming import Factorizing, Warping
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
 from pimper_torch.meshing.extract import Extract, ExtractConfig
@@ -20,12 +20,15 @@ from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.photometry.gauge import FixGauge
 from pimper_torch.priors.settled import settled
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
+    PatchViews,
     PhotometricPatches,
     SparseScene,
     Surface,
@@ -60,6 +63,7 @@ class PublishedConfig:
     coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
     decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
+    light: FitLightConfig = field(default_factory=FitLightConfig)
     factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -72,8 +76,6 @@ class Published(Chain):
     Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
     multi-view and multi-illumination images, 2015.
     """
-
-    put_off = ("warp",)
 
     def __init__(
         self,
@@ -93,7 +95,9 @@ class Published(Chain):
         )
         self.decompose = Decompose(config.decompose)
         self.warp: Warping = Warp(config.warp)
+        self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
         self.factorize: Factorizing = Factorize(config.factorize)
+        self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
         self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
         self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
         self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
@@ -125,7 +129,7 @@ class Published(Chain):
         self.show(scene, coarse)
         patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
         seen = run(self.warp, scene.views, scene.cameras, patches)
-        photometric = run(self.factorize, seen)
+        photometric = run(self.gauge, run(self.factorize, seen, run(self.light, seen)))
         heights = run(self.align, run(self.integrate, photometric))
         surface = run(self.refine, heights)
         yield Step(

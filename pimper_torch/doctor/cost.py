@@ -52,7 +52,8 @@ def planned(
     for scale in scales:
         stages += [
             ("decompose", 0.1 + 3.0 * one * scale**2),
-            ("photometry", 1.5 + 1.6 * megapixels**0.75 * scale**2),
+            ("light", 1.5),
+            ("photometry", 1.6 * megapixels**0.75 * scale**2),
             ("fuse", 0.7 + 42.0 * one * scale**2),
             ("repair", 1.5 * one * scale**2),
         ]

@@ -6,6 +6,7 @@ tensors, and which face a ray meets is a constant to autograd; where it meets th
 """
 
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
@@ -154,6 +156,21 @@ class RayCaster:
         far = _reaches(reach, shape)
         found = self._scene.run(start, along, dists=far, query="OCCLUDED")
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
+
+
+# Of meshes, while their vertices live: faces, and the caster.
+_prepared: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+_preparing = Lock()
+
+
+def ray_caster(mesh: Mesh) -> RayCaster:
+    """Return a mesh prepared for ray casting, once as long as it lives."""
+    with _preparing:
+        faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]
+        if faces is not mesh.faces:
+            caster = RayCaster(mesh.vertices_world, mesh.faces)
+            _prepared[mesh.vertices_world] = mesh.faces, caster
+        return caster
 
 
 def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:

@@ -130,6 +130,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     """
     scene = result.scene
     figures = {key: value for report in result.report for key, value in report.figures.items()}
+    samples, missing = figures.get("samples"), figures.get("missing_samples", 0)
     ends = [bucket.convergence for bucket in result.patches.photometric.buckets]
     patches = sum(len(end.converged) for end in ends)
     return {
@@ -146,8 +147,8 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "sparse_points": len(scene.points_world),
         "mesh_points": len(result.coarse.mesh.vertices_world),
         "triangles": len(result.coarse.mesh.faces),
-        "samples": figures.get("samples"),
-        "missing_fraction": _finite(figures.get("missing_fraction", math.nan)),
+        "samples": samples,
+        "missing_fraction": missing / samples if samples else None,
         "vertices": len(result.mesh.vertices_world),
         "faces": len(result.mesh.faces),
         "seconds": sum(report.seconds for report in result.report),

@@ -1,7 +1,7 @@
 """Image pyramids, looked up at a sample's footprint, and the occluding surface, for all patches."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from typing import Literal
@@ -15,7 +15,6 @@ from torch.nn.functional import conv2d, grid_sample, pad
 from pimper_torch.errors import InputError
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.rigid import invert_rigid, transform
-from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.arrays import FractionRows, PictureRows, Projection, Samples, as_array
 from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.parallel import side_by_side
@@ -26,7 +25,6 @@ from pimper_torch.records import (
     DepthPrior,
     InlierPrior,
     LightPrior,
-    Mesh,
     NormalPrior,
     Record,
     Templates,
@@ -154,29 +152,23 @@ class Pyramid(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Sources(Record):
-    """Photographs at several sizes, and the surface that occludes.
+    """Photographs at several sizes. It is not hashed beside the photographs themselves.
 
     Attributes:
         images: Linear radiance; zero where it is not finite.
         unusable: Fraction of every pixel that is unusable, in 255ths: outside the undistorted frame
             or the mask, not finite, or saturated in any channel.
         gray: Mean over the channels.
-        caster: Of the surface that occludes; ``None`` where none is given yet.
         priors: Guessed maps of the photographs, prepared like these.
         lights: Guessed lights of the photographs, one a view, of infinite variance where none is
             guessed.
     """
 
-    images: Pyramid
-    unusable: Pyramid
-    gray: Pyramid
-    caster: RayCaster | None = None
-    priors: "tuple[PriorMaps, ...]" = ()
-    lights: LightPrior | None = None
-
-    def hidden_by(self, mesh: Mesh) -> "Sources":
-        """Set the surface that occludes."""
-        return self.replace(caster=RayCaster(mesh.vertices_world, mesh.faces))
+    images: Pyramid = field(compare=False)
+    unusable: Pyramid = field(compare=False)
+    gray: Pyramid = field(compare=False)
+    priors: "tuple[PriorMaps, ...]" = field(default=(), compare=False)
+    lights: LightPrior | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.geometry.visibility import Hits, RayCaster, ray_caster
 from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import CoarseMesh, Mesh, PatchSet, Templates
@@ -31,8 +31,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     normals = surface.normals_world
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
-    caster = RayCaster(surface.vertices_world, surface.faces)
-    one = partial(_transferred, surface, normals, caster)
+    one = partial(_transferred, surface, normals, ray_caster(surface))
     buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 

@@ -16,7 +16,7 @@ from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.kernels.arrays import (
     FractionRows,
     PictureRows,
@@ -29,7 +29,6 @@ from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
 from pimper_torch.patches.sources import (
-    LEVELS,
     PriorMaps,
     Sources,
     centers_in_patches,
@@ -219,21 +218,21 @@ class Warp(Stage):
 
         Args:
             patches: All, or some buckets of them.
-            sources: Pyramids as :meth:`prepare` builds them, and the surface that occludes;
-                made here where not given.
+            sources: Pyramids as :func:`~pimper_torch.patches.sources.prepare` builds them; built
+                here where not given.
         """
-        sources = sources or self.prepare(views)
-        if sources.caster is None:
-            sources = sources.hidden_by(patches.surface or patches.coarse.mesh)
-        one = partial(self._registered, views.images.shape[1], cameras, sources)
+        sources = sources or prepare(views, self.config.saturation_level)
+        caster = ray_caster(patches.surface or patches.coarse.mesh)
+        one = partial(self._registered, views.images.shape[1], cameras, sources, caster)
         return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
 
-    def prepare(self, views: Views) -> Sources:
-        """Build pyramids of photographs for any number of calls, here and in the sweep."""
-        return prepare(views, self.config.saturation_level, LEVELS)
-
     def _registered(
-        self, channels: int, cameras: Cameras, sources: Sources, templates: Templates
+        self,
+        channels: int,
+        cameras: Cameras,
+        sources: Sources,
+        caster: RayCaster,
+        templates: Templates,
     ) -> Observations:
         """Register a bucket; patches that cannot be have no valid sample."""
         rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
@@ -255,7 +254,7 @@ class Warp(Stage):
             return Observations(radiance=radiance, valid=valid, priors=priors)
 
         found = over_patches(
-            lambda some: self._register(cameras, sources, rows, templates.take(some)),
+            lambda some: self._register(cameras, sources, caster, rows, templates.take(some)),
             templates.facet,
             "warp",
             lost,
@@ -270,7 +269,12 @@ class Warp(Stage):
         return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
 
     def _register(
-        self, cameras: Cameras, sources: Sources, rows: Int[Tensor, " view"], templates: Templates
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        caster: RayCaster,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
     ) -> Observations:
         found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
         guesses = [
@@ -280,9 +284,8 @@ class Warp(Stage):
         shown = found.valid
         for maps, guess in guesses:
             shown = shown.index_add(1, maps.view, guess.valid)
-        assert sources.caster is not None  # forward sees to it
         stride = self.config.occlusion_stride
-        hidden = occluded(shown, cameras, sources.caster, templates, stride)
+        hidden = occluded(shown, cameras, caster, templates, stride)
         found.radiance.masked_fill_(hidden[:, :, None], 0)
         priors: PatchPriors | None = None
         if guesses or sources.lights is not None:
@@ -372,10 +375,3 @@ def _maps_of(
 ) -> list[tuple[PriorMaps, Int[Tensor, " map"]]]:
     """List the guessed maps of some views, where there are any, and their rows."""
     return [(maps, own) for maps, own in (each.of(rows) for each in sources.priors) if len(own)]
-
-
-def missing_fraction(seen: PatchViews) -> float:
-    """Return the fraction of the enlarged triangles' samples, over all views, that is missing."""
-    pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
-    samples = sum(int(t.inside.sum()) * r.valid.shape[1] for t, r in pairs)
-    return 1 - sum(int(registered.valid.sum()) for _, registered in pairs) / samples

@@ -8,7 +8,9 @@ from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
-from pimper_torch.photometry.factorize import Factorize, FactorizeConfig, Illumination
+from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.photometry.gauge import FixGauge
 from pimper_torch.photometry.lights import thinned
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -20,6 +22,9 @@ __all__ = [
     "Factorize",
     "FactorizeConfig",
     "Factors",
+    "FitLight",
+    "FitLightConfig",
+    "FixGauge",
     "GemanMcClure",
     "Huber",
     "Illumination",

@@ -1,6 +1,5 @@
 """Factorization of patches into albedo, normals and light."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,12 +8,12 @@ from typing import Annotated, Literal, cast
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped_patches
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ledger import leave_out
 from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
@@ -24,7 +23,6 @@ from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.factor_priors import (
-    RELATIVE_NOISE,
     FactorPrior,
     FieldLights,
     Guesses,
@@ -32,14 +30,13 @@ from pimper_torch.photometry.factor_priors import (
     PatchSamples,
     SurfaceNormals,
 )
+from pimper_torch.photometry.fit_light import Illumination, lights_in_patches
 from pimper_torch.photometry.light_field import (
     LightField,
     faces_light,
     harmonics,
     is_strong,
-    rotate_lights,
 )
-from pimper_torch.photometry.lights import light_of_mesh
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.sample_estimates import (
     Rows,
@@ -51,13 +48,12 @@ from pimper_torch.photometry.sample_estimates import (
     rows_of,
 )
 from pimper_torch.photometry.shadows import cast_shadows_on_rasters
-from pimper_torch.photometry.status import light_varies, patch_status, warn_of_undetermined
+from pimper_torch.photometry.status import light_varies, patch_status
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
     CoarseMesh,
     Convergence,
     Observations,
-    PatchPriors,
     PatchStatus,
     PatchViews,
     PhotometricPatches,
@@ -67,15 +63,6 @@ from pimper_torch.records import (
     Templates,
 )
 from pimper_torch.stage import Stage
-
-# Guessed normals suit the photographs better if residuals fall below this fraction: a choice. True
-# ones with smooth errors of 10 degrees lower them to 0.63 on a jar's first pass, and normals that
-# all face the camera to 0.98.
-_GUESS_GAIN = 0.95
-
-# Information of the surface's normals where guesses stand beside them: a choice, 5.4 degrees, as
-# much as the weight of their prior says.
-_SURFACE_INFORMATION = 0.1 / RELATIVE_NOISE**2
 
 SOLVERS: dict[str, Solver] = {
     # 256 samples are ten for each of 24 lights' coefficients.
@@ -101,17 +88,10 @@ _COARSE_NORMALS = "These patches keep the coarse mesh's normals"
 class FactorizeConfig:
     """Settings of :class:`Factorize`.
 
-    The published method is ``light="soft"``, ``colours=False``, ``solver="balm"``,
-    ``loss="squares"``, and no priors: ``light_prior=0`` and ``geometry_weight=0``.
+    The published method is ``solver="balm"``, ``loss="squares"``, and no priors: ``light_prior=0``
+    and ``geometry_weight=0``.
 
     Attributes:
-        light: Model fitted to the coarse mesh: ``"soft"``, first-order harmonics per view,
-            constant over the scene; ``"point_light"``, ambient light and a near point light with
-            attached shadows; ``"room"``, a near point light in a room that is lit, whose light is
-            second-order harmonics shared by the views up to exposure; ``"auto"``, the simplest
-            that predicts radiance left out of the fit.
-        colours: Whether views may have light of unlike colour, where that predicts radiance left
-            out of the fit, and be exposed unlike by 1.5 stops or more.
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
         light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in
@@ -120,8 +100,6 @@ class FactorizeConfig:
             of one view.
         loss: ``"cauchy"``, by which highlights and shadows lose weight; ``"geman-mcclure"``, by
             which they lose it faster; ``"huber"``, more slowly; or ``"squares"``.
-        shadows: Whether samples in cast shadow are left out. Needs a surface that is nearly
-            right.
         loss_scale: Of the loss, in standard deviations of the patch's residuals; 0 for that at
             which it is 95 % efficient on Gaussian noise.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
@@ -133,14 +111,11 @@ class FactorizeConfig:
             projection, of its shading vectors with BALM.
     """
 
-    light: Literal["auto", "soft", "point_light", "room"] = "auto"
-    colours: bool = True
     solver: Literal["variable-projection", "balm"] = "variable-projection"
     light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
     geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
     loss: Literal["squares", "cauchy", "huber", "geman-mcclure"] = "cauchy"
     loss_scale: Annotated[float, Range(least=0, most=1e12)] = 0.0
-    shadows: bool = True
     min_views: Annotated[int, Range(least=3, most=100_000)] = 4
     min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
     max_iterations: Annotated[int, Range(least=1, most=100_000)] = 60
@@ -148,25 +123,8 @@ class FactorizeConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self, "factorize")
-        models = ("auto", "soft", "point_light", "room")
-        require(self.light in models, "factorize.light", self.light, " or ".join(models))
         require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
         require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Illumination(Record):
-    """The light of all views, and the surface that casts shadows.
-
-    Attributes:
-        caster: Of rays on the surface; ``None`` if cast shadows are not predicted.
-        guess_variance: Of what guessed normals differ from the surface's beyond what both claim,
-            squared radians; 0 where they suit the photographs better.
-    """
-
-    field: LightField
-    caster: RayCaster | None
-    guess_variance: float | Float[Tensor, ""] = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -181,19 +139,15 @@ class _Bucket(Record):
 class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
-    First the light field of every view is fitted to the smoothed normals of the coarse mesh:
-    soft light, or a near point light, in a lit room where there is one; its colour and exposure are
-    divided out. Then every patch is factorized, the field being the prior mean of its lights;
-    samples in shadow of the point light are left out, or, where they are most of a patch in a lit
-    room, those outside it. Each sample gets a last Gauss-Newton step, and albedo is fitted to
-    every channel.
+    Every patch is factorized by itself. The light field (:class:`FitLight
+    <pimper_torch.photometry.fit_light.FitLight>`) is the prior mean of its lights; colours and
+    exposures of views are divided out first. Samples in shadow of the point light are left out, or,
+    where they are most of a patch in a lit room, those outside it. Each sample gets a last
+    Gauss-Newton step, and albedo is fitted to every channel.
 
-    In parts, for patches that are not all in memory at once: :meth:`light` from thinned
-    templates, :meth:`solve` for some patches at a time, and :meth:`conclude` for all of them.
-
-    Gauge: albedo and light share one free factor for the whole scene; it is set so that the
-    99th percentile of gray albedo is 1. With ``light_prior=0`` each patch has its own Lorentz
-    ambiguity besides, fixed by the initial values.
+    Gauge: albedo and light share one free factor for the whole scene, which :class:`FixGauge
+    <pimper_torch.photometry.gauge.FixGauge>` sets. With ``light_prior=0`` each patch has its own
+    Lorentz ambiguity besides, fixed by the initial values.
 
     Where it fails softly: samples lit in fewer than ``min_views`` views, or whose normal faces
     away, keep the coarse normal, are not ``valid`` and have information 0. Patches that light
@@ -222,54 +176,29 @@ class Factorize(Stage):
             require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)
         self.priors = nn.ModuleList(priors)
 
-    def forward(self, seen: PatchViews) -> PhotometricPatches:
-        """Factorize all patches: :meth:`light`, :meth:`solve` and :meth:`conclude` in turn."""
-        light = self.light(seen)
-        parts = zip(seen.patches.buckets, seen.buckets, strict=True)
-        solved = side_by_side(partial(self._solved, seen.patches.coarse, light), list(parts))
-        return self.conclude(PhotometricPatches(patches=seen.patches, buckets=tuple(solved)))
-
-    def light(self, seen: PatchViews) -> Illumination:
-        """Fit the light field.
+    def forward(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
+        """Factorize patches, independently of one another.
 
         Args:
-            seen: Of all patches; views on templates that are
-                :func:`~pimper_torch.photometry.lights.thinned` are enough.
-        """
-        coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
-        field = self._field(seen, coarse)
-        variance: float | Float[Tensor, ""] = 0.0
-        guesses = [bucket.priors for bucket in seen.buckets]
-        if any(each is not None and bool(each.normal_information.any()) for each in guesses):
-            led = [_beside_guesses(*pair) for pair in zip(coarse, guesses, strict=True)]
-            under = self._field(seen, led)
-            # The photographs decide whether the surface or the guess is nearer to the truth.
-            if _misfit(seen, under, led) < _GUESS_GAIN * _misfit(seen, field, coarse):
-                field = under
-            else:
-                variance = _excess_variance(coarse, guesses)
-        caster: RayCaster | None = None
-        if self.config.shadows and bool(field.point_light.any()):
-            mesh = seen.patches.surface or seen.patches.coarse.mesh
-            caster = RayCaster(mesh.vertices_world, mesh.faces)
-        return Illumination(field=field, caster=caster, guess_variance=variance)
-
-    def _field(self, seen: PatchViews, normals: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
-        config = self.config
-        return light_of_mesh(seen, normals, config.min_views, config.light, config.colours)
-
-    def solve(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
-        """Factorize some patches, independently of others.
+            seen: Of all patches, or of some buckets.
+            light: As :class:`~pimper_torch.photometry.fit_light.FitLight` fits it.
 
         Returns:
-            Albedo and lights up to the factor of the scene, which :meth:`conclude` sets.
+            Albedo and lights up to the factor of the scene, see
+            :class:`~pimper_torch.photometry.gauge.FixGauge`.
         """
-        parts = zip(seen.patches.buckets, seen.buckets, strict=True)
-        solved = tuple(self._solved(seen.patches.coarse, light, part) for part in parts)
-        return PhotometricPatches(patches=seen.patches, buckets=solved)
+        mesh = seen.patches.surface or seen.patches.coarse.mesh
+        caster = ray_caster(mesh) if light.shadows else None
+        parts = list(zip(seen.patches.buckets, seen.buckets, strict=True))
+        one = partial(self._solved, seen.patches.coarse, light, caster)
+        return PhotometricPatches(patches=seen.patches, buckets=tuple(side_by_side(one, parts)))
 
     def _solved(
-        self, coarse: CoarseMesh, light: Illumination, part: tuple[Templates, Observations]
+        self,
+        coarse: CoarseMesh,
+        light: Illumination,
+        caster: RayCaster | None,
+        part: tuple[Templates, Observations],
     ) -> Photometry:
         """Factorize a bucket."""
         templates, registered = part
@@ -283,7 +212,7 @@ class Factorize(Stage):
         def work(patches: slice) -> Photometry:
             taken = bucket.take(patches)
             return self._photometry(
-                taken, *self._prepare(taken, *_illuminated(taken, light), light)
+                taken, *self._prepare(taken, *_illuminated(taken, light.field, caster), light)
             )
 
         solved = over_patches(
@@ -295,17 +224,6 @@ class Factorize(Stage):
         exposure = exposure.to(solved.lights_patch).expand(len(templates.facet), -1)
         lights = solved.lights_patch * exposure[..., None]
         return solved.replace(lights_patch=lights, exposure=exposure)
-
-    def conclude(self, solved: PhotometricPatches) -> PhotometricPatches:
-        """Set the scale of albedo over all patches, and warn of those that are undetermined."""
-        config = self.config
-        status = torch.cat([bucket.status for bucket in solved.buckets])
-        mesh, facet = solved.patches.coarse.mesh, [one.facet for one in solved.patches.buckets]
-        undetermined = status != int(PatchStatus.DETERMINED)
-        at = mesh.vertices_world, mesh.faces[torch.cat(facet)]
-        leave_out("photometry.undetermined", undetermined, at=at)
-        warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
-        return in_gauge(solved)
 
     def _prepare(
         self,
@@ -393,7 +311,7 @@ class Factorize(Stage):
         refused: Bool[Tensor, " patch"],
         raster: int,
         registered: Observations,
-        variance: float | Float[Tensor, ""],
+        variance: Float[Tensor, ""],
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
@@ -466,18 +384,6 @@ def _balanced(registered: Observations, field: LightField) -> Observations:
     return registered.replace(radiance=balanced)
 
 
-def _lights_in_patches(
-    field: LightField, patch_from_world: Float[Tensor, "patch 4 4"]
-) -> tuple[
-    Float[Tensor, "patch view 4"], Float[Tensor, "patch view 4"], Float[Tensor, "patch view 3"]
-]:
-    """Return first-order light at the centres of patches, soft light alone, and the point light."""
-    centre, outward = invert_rigid(patch_from_world)[:, :3, 3], -patch_from_world[:, 2, :3]
-    both, soft = field.lights_at(centre, outward), field.soft_at(outward)
-    point_light = rotate(patch_from_world, field.point_light_at(centre))
-    return rotate_lights(patch_from_world, both), rotate_lights(patch_from_world, soft), point_light
-
-
 def _lit(
     rows: Rows,
     field: LightField,
@@ -489,52 +395,12 @@ def _lit(
 
     What is mostly in shadow of the lamp has the room's light in that view.
     """
-    lights, soft, point_light = _lights_in_patches(field, patch_from_world)
+    lights, soft, point_light = lights_in_patches(field, patch_from_world)
     lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
     shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
     by_soft = shaded & rows.seen & is_strong(soft, point_light)[..., None]
     in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
     return torch.where(in_room, by_soft, lit), torch.where(in_room, soft, lights)
-
-
-def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ _ _ 3"]]) -> float:
-    """Return the median residual of normals under a light field, over what it predicts."""
-    found = []
-    for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
-        rows = rows_of(templates, registered, own)
-        lights, _, _ = _lights_in_patches(templates.own(field), templates.patch_from_world.to(own))
-        gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
-        predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
-        some = rows.seen & (predicted > 0)
-        found.append(((gray - predicted).abs() / predicted.clamp_min(1e-12))[some])
-    return float(torch.cat(found).detach().median()) if sum(map(len, found)) else math.inf
-
-
-def _excess_variance(
-    normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
-) -> Float[Tensor, ""]:
-    """Return the variance of guessed normals about the surface's, beyond what both claim."""
-    square, claimed = [], []
-    for own, guess in zip(normals, guesses, strict=True):
-        if guess is not None:
-            some = guess.normal_information > 0
-            square.append((guess.normals_patch - own)[some].square().sum(dim=-1))
-            claimed.append(1 / guess.normal_information[some])
-    # Half of the squares of two Gaussian components lie below 2 log 2 times their variance.
-    found = torch.cat(square).median() / math.log(2)
-    claims = torch.cat(claimed).median() + 1 / _SURFACE_INFORMATION
-    return (found - claims).clamp_min(0)
-
-
-def _beside_guesses(
-    normals: Float[Tensor, "patch height width 3"], guessed: PatchPriors | None
-) -> Float[Tensor, "patch height width 3"]:
-    """Average the surface's normals with those that were guessed, where there are any."""
-    if guessed is None:
-        return normals
-    information = guessed.normal_information[..., None]
-    both = _SURFACE_INFORMATION * normals + information * guessed.normals_patch
-    return torch.where(information > 0, normalize(both, dim=-1), normals)
 
 
 def _samples(
@@ -543,7 +409,7 @@ def _samples(
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
     registered: Observations,
-    variance: float | Float[Tensor, ""],
+    variance: Float[Tensor, ""],
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
     guessed = registered.priors
@@ -635,18 +501,18 @@ def _lost(bucket: _Bucket, some: slice) -> Photometry:
 
 @torch.no_grad()
 def _illuminated(
-    bucket: _Bucket, light: Illumination
+    bucket: _Bucket, field: LightField, caster: RayCaster | None
 ) -> tuple[Bool[Tensor, "patch view height width"], Bool[Tensor, "patch view height width"]]:
     """Find observed samples that are not in cast shadows, and those that are; no edges of them."""
     registered, templates = bucket.registered, bucket.templates
-    if light.caster is None:
+    if caster is None:
         return registered.valid, torch.zeros_like(registered.valid)
     world_from_patch = invert_rigid(templates.patch_from_world)
     raster = templates.points_patch.shape
     points_world = transform(world_from_patch, templates.points_patch.flatten(1, 2))
     shadows = cast_shadows_on_rasters(
-        light.field,
-        light.caster,
+        field,
+        caster,
         points_world.reshape(raster),
         rotate(world_from_patch, bucket.normals.flatten(1, 2)).reshape(raster),
         templates.spacing,
@@ -666,23 +532,3 @@ def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor,
     square = predicted.square().sum(dim=2)
     gain = (predicted * gray).sum(dim=2) / torch.where(square > 0, square, 1)
     return lights * torch.where((square > 0) & (gain > 0), gain, 1)[..., None]
-
-
-def in_gauge(solved: PhotometricPatches) -> PhotometricPatches:
-    """Set the 99th percentile of gray albedo to 1, where light determines normals if anywhere."""
-    determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
-    gray = torch.cat(
-        [
-            bucket.albedo.mean(dim=-1)[bucket.valid if determined else bucket.observed]
-            for bucket in solved.buckets
-        ]
-    )
-    if len(gray) == 0:
-        return solved
-    bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
-    factor = torch.where(bright > 0, bright, 1)
-    buckets = tuple(
-        bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
-        for bucket in solved.buckets
-    )
-    return solved.replace(buckets=buckets)

@@ -16,7 +16,7 @@ class StageReport(Record):
 
     Attributes:
         peak_memory_mb: Highest resident memory of the process up to the stage's end.
-        figures: Counts and shares worth telling, such as ``samples`` or ``missing_fraction``.
+        figures: Counts and shares worth telling, such as ``samples`` or ``missing_samples``.
         kept: Whether an earlier run found the record; time and memory are that run's.
     """
 

@@ -1,8 +1,8 @@
 """Every stage and chain, under one name: ``pt.stages.Warp``.
 
 ``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
-``TraceContours`` and ``CoarseSurface``; for each scale ``Decompose``, ``Warp``, ``Factorize``,
-``Sweep``, ``Fuse``, ``Repair`` and ``Remesh``; then ``Extract``.
+``TraceContours`` and ``CoarseSurface``; for each scale ``Decompose``, ``Warp``, ``FitLight``,
+``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then ``Extract``.
 """
 
 from pimper_torch.chains.chain import Chain as Chain
@@ -25,10 +25,15 @@ from pimper_torch.patches.decompose import Decompose as Decompose
 from pimper_torch.patches.warp import Warp as Warp
 from pimper_torch.photometry.factorize import Factorize as Factorize
 from pimper_torch.photometry.factorize import FactorizeConfig as FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight as FitLight
+from pimper_torch.photometry.fit_light import FitLightConfig as FitLightConfig
+from pimper_torch.photometry.fit_light import Illumination as Illumination
+from pimper_torch.photometry.gauge import FixGauge as FixGauge
 from pimper_torch.sfm.reconstruct import Reconstruct as Reconstruct
 from pimper_torch.silhouettes.contours import Contours as Contours
 from pimper_torch.silhouettes.contours import TraceContours as TraceContours
 from pimper_torch.silhouettes.find import FindSilhouettes as FindSilhouettes
 from pimper_torch.stage import Given as Given
 from pimper_torch.stage import Stage as Stage
+from pimper_torch.stage import Then as Then
 from pimper_torch.sweep.sweep import Sweep as Sweep

@@ -15,7 +15,7 @@ def show(terminal, plan=()):
         name="warp",
         seconds=2.5,
         peak_memory_mb=9.0,
-        figures={"samples": 12345, "missing_fraction": 0.25},
+        figures={"samples": 12345, "missing_samples": 3086},
     )
     forecast = Forecast()
     forecast.plan = plan
@@ -31,15 +31,15 @@ def show(terminal, plan=()):
 def test_a_terminal_sees_a_bar_that_ends_full():
     shown = show(terminal=True)
     assert "100%" in shown
-    assert "samples 12,345, missing fraction 0.25" in shown
+    assert "samples 12,345, missing samples 3,086" in shown
 
 
 def test_a_log_file_sees_one_line_a_stage():
     shown = show(terminal=False)
-    assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing fraction 0.25"
+    assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing samples 3,086"
 
 
 def test_the_time_left_for_the_run_is_told_in_the_line_of_the_stage():
     plan = [("warp", 2.5), ("write", 600.0)]
-    assert show(False, plan).splitlines()[0].endswith("fraction 0.25  [about 10 minutes left]")
+    assert show(False, plan).splitlines()[0].endswith("samples 3,086  [about 10 minutes left]")
     assert "about 10 minutes left" in show(True, plan)

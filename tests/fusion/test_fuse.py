@@ -8,7 +8,7 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.chains.streaming import warn_of_priors
+from pimper_torch.chains.photometric import warn_of_priors
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig

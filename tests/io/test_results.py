@@ -190,11 +190,11 @@ def test_the_summary_counts(reconstruction):
 
 
 def test_numbers_that_json_cannot_hold_become_null(reconstruction, tmp_path):
-    report = reconstruction.report[0].replace(figures={"missing_fraction": float("nan")})
+    report = reconstruction.report[0].replace(figures={"mean_residual": float("nan")})
     write_result(reconstruction.replace(report=(report,)), Config(), tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["missing_fraction"] is None
-    assert summary["stages"][0]["missing_fraction"] is None
+    assert summary["stages"][0]["mean_residual"] is None
 
 
 def test_a_failure_in_the_centre_leaves_nothing_behind(reconstruction, tmp_path, monkeypatch):

@@ -198,7 +198,7 @@ def test_costs_of_heights_and_their_gradients_are_those_of_torch(photographed, c
 def test_buckets_by_themselves_give_what_all_give_together(photographed):
     views, cameras, lifted = photographed
     patches, warp, sweep = lifted.seen.patches, Warp(), Sweep()
-    sources = warp.prepare(views).hidden_by(patches.coarse.mesh)
+    sources = prepare(views)
     together = warp(views, cameras, patches)
     swept = sweep(views, cameras, lifted.seen, lifted.photometric)
     for place, bucket in enumerate(patches.buckets):

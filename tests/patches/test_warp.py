@@ -6,8 +6,9 @@ from pimper_torch.errors import ConfigError
 from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.sources import look_up, pyramid_level
-from pimper_torch.patches.warp import Warp, WarpConfig, missing_fraction
+from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.records import CoarseMesh, Mesh
+from pimper_torch.reporting import figures
 
 
 @pytest.fixture
@@ -36,7 +37,8 @@ def test_every_view_gives_the_albedo_at_each_samples_own_point(registered):
 def test_missing_samples_are_zero(registered):
     for seen in registered.buckets:
         assert (seen.radiance * ~seen.valid[:, :, None]).abs().max() == 0
-    assert 0 <= missing_fraction(registered) < 0.2
+    counts = figures(registered)
+    assert 0 <= counts["missing_samples"] < 0.2 * counts["samples"]
 
 
 def test_viewers_are_the_directions_to_the_cameras(registered, plane_scene):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from solved import solved
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
@@ -11,6 +12,7 @@ from twins import using
 from pimper_torch.errors import PimperWarning
 from pimper_torch.photometry.bilinear import residual_deviation
 from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.photometry.fit_light import FitLight
 from pimper_torch.photometry.lights import fit_light_field, thinned
 from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
@@ -103,7 +105,7 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
     results = []
     for how in ("numba", "torch"):
         with using(how), pytest.warns(PimperWarning, match="1 of 8"):
-            results.append(Factorize()(seen))
+            results.append(solved(Factorize(), seen))
     for one, other in zip(results[0].buckets, results[1].buckets, strict=True):
         assert_close(one.status, other.status)
         assert_close(one.valid, other.valid)
@@ -133,8 +135,8 @@ def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
         registered.append(
             each.replace(radiance=radiance, valid=each.valid[..., rows, :][..., rows])
         )
-    few = Factorize().light(true.seen.replace(patches=thin, buckets=tuple(registered)))
-    every = Factorize().light(true.seen)
+    few = FitLight()(true.seen.replace(patches=thin, buckets=tuple(registered)))
+    every = FitLight()(true.seen)
     at = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[0.0, 0.0, -1.0]]).double()
     # Exact data: both are the truth.
     assert_close(few.field.lights_at(*at), every.field.lights_at(*at), rtol=0, atol=5e-3)

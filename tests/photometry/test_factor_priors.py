@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 from derivatives import check_derivatives
+from solved import solved
 from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -17,6 +18,7 @@ from pimper_torch.photometry.factor_priors import (
     views_worth,
 )
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight
 from pimper_torch.records import PatchPriors
 from tests.photometry.test_factorize import median_error
 
@@ -41,15 +43,17 @@ def carried(seen, **changes):
 
 def test_the_default_list_is_what_the_settings_weigh(scene):
     seen = scene(bumps=0.2).seen
-    found = Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2))(seen)
-    listed = Factorize(priors=[FieldLights(0.5), SurfaceNormals(0.2)])(seen)
-    unknowing = Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2))(carried(seen))
+    found = solved(Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2)), seen)
+    listed = solved(Factorize(priors=[FieldLights(0.5), SurfaceNormals(0.2)]), seen)
+    unknowing = solved(
+        Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2)), carried(seen)
+    )
     for one, *others in zip(found.buckets, listed.buckets, unknowing.buckets, strict=True):
         for other in others:
             assert torch.equal(one.normals_patch, other.normals_patch)
             assert torch.equal(one.lights_patch, other.lights_patch)
-    free = Factorize(FactorizeConfig(light_prior=0.0, geometry_weight=0.2))(seen)
-    without = Factorize(priors=[SurfaceNormals(0.2)])(seen)
+    free = solved(Factorize(FactorizeConfig(light_prior=0.0, geometry_weight=0.2)), seen)
+    without = solved(Factorize(priors=[SurfaceNormals(0.2)]), seen)
     for one, other in zip(free.buckets, without.buckets, strict=True):
         assert torch.equal(one.lights_patch, other.lights_patch)
     with pytest.raises(ConfigError, match="derived from FactorPrior"):
@@ -60,7 +64,7 @@ def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
     true = scene(bumps=0.3)
     information = [torch.full_like(each[..., 0], math.radians(2) ** -2) for each in true.normals]
     seen = carried(true.seen, normals_patch=true.normals, normal_information=information)
-    plain, led = Factorize()(true.seen), Factorize()(seen)
+    plain, led = solved(Factorize(), true.seen), solved(Factorize(), seen)
     assert median_error(led, true) < 0.8 * median_error(plain, true)
 
 
@@ -72,11 +76,11 @@ def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
         albedo = [unit * each.mean(dim=-1) for each in true.albedo]
         variance = [torch.full_like(each, 1e-4) for each in albedo]
         seen = carried(true.seen, albedo=albedo, albedo_variance=variance)
-        found.append(Factorize(priors=priors)(seen))
+        found.append(solved(Factorize(priors=priors), seen))
     for one, other, views in zip(*(each.buckets for each in found), true.seen.buckets, strict=True):
         assert_close(one.normals_patch, other.normals_patch, rtol=0, atol=1e-3)
         assert one.lights_patch.shape[1] == views.valid.shape[1]
-    plain = Factorize(priors=priors)(true.seen)
+    plain = solved(Factorize(priors=priors), true.seen)
     assert median_error(found[0], true) < median_error(plain, true)
 
 
@@ -90,22 +94,24 @@ def test_guessed_inliers_leave_out_what_does_not_fit(scene):
         inlier.append((~wrong).to(bucket.radiance))
     seen = true.seen.replace(buckets=tuple(spoilt))
     squares = FactorizeConfig(loss="squares")
-    blind = median_error(Factorize(squares)(seen), true)
-    knowing = median_error(Factorize(squares)(carried(seen, inlier=inlier)), true)
+    blind = median_error(solved(Factorize(squares), seen), true)
+    knowing = median_error(solved(Factorize(squares), carried(seen, inlier=inlier)), true)
     assert knowing < 0.7 * blind
-    deaf = Factorize(squares, [FieldLights(), SurfaceNormals()])(carried(seen, inlier=inlier))
+    deaf = solved(
+        Factorize(squares, [FieldLights(), SurfaceNormals()]), carried(seen, inlier=inlier)
+    )
     assert float(median_error(deaf, true)) > 0.9 * float(blind)
 
 
 def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
     true = scene(bumps=0.2)
-    plain = Factorize(priors=[FieldLights(1e6)])(true.seen)
+    plain = solved(Factorize(priors=[FieldLights(1e6)]), true.seen)
     lights = [3.0 * bucket.lights_patch for bucket in plain.buckets]
     wrong = [each + each.norm(dim=2, keepdim=True) * 0.3 for each in lights]
     for variance, pulled in ((1e-6, True), (1e6, False)):
         variances = [torch.full_like(each[..., 0], variance) for each in lights]
         seen = carried(true.seen, lights_patch=wrong, light_variance=variances)
-        found = Factorize(priors=[FieldLights(1.0), Guesses()])(seen)
+        found = solved(Factorize(priors=[FieldLights(1.0), Guesses()]), seen)
         for one, given in zip(found.buckets, wrong, strict=True):
             cosine = torch.cosine_similarity(one.lights_patch, given, dim=2)
             assert bool((cosine > 0.9999).all()) == pulled
@@ -132,11 +138,15 @@ def test_gradients_reach_a_prior_from_elsewhere(scene):
         patches=seen.patches.replace(buckets=seen.patches.buckets[:1]), buckets=seen.buckets[:1]
     )
 
+    light = FitLight()(part)
+
     def factorized(inputs):
         prior = Leaning()
         stage = Factorize(priors=[FieldLights(), prior])
         found = torch.func.functional_call(
-            stage, {"priors.1.lean": inputs["lean"], "priors.1.trust": inputs["trust"]}, (part,)
+            stage,
+            {"priors.1.lean": inputs["lean"], "priors.1.trust": inputs["trust"]},
+            (part, light),
         )
         return {"normals": found.buckets[0].normals_patch, "lights": found.buckets[0].lights_patch}
 

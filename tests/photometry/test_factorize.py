@@ -1,8 +1,9 @@
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import pytest
 import torch
+from solved import solved
 from torch.nn.functional import pad
 from torch.testing import assert_close
 
@@ -11,6 +12,7 @@ from pimper_torch.errors import ConfigError, PimperWarning
 from pimper_torch.patches.transfer import coarse_normals
 from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.photometry.fit_light import FitLight, FitLightConfig
 from pimper_torch.photometry.light_field import LightField, harmonics
 from pimper_torch.records import PatchStatus, PatchViews
 
@@ -33,7 +35,7 @@ def median_error(found, scene):
 
 def test_the_mesh_starts_at_the_truth_and_stays_when_it_is_the_truth(scene):
     true = scene(bumps=0.0)
-    found = Factorize(EXACT)(true.seen)
+    found = solved(Factorize(EXACT), true.seen)
     ratios = []
     for bucket, normals, albedo, registered in zip(
         found.buckets, true.normals, true.albedo, true.seen.buckets, strict=True
@@ -59,7 +61,7 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
             for t, n in zip(true.seen.patches.buckets, true.normals, strict=True)
         ]
     ).median()
-    found = Factorize(FactorizeConfig(solver=solver, geometry_weight=0.0))(true.seen)
+    found = solved(Factorize(FactorizeConfig(solver=solver, geometry_weight=0.0)), true.seen)
     assert start > 10
     assert median_error(found, true) < 0.25 * start
     for bucket in found.buckets:
@@ -79,7 +81,7 @@ def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
     radiance = first.radiance.clone().requires_grad_()
     seen = true.seen.to(torch.float32)
     seen = seen.replace(buckets=(first.replace(radiance=radiance), *others))
-    found = Factorize(config)(seen)
+    found = solved(Factorize(config), seen)
     assert median_error(found, true) < 3  # of a start 10 degrees off
     total = sum(bucket.albedo.square().sum() for bucket in found.buckets)
     (slope,) = torch.autograd.grad(total, radiance)
@@ -89,8 +91,9 @@ def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
 
 def test_the_published_method_stays_at_the_ambiguity_of_its_start(scene):
     true = scene(bumps=0.3)
-    paper = load_config("paper").factorize
-    assert median_error(Factorize(paper)(true.seen), true) < 5  # the bumps have 17 degrees
+    paper = load_config("paper")
+    found = solved(Factorize(paper.factorize), true.seen, **asdict(paper.light))
+    assert median_error(found, true) < 5  # the bumps have 17 degrees
 
 
 def test_samples_lit_by_few_have_no_say(scene):
@@ -99,7 +102,7 @@ def test_samples_lit_by_few_have_no_say(scene):
     valid = first.valid.clone()
     valid[1, 3:, 4:7] = False  # three views left in these rows
     seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
-    found = Factorize()(seen).buckets[0]
+    found = solved(Factorize(), seen).buckets[0]
     assert not found.valid[1, 4:7].any()
     assert (found.information[1, 4:7] == 0).all()
     coarse = coarse_normals(seen.patches.coarse, seen.patches.buckets[0])
@@ -111,7 +114,7 @@ def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
     with pytest.warns(PimperWarning, match=r"8 of 8 patches keep .* silhouettes are wrong"):
-        found = Factorize()(true.seen)
+        found = solved(Factorize(), true.seen)
     for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True):
         assert (bucket.status == PatchStatus.CONSTANT_LIGHT).all()
         assert not bucket.valid.any()
@@ -129,7 +132,7 @@ def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
     radiance[2, 3] *= 0.6  # a shadow over one patch in one view, which the field does not know
     seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
     with pytest.warns(PimperWarning, match="light varies too little"):
-        found = Factorize()(seen)
+        found = solved(Factorize(), seen)
     for bucket, templates, one in zip(
         found.buckets, seen.patches.buckets, seen.buckets, strict=True
     ):
@@ -148,13 +151,13 @@ def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
-    def illuminated(bucket, _):
+    def illuminated(bucket, *_):
         lit = bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
         return lit, torch.zeros_like(lit)
 
     monkeypatch.setattr(factorize, "_illuminated", illuminated)
     with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
-        found = Factorize()(true.seen).buckets[0]
+        found = solved(Factorize(), true.seen).buckets[0]
     observations = true.seen.buckets[0]
     seen = observations.valid[1]
     assert not found.valid[1].any()
@@ -180,17 +183,19 @@ def test_in_the_lamps_shadow_the_rooms_light_tells_normals_where_it_is_strong(
         point_light=lamp,  # shadowed all over
         closeness=torch.zeros(12).double(),
     )
-    monkeypatch.setattr(Factorize, "_field", lambda *_: field)
+    monkeypatch.setattr(FitLight, "_field", lambda *_: field)
     monkeypatch.setattr(
         factorize,
         "_illuminated",
-        lambda bucket, _: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
+        lambda bucket, *_: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
     )
     if strength > 1:
         with pytest.warns(PimperWarning, match="8 of 8 patches keep"):
-            assert not any(bucket.valid.any() for bucket in Factorize(EXACT)(true.seen).buckets)
+            assert not any(
+                bucket.valid.any() for bucket in solved(Factorize(EXACT), true.seen).buckets
+            )
         return
-    assert median_error(Factorize(EXACT)(true.seen), true) < 0.1
+    assert median_error(solved(Factorize(EXACT), true.seen), true) < 0.1
 
 
 def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
@@ -203,8 +208,8 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
             for one in true.seen.buckets
         )
     )
-    white, found = Factorize(EXACT)(true.seen), Factorize(EXACT)(tinted)
-    gray = Factorize(FactorizeConfig(**asdict(EXACT) | {"colours": False}))(tinted)
+    white, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), tinted)
+    gray = solved(Factorize(EXACT), tinted, colours=False)
     for one, two, three in zip(white.buckets, found.buckets, gray.buckets, strict=True):
         share = one.albedo / one.albedo.mean(dim=-1, keepdim=True)
 
@@ -227,8 +232,8 @@ def test_exposures_of_the_views_are_those_of_the_lights_and_leave_normals(scene)
             for one in true.seen.buckets
         )
     )
-    plain, found = Factorize(EXACT)(true.seen), Factorize(EXACT)(exposed)
-    unlike = Factorize(replace(EXACT, colours=False))(exposed)
+    plain, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), exposed)
+    unlike = solved(Factorize(EXACT), exposed, colours=False)
     for one, two, three in zip(plain.buckets, found.buckets, unlike.buckets, strict=True):
         assert (one.exposure == 1).all()
         assert (three.exposure == 1).all()
@@ -259,9 +264,9 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
     without = spoil(true.seen, "masked")
     keep = torch.tensor([0, 1, 3, 4])
     with pytest.warns(PimperWarning, match="1 of 8"):
-        found = Factorize()(spoil(true.seen, how))
+        found = solved(Factorize(), spoil(true.seen, how))
     with pytest.warns(PimperWarning):
-        plain = Factorize()(without)
+        plain = solved(Factorize(), without)
     bad, good = found.buckets[0], plain.buckets[0]
     reason = PatchStatus.UNSEEN if how == "masked" else PatchStatus.NOT_FINITE
     assert bad.status[2] == reason
@@ -280,7 +285,7 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
         for each in true.seen.buckets
     )
     with pytest.warns(PimperWarning, match="8 have no valid sample in any view"):
-        found = Factorize()(true.seen.replace(buckets=buckets))
+        found = solved(Factorize(), true.seen.replace(buckets=buckets))
     for bucket in found.buckets:
         assert bucket.normals_patch.isfinite().all()
         assert (bucket.albedo == 0).all()
@@ -295,8 +300,8 @@ def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
         )
         for each in true.seen.buckets
     )
-    alone = FactorizeConfig(light="soft", loss="squares", light_prior=1e6, geometry_weight=0.0)
-    found = Factorize(alone)(true.seen.replace(buckets=buckets))
+    alone = FactorizeConfig(loss="squares", light_prior=1e6, geometry_weight=0.0)
+    found = solved(Factorize(alone), true.seen.replace(buckets=buckets), model="soft")
     variance, square = [], []
     for bucket, normals in zip(found.buckets, true.normals, strict=True):
         variance.append(1 / bucket.information[bucket.valid])
@@ -312,7 +317,7 @@ def test_gradients_reach_the_radiance_of_lit_samples_only(scene, generator):
 
     def total(radiance):
         seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
-        found = Factorize()(seen).buckets[0]
+        found = solved(Factorize(), seen).buckets[0]
         return found.normals_patch[..., 0].sum() + found.albedo.sum()
 
     radiance = first.radiance.clone().requires_grad_()
@@ -329,16 +334,22 @@ def test_gradients_reach_the_radiance_of_lit_samples_only(scene, generator):
 def test_what_is_handed_in_is_left_alone(scene):
     true = scene()
     before = [each.radiance.clone() for each in true.seen.buckets]
-    Factorize()(true.seen)
+    solved(Factorize(), true.seen)
     for each, copy in zip(true.seen.buckets, before, strict=True):
         assert_close(each.radiance, copy, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("field", ["solver", "loss", "light"])
-def test_unknown_ways_are_refused(field):
-    config = FactorizeConfig()
-    object.__setattr__(config, field, "random")  # past the type checker of the tests
-    with pytest.raises(ConfigError, match=f"factorize.{field}"):
+@pytest.mark.parametrize(
+    ("config", "field"),
+    [
+        (FactorizeConfig(), "factorize.solver"),
+        (FactorizeConfig(), "factorize.loss"),
+        (FitLightConfig(), "light.model"),
+    ],
+)
+def test_unknown_ways_are_refused(config, field):
+    object.__setattr__(config, field.split(".")[1], "random")  # past the type checker of the tests
+    with pytest.raises(ConfigError, match=field):
         config.__post_init__()
 
 
@@ -349,7 +360,7 @@ def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
     valid[1, 3:] = False
     seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
     with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
-        found = Factorize()(seen).buckets[0]
+        found = solved(Factorize(), seen).buckets[0]
     assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
     assert (found.lights_patch[1, 3:] == 0).all()
     assert found.convergence.residual.isfinite().all()
@@ -361,7 +372,7 @@ def test_a_view_that_sees_nothing_has_no_light(scene):
         each.replace(valid=each.valid & (torch.arange(12) != 4)[:, None, None])
         for each in true.seen.buckets
     )
-    found = Factorize()(true.seen.replace(buckets=buckets))
+    found = solved(Factorize(), true.seen.replace(buckets=buckets))
     assert (found.buckets[0].lights_patch[:, 4] == 0).all()
     assert (found.buckets[0].lights_patch[:, 5] != 0).any()
     assert found.buckets[0].valid.any()

@@ -3,6 +3,7 @@
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from solved import solved
 from torch.testing import assert_close
 
 from pimper_torch.photometry.factorize import Factorize
@@ -24,7 +25,7 @@ def shuffled(count, seed):
 @given(seed=SEEDS, power=st.integers(-10, 10))
 def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, power):
     seen = scene().seen
-    usual = Factorize()(seen)
+    usual = solved(Factorize(), seen)
     gain, views = 2.0**power, shuffled(12, seed)
     orders = [
         shuffled(len(one.radiance), seed + 1 + index) for index, one in enumerate(seen.buckets)
@@ -38,7 +39,7 @@ def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, po
         one.replace(radiance=gain * one.radiance[:, views], valid=one.valid[:, views]).take(order)
         for one, order in zip(seen.buckets, orders, strict=True)
     )
-    found = Factorize()(PatchViews(patches=patches, buckets=buckets))
+    found = solved(Factorize(), PatchViews(patches=patches, buckets=buckets))
     for before, after, order in zip(usual.buckets, found.buckets, orders, strict=True):
         assert torch.equal(after.valid, before.valid[order])
         normals = before.normals_patch[order]

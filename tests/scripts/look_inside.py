@@ -1,4 +1,4 @@
-"""Log every record of a run, use a factorization of one's own, plot one patch."""
+"""Log every record of a run, use a stage of one's own, plot one patch."""
 
 import logging
 import sys
@@ -9,14 +9,14 @@ import pimper_torch as pt
 
 
 class WithoutHighlights(pt.Stage):
-    """The package's factorization, with albedo held below what nine in ten samples have."""
+    """The package's gauge, with albedo held below what nine in ten samples have."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.factorize = pt.Factorize(pt.FactorizeConfig(loss="squares"))
+        self.gauge = pt.stages.FixGauge()
 
-    def forward(self, seen: pt.PatchViews) -> pt.PhotometricPatches:
-        found = self.factorize(seen)
+    def forward(self, solved: pt.PhotometricPatches) -> pt.PhotometricPatches:
+        found = self.gauge(solved)
         limit = torch.cat([bucket.albedo[bucket.valid].flatten() for bucket in found.buckets])
         most = float(limit.quantile(0.9))
         held = [bucket.replace(albedo=bucket.albedo.clamp_max(most)) for bucket in found.buckets]
@@ -24,7 +24,7 @@ class WithoutHighlights(pt.Stage):
 
 
 def main(scene: pt.SparseScene, mesh: pt.Mesh, picture: str) -> None:
-    chain = pt.load_chain("default", {"scales": [0.5, 1.0]}, factorize=WithoutHighlights())
+    chain = pt.load_chain("default", {"scales": [0.5, 1.0]}, gauge=WithoutHighlights())
     for step in chain.steps(scene, mesh=mesh):
         for record in (step.scene, step.coarse, step.photometric, step.heights, step.surface):
             logging.getLogger("run").info("%s: %s", step.scale, record)

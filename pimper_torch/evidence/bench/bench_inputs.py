@@ -196,7 +196,7 @@ def _preset(name: str) -> Method:
             mesh_points=int(found["mesh_points"]),
             triangles=int(found["triangles"]),
             samples=int(found["samples"]),
-            missing_fraction=float(found["missing_fraction"]),
+            missing_fraction=found["missing_samples"] / found["samples"],
         )
 
     return run

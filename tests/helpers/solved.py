@@ -1,0 +1,9 @@
+"""What a chain makes of samples: light, factorization and gauge, one after the other."""
+
+from pimper_torch.photometry.fit_light import FitLight, FitLightConfig
+from pimper_torch.photometry.gauge import FixGauge
+
+
+def solved(factorize, seen, **light):
+    """Factorize under the light that is fitted, with these settings of it, and set the gauge."""
+    return FixGauge()(factorize(seen, FitLight(FitLightConfig(**light))(seen)))
