@@ -12,6 +12,9 @@ from . import size as size
 from . import stages as stages
 from . import store as store
 from . import viz as viz
+from .asset.finish import MeshFiles as MeshFiles
+from .asset.finish import Simplify as Simplify
+from .asset.make import Texture as Texture
 from .batches.many_objects import batch as batch
 from .batches.objects import Object as Object
 from .batches.task import Outcome as Outcome
@@ -36,7 +39,6 @@ from .errors import ReconstructionError as ReconstructionError
 from .exchange.result import Result as Result
 from .exchange.result import read_result as read_result
 from .fusion.fuse import Fuse as Fuse
-from .io.finish import MeshFiles as MeshFiles
 from .io.meshes import read_mesh as read_mesh
 from .io.photographs import load_views as load_views
 from .io.results import write_result as write_result
@@ -81,6 +83,7 @@ from .records import SweptPatches as SweptPatches
 from .records import Views as Views
 from .records.stored import load_record as load_record
 from .records.stored import save_record as save_record
+from .relighting.held_out import Relight as Relight
 from .sfm.reconstruct import Reconstruct as Reconstruct
 from .silhouettes.contours import Contours as Contours
 from .silhouettes.contours import TraceContours as TraceContours

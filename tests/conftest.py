@@ -56,7 +56,7 @@ def _answered_once(function: Callable[..., object]) -> Callable[..., object]:
     @wraps(function)
     def answer(*given: object) -> object:
         asked = io.BytesIO()
-        torch.save((function.__name__, given), asked)
+        torch.save((function.__qualname__, given), asked)
         if asked.getvalue() not in _ANSWERED:
             _ANSWERED[asked.getvalue()] = function(*given)
         return _ANSWERED[asked.getvalue()]
@@ -67,10 +67,11 @@ def _answered_once(function: Callable[..., object]) -> Callable[..., object]:
 @pytest.fixture
 def lit_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit lights to equal results and bake their textures once: many tests write the same one."""
-    from pimper_torch.io import results
+    from pimper_torch.stages import Relight, Texture
 
-    for name in ("relight", "textured"):
-        monkeypatch.setattr(results, name, _answered_once(getattr(results, name)))
+    for stage in (Relight, Texture):
+        answer = _answered_once(stage().forward)
+        monkeypatch.setattr(stage, "forward", lambda _, *given, answer=answer: answer(*given))
 
 
 @pytest.fixture

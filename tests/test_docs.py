@@ -196,14 +196,28 @@ def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = ball.photographed((0.0, 0.3, 1.0), views=3)
-    result = SimpleNamespace(
+    chain = pimper_torch.load_chain("default")
+    result = Found(
         mesh=ball.ball_mesh(),
         scene=scene,
         cameras=scene.cameras,
         silhouettes=Silhouettes.everything(scene.views),
         held_out=None,
+        report=(),
+        failures=(),
+        left_out=(),
     )
-    return {"result": result}
+    return {"result": result, "chain": chain}
+
+
+class Found(SimpleNamespace):
+    """What a chain's finish asks of a result."""
+
+    def to(self, _: str) -> "Found":
+        return self
+
+    def replace(self, **changes: object) -> "Found":
+        return Found(**vars(self) | changes)
 
 
 def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:

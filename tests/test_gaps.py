@@ -74,5 +74,19 @@ def test_a_module_behind_a_stage_is_handed_its_record_and_changes_no_bit(preset,
 @pytest.mark.parametrize("preset", SETTINGS)
 def test_there_is_a_gap_behind_every_stage(preset):
     chain, _ = chain_on_a_sphere(preset)
-    spare = {"coarse_surface"} if preset == "paper" else set()  # of a mesh that is given
+    spare = {"simplify", "relight", "texture"}  # of a result, see below
+    spare |= {"coarse_surface"} if preset == "paper" else set()  # of a mesh that is given
     assert {name for name, _ in chain.named_children()} - spare == {*GAPS[preset]}
+
+
+@pytest.mark.parametrize("behind", ["simplify", "relight", "texture"])
+def test_a_module_behind_a_stage_of_the_finish_is_handed_its_record(behind):
+    plain, views = chain_on_a_sphere("default")
+    mine = Mine()
+    chain, _ = chain_on_a_sphere("default", **{behind: pt.Then(getattr(plain, behind), mine)})
+    result = chain.finish(chain(views))
+    assert mine.handed
+    assert torch.equal(result.asset.normal, plain.finish(plain(views)).asset.normal)
+    assert [report.name for report in result.report][-5:] == [
+        *("simplify", "relight", "texture", "judge_textures", "between stages")
+    ]

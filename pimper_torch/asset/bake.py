@@ -1,9 +1,7 @@
 """Textures of a mesh of few faces, read off the surface that it stands for."""
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
@@ -20,49 +18,18 @@ from pimper_torch.geometry.surfaces import (
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Mesh, Record
+from pimper_torch.records import Mesh, Textured
 from pimper_torch.viz.maps import albedo_scale, base_color
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Textured(Record):
-    """A mesh with textures, as glTF wants them.
-
-    Attributes:
-        mesh: Its vertices are copied along seams.
-        vertex: That each copy is of.
-        normals: Of its vertices, unit; those that the normal map is relative to.
-        uv: Right and down over the textures, in [0, 1].
-        tangent: Unit along ``u``, and the sign of the bitangent.
-        normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
-        reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
-    """
-
-    mesh: Mesh
-    vertex: Int[Tensor, " copy"]
-    normals: Float[Tensor, "copy 3"]
-    uv: Float[Tensor, "copy 2"]
-    tangent: Float[Tensor, "copy 4"]
-    base_color: UInt8[Tensor, "height width 3"]
-    normal: UInt8[Tensor, "height width 3"]
-    reflectance: Float[Tensor, "height width 3"] | None
-    charts: int
-
-    @property
-    def summary(self) -> dict[str, int | float]:
-        """Return counts and sizes, for ``summary.json``."""
-        height, width = self.normal.shape[:2]
-        faces = len(self.mesh.faces)
-        return {"faces": faces, "charts": self.charts, "width_px": width, "height_px": height}
-
-    def halved(self) -> "Textured":
-        """Return the same with textures of half the size."""
-        reflectance = self.reflectance
-        return self.replace(
-            base_color=_halved(self.base_color.float()).round().to(torch.uint8),
-            normal=_halved(self.normal.float()).round().to(torch.uint8),
-            reflectance=None if reflectance is None else _halved(reflectance),
-        )
+def halved(asset: Textured) -> Textured:
+    """Return the same with textures of half the size."""
+    reflectance = asset.reflectance
+    return asset.replace(
+        base_color=_halved(asset.base_color.float()).round().to(torch.uint8),
+        normal=_halved(asset.normal.float()).round().to(torch.uint8),
+        reflectance=None if reflectance is None else _halved(reflectance),
+    )
 
 
 def _halved(

@@ -5,21 +5,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.asset.atlas import unwrapped
-from pimper_torch.asset.bake import Textured, baked
+from pimper_torch.asset.bake import baked
 from pimper_torch.geometry.surfaces import side_lengths
-from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap_surfaces import reduced
-
-# What people can edit, and browsers draw at once.
-_FACES = 50_000
+from pimper_torch.records import Mesh, Relighting, Textured
+from pimper_torch.stage import Stage
 
 # Texels along a median side of the surface's faces.
 _TEXELS_PER_SIDE = 1.5
-
-
-def few_enough(mesh: Mesh) -> Mesh:
-    """Reduce a mesh to about 50,000 faces, where it has more."""
-    return reduced(mesh, _FACES)
 
 
 def textured(
@@ -29,9 +21,21 @@ def textured(
 
     Args:
         full: The surface, on the CPU.
-        few: The same of fewer faces, see :func:`few_enough`.
+        few: The same of fewer faces.
         reflectance: Metallic, roughness and specular of its vertices; matte without.
     """
     full, few = (one.detach().to(torch.float32) for one in (full, few))
     side = float(side_lengths(full.vertices_world[full.faces]).median())
     return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance)
+
+
+class Texture(Stage):
+    """Bake a surface and its materials onto few faces, see :func:`textured`."""
+
+    def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> Textured:
+        """Bake it.
+
+        Args:
+            few: That the materials are of.
+        """
+        return textured(full, few, relighting.materials.at_vertices())

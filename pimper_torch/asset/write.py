@@ -11,10 +11,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from pimper_torch.asset.bake import Textured
 from pimper_torch.asset.gltf import MATTE, gltf_of
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.radiometry import to_bytes
+from pimper_torch.records import Textured
 
 _SPECULAR = "KHR_materials_specular"
 

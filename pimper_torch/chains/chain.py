@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from pimper_torch.asset.finish import MeshFiles, Simplify
+from pimper_torch.asset.make import Texture
 from pimper_torch.chains.running import Running
 from pimper_torch.coarse.depth_points import depth_points
 from pimper_torch.coarse.given_mesh import prepared
@@ -22,19 +24,23 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Failure,
+    Finished,
     LeftOut,
     Mesh,
     PatchSet,
     PhotometricPatches,
     Reconstruction,
     Record,
+    Relighting,
     Silhouettes,
     SparseScene,
     StageReport,
     Surface,
     SweptPatches,
+    Textured,
     Views,
 )
+from pimper_torch.relighting.held_out import Relight, judge_textures
 from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
 from pimper_torch.sfm.conventions.mesh_frame import refuse_other_axes
 from pimper_torch.sfm.poses import with_poses
@@ -116,6 +122,9 @@ class Chain(Stage):
         super().__init__()
         self.on_failure: OnFailure = on_failure
         self.observer = observer or Silent()
+        self.simplify: Callable[[Mesh, MeshFiles], Finished] = Simplify()
+        self.relight: Callable[..., Relighting] = Relight()
+        self.texture: Callable[[Mesh, Mesh, Relighting], Textured] = Texture()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
         self.needed: tuple[str, ...] = ()
@@ -281,6 +290,32 @@ class Chain(Stage):
             report=gathered([*reports, *last]),
             failures=(*step.failures, *distinct(entries)),
             left_out=(*step.left_out, *left_out_of(entries)),
+        )
+
+    def finish(self, result: Reconstruction, files: MeshFiles | None = None) -> Reconstruction:
+        """Make a result ready to be written, on the CPU.
+
+        A surface of fewer vertices; the lights and materials under which it predicts its
+        photographs, or those that were held out; and textures of few faces.
+        """
+        result = result.to("cpu")
+        scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
+        run = self.running()
+        with collecting(self.on_failure) as entries, recorded(self.observer) as reports:
+            finished = run(self.simplify, result.mesh, files or MeshFiles())
+            relighting = run(self.relight, finished.few, scene, silhouettes, held_out)
+            asset = run(self.texture, result.mesh, finished.few, relighting)
+            # By the photographs that the mesh was judged by.
+            judged_by = (scene, silhouettes) if held_out is None else (held_out, None)
+            relighting = run(judge_textures, relighting, asset, *judged_by)
+            warn_of(entries)
+        return result.replace(
+            finished=finished,
+            relighting=relighting,
+            asset=asset,
+            report=gathered([*result.report, *reports]),
+            failures=(*result.failures, *distinct(entries)),
+            left_out=(*result.left_out, *left_out_of(entries)),
         )
 
     if TYPE_CHECKING:  # completion does not see through the type of a stage's call

@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
 from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import presets, require
 from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.photographs import image_name, list_images
 from pimper_torch.memory import bytes_of
 from pimper_torch.outputs.files import require_name

@@ -72,10 +72,12 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
         if viewer is not None:
             viewer.add_pass(RESULT, result.mesh)
         result = result.replace(report=(imports, *accounted()))
-        with stage("write") as told:
+        with stage("scale") as told:
             result, scale = sized(job, bars, result)
             if scale is not None:
                 told["scale"] = scale.factor
+        result = chain.finish(result, job.common.files)
+        with stage("write"):
             _write(job, result, scale)
         result = result.replace(report=(imports, *accounted()))
     if scale is not None:

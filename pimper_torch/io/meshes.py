@@ -31,9 +31,6 @@ from pimper_torch.viz.maps import base_color
 _ERRORS = ("confidence", "expected_error")
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 _NEEDED = "PLY, OBJ, STL, OFF or GLB"
-# Steps that the eye hardly sees on a rendered surface, and errors far below what these two
-# figures are known to.
-_MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 # Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
 # A cloud's spacing is taken for a thousandth of its radius.
 _MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
@@ -110,23 +107,6 @@ def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
         short = _CLOUD_SPACING * float(away.median())
     lost = float((placed - single).abs().max())
     return single if lost <= _MAX_ROUNDING * short else placed
-
-
-def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
-    """Return a file's other values of vertices, in units of their tolerances.
-
-    For :func:`pimper_torch.meshing.simplify.simplify`: sRGB colour may be off by 8 levels of 255,
-    confidence by 0.1, expected error by a tenth of itself.
-    """
-    channels = [mesh.vertices_world.new_zeros(len(mesh.vertices_world), 0)]
-    if mesh.albedo is not None:
-        channels.append(255 / _MAX_LEVELS * srgb_from_linear(_colors(mesh)))
-    if mesh.confidence is not None:
-        channels.append(mesh.confidence[:, None] / _MAX_CONFIDENCE)
-    if mesh.expected_error is not None:
-        least = torch.finfo(torch.float32).tiny
-        channels.append(mesh.expected_error[:, None].clamp_min(least).log() / _MAX_RATIO)
-    return torch.cat(channels, dim=1).detach()
 
 
 def read_mesh(path: Path | str) -> Mesh:

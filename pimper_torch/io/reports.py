@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.io.version import installed_version
-from pimper_torch.records import Failure, Reconstruction
+from pimper_torch.records import Failure, Reconstruction, Relighting
 
 # What JSON can hold.
 Report = dict[str, object]
@@ -189,3 +189,38 @@ def _finite(value: float | int) -> float | int | None:
 def _rounded(light: Float[Tensor, " 4"]) -> list[float | None]:
     """Keep six digits, more than any photograph determines."""
     return [_finite(float(f"{value:.6g}")) for value in light.tolist()]
+
+
+def relighting_report(found: Relighting) -> dict[str, object]:
+    """Return what ``summary.json`` tells of lights and materials."""
+    vertices = torch.bincount(found.materials.cluster, minlength=len(found.materials.metallic))
+    shares = (vertices / vertices.sum()).tolist()
+    rows = zip(shares, found.materials.values.tolist(), strict=True)
+    judged = zip(
+        found.judged.names,
+        found.judged.psnr_db.tolist(),
+        found.matte.psnr_db.tolist(),
+        strict=True,
+    )
+    return {
+        "photographs": "held out" if found.held_out else "used",
+        "psnr_db": _mean(found.judged.psnr_db),
+        "psnr_matte_db": _mean(found.matte.psnr_db),
+        "psnr_textured_db": None if found.textured is None else _mean(found.textured.psnr_db),
+        "views": [
+            {"name": name, "psnr_db": _figure(with_one), "psnr_matte_db": _figure(without)}
+            for name, with_one, without in judged
+        ],
+        "materials": [
+            {"vertices": share, "metallic": metal, "roughness": rough, "specular": specular}
+            for share, (metal, rough, specular) in rows
+        ],
+    }
+
+
+def _mean(values: Float[Tensor, " view"]) -> float | None:
+    return _figure(float(values.nanmean()))
+
+
+def _figure(value: float) -> float | None:
+    return round(value, 3) if value == value else None

@@ -10,20 +10,24 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from pimper_torch.asset.make import few_enough, textured
+from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.asset.write import write_asset, write_asset_obj
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.config import to_yaml
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.estimates import mask_path
-from pimper_torch.io.finish import Finished, MeshFiles, finished
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
-from pimper_torch.io.reports import lights_report, summary_report, write_json
+from pimper_torch.io.reports import (
+    lights_report,
+    relighting_report,
+    summary_report,
+    write_json,
+)
 from pimper_torch.mapped import each
 from pimper_torch.outputs.folders import written_whole
 from pimper_torch.progress import part
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Reconstruction, Silhouettes, SparseScene
-from pimper_torch.relighting.held_out import relight
+from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.report.page import asset_within, write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.report.vertex_layers import surface_layers
@@ -56,7 +60,7 @@ RESULT_NAMES = (
     "report.html",
 )
 """Files of a result, and nothing else; a table in the manual tells what each holds."""
-_PARTS = 8  # of the bar: simplification, light, meshes, asset, maps, sheet, turning picture, page
+_PARTS = 6  # of the bar: meshes, asset, maps, sheet, turning picture, page
 
 
 def write_result(
@@ -77,7 +81,7 @@ def write_result(
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
     spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
-    within :func:`~pimper_torch.io.meshes.written_channels` of what is blended there
+    within :func:`~pimper_torch.asset.finish.written_channels` of what is blended there
     (``summary.json`` tells how far off they are). ``files`` asks for every vertex, or for fewer.
     The pictures show what is written, but for the caps of a mesh that shall be watertight: those
     are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
@@ -87,43 +91,41 @@ def write_result(
     Args:
         config: The dataclass of settings that it ran with.
         folder: New or empty; its parents are made.
-        files: How many faces the mesh has, and in which formats.
+        files: How many faces the mesh has, and in which formats; of a result that is not finished
+            yet, see :meth:`~pimper_torch.chains.chain.Chain.finish`.
 
     Raises:
         OutputError: The folder holds something else, or cannot be written.
     """
     folder, began = Path(folder), time.perf_counter()
+    files = files or MeshFiles()
+    if result.finished is None:
+        result = CoarseToFine().finish(result, files)
     with written_whole(folder, "result", overwrite=overwrite) as staging:
-        whole = result.to("cpu")
+        ready, asset, relighting = result.finished, result.asset, result.relighting
+        assert ready is not None
+        assert asset is not None
+        assert relighting is not None
+        found, whole = result, result.replace(mesh=ready.mesh)
+        offset = whole.scene.offset_world
         with part(0, _PARTS):
-            ready = finished(whole.mesh, files or MeshFiles())
-        found, whole = whole, whole.replace(mesh=ready.mesh)
+            _write_meshes(ready, files, offset, staging)
         with part(1, _PARTS):
-            few = few_enough(whole.mesh)
-            relighting = relight(few, whole.scene, whole.silhouettes, whole.held_out)
-        with part(2, _PARTS):
-            _write_meshes(ready, files or MeshFiles(), whole.scene.offset_world, staging)
-        with part(3, _PARTS):
-            asset = textured(found.mesh, few, relighting.materials.at_vertices())
-            write_asset(asset, staging / "asset.glb", whole.scene.offset_world)
-            if "obj" in (files or MeshFiles()).formats:
-                write_asset_obj(asset, staging / "asset.obj", whole.scene.offset_world)
-            # By the photographs that the mesh was judged by.
-            held_out, silhouettes = whole.held_out, whole.silhouettes
-            relighting = relighting.with_textures(
-                asset, held_out or whole.scene, None if held_out else silhouettes
-            )
+            write_asset(asset, staging / "asset.glb", offset)
+            if "obj" in files.formats:
+                write_asset_obj(asset, staging / "asset.obj", offset)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
         summary = {
             **summary_report(found, about or {}),
-            **ready.summary,
+            **({ready.how: ready.counts} if ready.how else {}),
+            **({"caps": ready.caps} if ready.caps else {}),
             "asset": asset.summary,
-            "relighting": relighting.report(),
+            "relighting": relighting_report(relighting),
         }
         write_json(summary, staging / "summary.json")
-        with part(7, _PARTS):
+        with part(5, _PARTS):
             if report:
                 write_page(
                     staging / "report.html",
@@ -133,7 +135,7 @@ def write_result(
                     scene=whole.scene,
                     silhouettes=whole.silhouettes,
                     reference=whole.coarse.reference,
-                    predictions=predictions(few, whole.scene, relighting),
+                    predictions=predictions(ready.few, whole.scene, relighting),
                     layers=surface_layers(asset.mesh),
                     summary=summary,
                     settings=(staging / "config.yaml").read_text(encoding="utf-8"),
@@ -156,13 +158,13 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         _write_masks(result.silhouettes, result.scene, folder / "masks")
-    with part(4, _PARTS):
+    with part(2, _PARTS):
         _write_maps(result, folder)
     write_json(lights_report(result), folder / "lights.json", indent=None)
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(5, _PARTS):
+    with part(3, _PARTS):
         draw_overview(result, folder / "overview.png")
-    with part(6, _PARTS):
+    with part(4, _PARTS):
         draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
 
 

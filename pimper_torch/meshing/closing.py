@@ -1,10 +1,9 @@
 """Closing: every hole of a surface, and every outer border, gets a cap."""
 
 import math
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
@@ -12,21 +11,7 @@ from pimper_torch.fusion.continuation import continued
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
 from pimper_torch.meshing.faults import diagonal
-from pimper_torch.records import Mesh, Record
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Closed(Record):
-    """A mesh without borders.
-
-    Attributes:
-        mesh: The former faces first, in their order.
-        measured: Faces that were there; the others are caps.
-    """
-
-    mesh: Mesh
-    measured: Bool[Tensor, " face"]
-    borders: int
+from pimper_torch.records import Closed, Mesh
 
 
 def closed(mesh: Mesh) -> Closed:

@@ -2,6 +2,13 @@
 
 from pimper_torch.records.failure import Failure as Failure
 from pimper_torch.records.failure import LeftOut as LeftOut
+from pimper_torch.records.finished import Closed as Closed
+from pimper_torch.records.finished import Finished as Finished
+from pimper_torch.records.finished import Judged as Judged
+from pimper_torch.records.finished import Materials as Materials
+from pimper_torch.records.finished import Relighting as Relighting
+from pimper_torch.records.finished import Textured as Textured
+from pimper_torch.records.finished import ViewLights as ViewLights
 from pimper_torch.records.patches import AlignStatus as AlignStatus
 from pimper_torch.records.patches import Convergence as Convergence
 from pimper_torch.records.patches import DepthPatches as DepthPatches

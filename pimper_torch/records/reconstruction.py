@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from pimper_torch.records.failure import Failure, LeftOut
+from pimper_torch.records.finished import Finished, Relighting, Textured
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -40,6 +41,8 @@ class Reconstruction(Record):
         left_out: What guards left out or doubted, in order.
         held_out: Photographs that took no part but in finding cameras, to judge the surface by;
             None without any.
+        finished: The surface as it is written; it, lights and materials, and the textured surface
+            are there once :meth:`~pimper_torch.chains.chain.Chain.finish` made them.
     """
 
     mesh: Mesh
@@ -51,6 +54,9 @@ class Reconstruction(Record):
     failures: tuple[Failure, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     held_out: SparseScene | None = None
+    finished: Finished | None = None
+    relighting: Relighting | None = None
+    asset: Textured | None = None
 
     @property
     def cameras(self) -> Cameras:

@@ -20,14 +20,16 @@ from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.parallel import side_by_side
 from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.radiometry import SATURATED
-from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
-from pimper_torch.relighting.lit_surface import (
-    LitSurface,
+from pimper_torch.records import (
+    Cameras,
     Materials,
-    SurfacePixels,
-    diffuse_color,
-    response,
+    Mesh,
+    Record,
+    Silhouettes,
+    SparseScene,
+    ViewLights,
 )
+from pimper_torch.relighting.lit_surface import LitSurface, SurfacePixels, diffuse_color, response
 
 # Longer side of the photographs that lights are fitted to, at most: some 20,000 pixels of an
 # object, ten thousand times what a light has unknowns.
@@ -209,23 +211,6 @@ _CLOSENESS, _CLOSEST = (0.0, 0.25, 0.5), 0.7
 # Of direction, in radians, and of closeness: half the distance of the first directions, down to a
 # tenth of a degree.
 _COARSE, _FINE = (0.1, 0.1, 0.05, 0.05, 0.025, 0.025), (0.04, 0.02, 0.01, 0.005, 0.0025)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class ViewLights(Record):
-    """The light of every view, for base colours of :func:`~pimper_torch.viz.maps.base_color`.
-
-    Attributes:
-        direction_world: Unit, from the surface's centre towards the light.
-        closeness: The surface's radius over the light's distance; 0 for a light at infinity.
-        ambient: Radiance of a white matte surface in shadow.
-        directed: Added where it faces the light, at the distance of the centre.
-    """
-
-    direction_world: Float[Tensor, "view 3"]
-    closeness: Float[Tensor, " view"]
-    ambient: Float[Tensor, "view channel"]
-    directed: Float[Tensor, "view channel"]
 
 
 def fit_lights(

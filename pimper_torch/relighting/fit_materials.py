@@ -7,6 +7,7 @@ one half of them best has to lower the loss of the other half, beyond what varie
 photographs. The surface stays matte otherwise.
 """
 
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -16,8 +17,9 @@ from torch import Tensor
 
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.relighting.fit_lights import Observed, ViewLights, fit_strengths, loss_scale
-from pimper_torch.relighting.lit_surface import LitSurface, Materials, diffuse_color, response
+from pimper_torch.records import Materials, ViewLights
+from pimper_torch.relighting.fit_lights import Observed, fit_strengths, loss_scale
+from pimper_torch.relighting.lit_surface import LitSurface, diffuse_color, response
 
 _MATTE = (0.0, 1.0, 0.0)
 # Tried first. Highlights of less roughness have few pixels; diamond has a specular of 4.
@@ -153,10 +155,12 @@ def _around(value: Float[Tensor, " 3"], step: float) -> Float[Tensor, "candidate
 
 
 def clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> Int[Tensor, " vertex"]:
-    """Divide vertices by their colour as sRGB shows it."""
+    """Divide vertices by their colour as sRGB shows it; a cluster may have none."""
     colors = srgb_from_linear(base_color.double())
     sample = colors[:: -(-len(colors) // 4096)]
     order = sample.sum(dim=1).argsort(stable=True)
     start = sample[order[(torch.arange(count) * 2 + 1) * len(order) // (2 * count)]]
-    centers, _ = kmeans2(sample.numpy(), start.numpy(), minit="matrix", missing="raise")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # where colours are fewer than clusters
+        centers, _ = kmeans2(sample.numpy(), start.numpy(), minit="matrix")
     return torch.from_numpy(vq(colors.numpy(), centers)[0]).long()

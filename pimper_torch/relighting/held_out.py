@@ -1,24 +1,31 @@
 """Prediction of photographs from a surface, its materials and a light, and the errors."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.asset.bake import Textured
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
-from pimper_torch.relighting.fit_lights import Observed, ViewLights, lights_of, observe_all
+from pimper_torch.records import (
+    Cameras,
+    Judged,
+    Materials,
+    Mesh,
+    Relighting,
+    Silhouettes,
+    SparseScene,
+    Textured,
+    ViewLights,
+)
+from pimper_torch.relighting.fit_lights import Observed, lights_of, observe_all
 from pimper_torch.relighting.fit_materials import materials_under
 from pimper_torch.relighting.lit_surface import (
     LitSurface,
-    Materials,
     SurfacePixels,
     TexturedSurface,
     diffuse_color,
     response,
 )
+from pimper_torch.stage import Stage
 
 
 def predict(
@@ -60,106 +67,58 @@ def psnr(
     return float(-10 * error.square().mean().clamp_min(1e-12).log10())
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Judged(Record):
-    """Errors of a surface in photographs, each under the light that suits it best.
+class Relight(Stage):
+    """Fit lights and materials to the photographs, and predict these, or others, with them."""
 
-    Attributes:
-        psnr_db: Of sRGB values in [0, 1], over the object's pixels.
-    """
+    def forward(
+        self,
+        mesh: Mesh,
+        scene: SparseScene,
+        silhouettes: Silhouettes | None,
+        held_out: SparseScene | None = None,
+    ) -> Relighting:
+        """Fit and judge them.
 
-    psnr_db: Float[Tensor, " view"]
-    lights: ViewLights
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Relighting(Record):
-    """The lights and materials of a result, and what they are worth.
-
-    Attributes:
-        lights: Of the photographs that the surface was made from.
-        held_out: Whether these photographs were held out, or the surface was made from them.
-        textured: With materials, and the asset's textures in place of values of vertices.
-    """
-
-    lights: ViewLights
-    materials: Materials
-    judged: Judged
-    matte: Judged
-    held_out: bool
-    textured: Judged | None = None
-
-    def with_textures(
-        self, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
-    ) -> "Relighting":
-        """Judge the textured surface, too, under the same lights."""
-        surface = TexturedSurface(asset)
+        Args:
+            mesh: In the scene's frame, with albedo.
+            held_out: What is predicted; without, the scene's own photographs.
+        """
+        surface = LitSurface(mesh)
         observed = observe_all(surface, scene, silhouettes)
-        materials = surface.materials(self.materials)
-        found = judge(surface, observed, self.judged.names, self.judged.lights, materials)
-        return self.replace(textured=found)
-
-    def report(self) -> dict[str, object]:
-        """Return what ``summary.json`` tells."""
-        vertices = torch.bincount(self.materials.cluster, minlength=len(self.materials.metallic))
-        shares = (vertices / vertices.sum()).tolist()
-        rows = zip(shares, self.materials.values.tolist(), strict=True)
-        judged = zip(
-            self.judged.names,
-            self.judged.psnr_db.tolist(),
-            self.matte.psnr_db.tolist(),
-            strict=True,
+        matte = lights_of(surface, observed)
+        materials = materials_under(surface, observed, matte)
+        lights = matte
+        if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
+            lights = lights_of(surface, observed, materials, matte)
+        if held_out is None:
+            names = scene.views.names
+            judged = judge(surface, observed, names, lights, materials)
+            plain = judge(surface, observed, names, matte)
+        else:
+            names, observed = held_out.views.names, observe_all(surface, held_out, None)
+            judged, plain = (
+                judge(surface, observed, names, lights_of(surface, observed, one), one)
+                for one in (materials, None)
+            )
+        return Relighting(
+            lights=lights,
+            materials=materials,
+            judged=judged,
+            matte=plain,
+            held_out=held_out is not None,
         )
-        return {
-            "photographs": "held out" if self.held_out else "used",
-            "psnr_db": _mean(self.judged.psnr_db),
-            "psnr_matte_db": _mean(self.matte.psnr_db),
-            "psnr_textured_db": None if self.textured is None else _mean(self.textured.psnr_db),
-            "views": [
-                {"name": name, "psnr_db": _figure(with_one), "psnr_matte_db": _figure(without)}
-                for name, with_one, without in judged
-            ],
-            "materials": [
-                {"vertices": share, "metallic": metal, "roughness": rough, "specular": specular}
-                for share, (metal, rough, specular) in rows
-            ],
-        }
 
 
-def relight(
-    mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes, held_out: SparseScene | None = None
+def judge_textures(
+    relighting: Relighting, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> Relighting:
-    """Fit lights and materials, and predict photographs with them.
-
-    Args:
-        mesh: In the scene's frame, with albedo.
-        held_out: What is predicted; without, the scene's own photographs.
-    """
-    surface = LitSurface(mesh)
+    """Judge the textured surface, too, under the same lights."""
+    surface = TexturedSurface(asset)
     observed = observe_all(surface, scene, silhouettes)
-    matte = lights_of(surface, observed)
-    materials = materials_under(surface, observed, matte)
-    lights = matte
-    if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
-        lights = lights_of(surface, observed, materials, matte)
-    if held_out is None:
-        names = scene.views.names
-        judged = judge(surface, observed, names, lights, materials)
-        plain = judge(surface, observed, names, matte)
-    else:
-        names, observed = held_out.views.names, observe_all(surface, held_out, None)
-        judged, plain = (
-            judge(surface, observed, names, lights_of(surface, observed, one), one)
-            for one in (materials, None)
-        )
-    return Relighting(
-        lights=lights,
-        materials=materials,
-        judged=judged,
-        matte=plain,
-        held_out=held_out is not None,
-    )
+    materials = surface.materials(relighting.materials)
+    judged = relighting.judged
+    found = judge(surface, observed, judged.names, judged.lights, materials)
+    return relighting.replace(textured=found)
 
 
 def judge(
@@ -175,11 +134,3 @@ def judge(
         for view, seen in enumerate(observed)
     ]
     return Judged(psnr_db=torch.tensor(found), lights=lights, names=names)
-
-
-def _mean(values: Float[Tensor, " view"]) -> float | None:
-    return _figure(float(values.nanmean()))
-
-
-def _figure(value: float) -> float | None:
-    return round(value, 3) if value == value else None

@@ -22,12 +22,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
-from pimper_torch.asset.bake import Textured
 from pimper_torch.asset.tangents import frames
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.radiometry import linear_from_srgb
-from pimper_torch.records import Cameras, Mesh, Record
+from pimper_torch.records import Cameras, Materials, Mesh, Record, Textured
 from pimper_torch.viz.maps import base_color
 
 
@@ -57,37 +56,6 @@ def masking(
     light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
     eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()
     return 0.5 / (light_side + eye_side)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Materials(Record):
-    """Materials of a surface in glTF's terms, one for every cluster of albedo.
-
-    Attributes:
-        roughness: In [0, 1]; its square is GGX's alpha.
-        specular: Times what glTF's dielectric mirrors head on; ``KHR_materials_specular``'s
-            ``specularFactor`` up to 1, ``specularColorFactor`` above.
-    """
-
-    cluster: Int[Tensor, " vertex"]
-    metallic: Float[Tensor, " cluster"]
-    roughness: Float[Tensor, " cluster"]
-    specular: Float[Tensor, " cluster"]
-
-    @classmethod
-    def of(cls, cluster: Int[Tensor, " vertex"], values: Float[Tensor, "cluster 3"]) -> "Materials":
-        """Return materials from metallic, roughness and specular of each cluster."""
-        metallic, roughness, specular = values.unbind(dim=1)
-        return cls(cluster=cluster, metallic=metallic, roughness=roughness, specular=specular)
-
-    @property
-    def values(self) -> Float[Tensor, "cluster 3"]:
-        """Metallic, roughness and specular of every cluster."""
-        return torch.stack([self.metallic, self.roughness, self.specular], dim=1)
-
-    def at_vertices(self) -> Float[Tensor, "vertex 3"]:
-        """Return metallic, roughness and specular of every vertex."""
-        return self.values[self.cluster]
 
 
 # Shadow rays start this far from the surface, as a fraction of its radius: beyond what

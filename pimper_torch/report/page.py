@@ -10,10 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pimper_torch.asset.bake import Textured
+from pimper_torch.asset.bake import halved
 from pimper_torch.asset.write import write_asset
 from pimper_torch.errors import some
-from pimper_torch.records import Silhouettes, SparseScene
+from pimper_torch.records import Silhouettes, SparseScene, Textured
 from pimper_torch.report.predictions import Prediction, view_entries
 from pimper_torch.report.vertex_layers import VertexLayer
 from pimper_torch.viz.turn import up_world
@@ -74,7 +74,7 @@ def asset_within(asset: Textured, path: Path) -> bytes:
     if path.stat().st_size <= 7_500_000 or min(asset.base_color.shape[:2]) < 2:
         return path.read_bytes()
     with TemporaryDirectory(prefix="pimper_page_") as folder:
-        smaller, coarser = Path(folder) / path.name, asset.halved()
+        smaller, coarser = Path(folder) / path.name, halved(asset)
         write_asset(coarser, smaller)
         return asset_within(coarser, smaller)
 

@@ -16,9 +16,16 @@ from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.mapped import drop_pages
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
-from pimper_torch.relighting.fit_lights import ViewLights
-from pimper_torch.relighting.held_out import Relighting, predict
+from pimper_torch.records import (
+    Cameras,
+    Mesh,
+    Record,
+    Relighting,
+    Silhouettes,
+    SparseScene,
+    ViewLights,
+)
+from pimper_torch.relighting.held_out import predict
 from pimper_torch.relighting.lit_surface import LitSurface
 
 # The demo's 24 photographs and their predictions take 1.1 MB of its page; more photographs share

@@ -3,8 +3,11 @@
 ``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
 ``TraceContours`` and ``CoarseSurface``; for each scale ``Decompose``, ``Warp``, ``FitLight``,
 ``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then ``Extract``.
+``Chain.finish`` runs ``Simplify``, ``Relight`` and ``Texture``.
 """
 
+from pimper_torch.asset.finish import Simplify as Simplify
+from pimper_torch.asset.make import Texture as Texture
 from pimper_torch.chains.chain import Chain as Chain
 from pimper_torch.chains.chain import Step as Step
 from pimper_torch.chains.coarse_to_fine import CoarseToFine as CoarseToFine
@@ -29,6 +32,7 @@ from pimper_torch.photometry.fit_light import FitLight as FitLight
 from pimper_torch.photometry.fit_light import FitLightConfig as FitLightConfig
 from pimper_torch.photometry.fit_light import Illumination as Illumination
 from pimper_torch.photometry.gauge import FixGauge as FixGauge
+from pimper_torch.relighting.held_out import Relight as Relight
 from pimper_torch.sfm.reconstruct import Reconstruct as Reconstruct
 from pimper_torch.silhouettes.contours import Contours as Contours
 from pimper_torch.silhouettes.contours import TraceContours as TraceContours

@@ -14,8 +14,8 @@ from torch.testing import assert_close
 
 from pimper_torch.asset import atlas as atlases
 from pimper_torch.asset.atlas import MAX_SIDE, by_triangles, unwrapped
-from pimper_torch.asset.bake import Textured, baked
-from pimper_torch.asset.make import few_enough, textured
+from pimper_torch.asset.bake import baked
+from pimper_torch.asset.make import textured
 from pimper_torch.asset.tangents import tangents
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.errors import PimperWarning
@@ -24,7 +24,8 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import write_glb
 from pimper_torch.parallel import on_one_thread
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
-from pimper_torch.records import Mesh
+from pimper_torch.records import Mesh, Textured
+from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.viz.maps import base_color
 
 
@@ -117,7 +118,7 @@ def test_the_number_of_threads_changes_no_bit(full, few, asset):
 
 
 def test_a_surface_of_many_faces_is_reduced(full):
-    asset = textured(full, few_enough(full))
+    asset = textured(full, reduced(full, 50_000))
     assert 49_000 < len(asset.mesh.faces) <= 50_000
     points, normals, _ = seen(asset)
     assert angles_deg(normals, of_surface(full, points)[0]).max() < 1.0

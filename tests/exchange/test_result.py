@@ -6,6 +6,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
 from pimper_torch.evidence.datasets import read_transforms
@@ -14,7 +15,6 @@ from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.geometry.projection import project
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of
-from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import Encoding
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
-from pimper_torch.io.finish import MeshFiles
 from pimper_torch.io.meshes import write_ply
 
 

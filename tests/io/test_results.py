@@ -12,6 +12,7 @@ import yaml
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.asset.finish import MeshFiles, written_channels
 from pimper_torch.errors import OutputError
 from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface
@@ -19,8 +20,7 @@ from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.io import results
 from pimper_torch.io.estimates import estimate_of, read_estimate
-from pimper_torch.io.finish import MeshFiles
-from pimper_torch.io.meshes import read_mesh, written_channels
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.io.results import RESULT_NAMES, write_result
 from pimper_torch.outputs.folders import prepare_output

@@ -91,7 +91,7 @@ def test_what_does_not_belong_to_the_patches_is_refused(lift):
 def test_printed_a_result_is_a_few_lines(reconstruction):
     shown = str(reconstruction)
     assert len(shown) < 600
-    assert len(shown.splitlines()) == 10
+    assert len(shown.splitlines()) == 13
     assert "  mesh: Mesh(vertex 225, face 392, channel 3)" in shown
     assert "  patches: DepthPatches(patch 2)" in shown
     assert "  report: 2 StageReport" in shown

@@ -74,7 +74,12 @@ def example(hint, generator, full=True):
         shape = [int(one) if one.isdigit() else AXES.get(one, 8) for one in hint.dim_str.split()]
         values = torch.randn(shape, generator=generator, dtype=torch.float64)
         values[values > 1] = torch.nan
-        kinds = {"Float": torch.float64, "Bool": torch.bool, "Int": torch.int64}
+        kinds = {
+            "Float": torch.float64,
+            "Bool": torch.bool,
+            "Int": torch.int64,
+            "UInt8": torch.uint8,
+        }
         return values.nan_to_num().to(kinds[hint.__name__.partition("[")[0]])
     return {str: "é\ud800", int: -(2**60), float: 0.1 + 0.2, bool: True}[hint]
 

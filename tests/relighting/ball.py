@@ -11,8 +11,7 @@ from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io.tensors import scene_of
-from pimper_torch.records import Mesh
-from pimper_torch.relighting.fit_lights import ViewLights
+from pimper_torch.records import Mesh, ViewLights
 
 SIDE = 80
 

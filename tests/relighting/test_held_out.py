@@ -6,8 +6,9 @@ import torch
 from pimper_torch.asset.make import textured
 from pimper_torch.chains.coarse_to_fine import held_apart
 from pimper_torch.errors import ConfigError
+from pimper_torch.io.reports import relighting_report
 from pimper_torch.records import Silhouettes
-from pimper_torch.relighting.held_out import relight
+from pimper_torch.relighting.held_out import Relight, judge_textures
 from pimper_torch.sfm.colmap_surfaces import reduced
 from tests.relighting.ball import ball_mesh, photographed
 
@@ -52,8 +53,8 @@ def test_too_few_photographs_are_refused(scene):
 
 def test_held_out_photographs_are_predicted_better_with_their_highlights(scene):
     used, held = held_apart(scene, 3)
-    found = relight(ball_mesh(), used, Silhouettes.everything(used.views), held)
-    report = found.report()
+    found = Relight()(ball_mesh(), used, Silhouettes.everything(used.views), held)
+    report = relighting_report(found)
     assert report["photographs"] == "held out"
     assert [view["name"] for view in report["views"]] == ["002", "005"]
     assert all(view["psnr_db"] > view["psnr_matte_db"] + 1 for view in report["views"])
@@ -65,8 +66,8 @@ def test_held_out_photographs_are_predicted_better_with_their_highlights(scene):
 
 def test_without_held_out_photographs_those_used_are_predicted():
     scene = photographed((0.0, 1.0, 0.0), views=3)[0]
-    found = relight(ball_mesh(), scene, Silhouettes.everything(scene.views))
-    report = found.report()
+    found = Relight()(ball_mesh(), scene, Silhouettes.everything(scene.views))
+    report = relighting_report(found)
     assert report["photographs"] == "used"
     assert report["psnr_db"] == report["psnr_matte_db"]
     assert len(report["views"]) == 3
@@ -77,7 +78,7 @@ def test_what_no_photograph_shows_has_no_figure():
     nothing = Silhouettes.everything(scene.views).replace(
         inside=torch.zeros_like(scene.views.images[:, 0])
     )
-    report = relight(ball_mesh(), scene, nothing).report()
+    report = relighting_report(Relight()(ball_mesh(), scene, nothing))
     assert report["psnr_db"] is None
     assert not math.isnan(report["materials"][0]["roughness"])
 
@@ -85,11 +86,11 @@ def test_what_no_photograph_shows_has_no_figure():
 def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
     full = ball_mesh()
     few = reduced(full, 1200)
-    found = relight(few, scene, None)
+    found = Relight()(few, scene, None)
     asset = textured(full, few, found.materials.at_vertices())
-    judged = found.with_textures(asset, scene, None)
+    judged = judge_textures(found, asset, scene, None)
     coarse, fine = found.judged.psnr_db.mean(), judged.textured.psnr_db.mean()
     assert fine > coarse + 1
     assert fine > 45  # eight bits a texel
-    assert judged.report()["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
-    assert found.report()["psnr_textured_db"] is None
+    assert relighting_report(judged)["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
+    assert relighting_report(found)["psnr_textured_db"] is None

@@ -81,3 +81,9 @@ def test_colours_of_two_paints_are_two_clusters():
     colors = torch.where(paint[:, None], red, blue) + 0.01 * torch.rand(500, 3)
     found = clusters(colors, 2)
     assert torch.equal(found == found[0], paint)
+
+
+def test_a_surface_of_fewer_colours_than_clusters_is_divided_by_these():
+    colours = torch.tensor([[0.2, 0.2, 0.2], [0.8, 0.1, 0.1]]).repeat(50, 1)
+    assert len(clusters(colours[::2], 2).unique()) == 1
+    assert len(clusters(colours, 3).unique()) == 2

@@ -12,9 +12,8 @@ from PIL import Image
 from pimper_torch.asset.make import textured
 from pimper_torch.asset.write import write_asset
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Silhouettes
-from pimper_torch.relighting.held_out import Judged, Relighting, predict
-from pimper_torch.relighting.lit_surface import Materials
+from pimper_torch.records import Judged, Materials, Relighting, Silhouettes
+from pimper_torch.relighting.held_out import predict
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.report.vertex_layers import surface_layers

@@ -11,9 +11,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.relighting.fit_lights import ViewLights
-from pimper_torch.relighting.held_out import Judged, Relighting
-from pimper_torch.relighting.lit_surface import Materials
+from pimper_torch.records import Judged, Materials, Relighting, ViewLights
 from pimper_torch.report.page import section_entries, write_page
 from pimper_torch.report.predictions import (
     Prediction,

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.asset.make import few_enough, textured
+from pimper_torch.asset.finish import MeshFiles, Simplify
+from pimper_torch.asset.make import Texture
 from pimper_torch.asset.write import write_asset
 from pimper_torch.evidence.metrics.in_view import angles_deg
 from pimper_torch.evidence.metrics.similarity import transfer
@@ -16,7 +17,7 @@ from pimper_torch.exchange.result import read_result
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import unit_face_normals
 from pimper_torch.records import Mesh
-from pimper_torch.relighting.held_out import relight
+from pimper_torch.relighting.held_out import Relight
 from pimper_torch.report.page import write_page
 from pimper_torch.report.predictions import predictions
 from pimper_torch.report.vertex_layers import length_layer, surface_layers
@@ -36,9 +37,10 @@ def write_compared_page(
         InputError: The folder is no result, or its photographs are gone.
     """
     found = read_result(folder)
-    few, scene = few_enough(found.mesh), found.scene
-    relighting = relight(few, scene, found.silhouettes)
-    asset = textured(found.mesh, few, relighting.materials.at_vertices())
+    few = Simplify()(found.mesh, MeshFiles(faces="all")).few
+    scene = found.scene
+    relighting = Relight()(few, scene, found.silhouettes)
+    asset = Texture()(found.mesh, few, relighting)
     errors = errors_of(asset.mesh.replace(normals_world=asset.normals), truth, truth_from_world)
     layers = [
         length_layer(

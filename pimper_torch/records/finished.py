@@ -1,0 +1,156 @@
+"""A surface that is ready to be written, and what it is worth beside photographs."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from pimper_torch.records.record import Record
+from pimper_torch.records.scene import Mesh
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Closed(Record):
+    """A mesh without borders.
+
+    Attributes:
+        mesh: The former faces first, in their order.
+        measured: Faces that were there; the others are caps.
+    """
+
+    mesh: Mesh
+    measured: Bool[Tensor, " face"]
+    borders: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Finished(Record):
+    """A surface as it is written.
+
+    Attributes:
+        mesh: Without caps; what pictures show.
+        few: The same in about 50,000 faces, where it has more: what people edit and browsers draw.
+        closed: With caps, if it shall have some.
+        how: ``"simplified"``, ``"reduced"`` to a number of faces, or nothing where it is whole.
+        counts: Of vertices and faces, and how far simplification moved the surface.
+        caps: Borders that were closed, faces and fraction of the area that they have.
+    """
+
+    mesh: Mesh
+    few: Mesh
+    closed: Closed | None
+    how: str
+    counts: dict[str, int | float]
+    caps: dict[str, int | float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class ViewLights(Record):
+    """The light of every view, for base colours of :func:`~pimper_torch.viz.maps.base_color`.
+
+    Attributes:
+        direction_world: Unit, from the surface's centre towards the light.
+        closeness: The surface's radius over the light's distance; 0 for a light at infinity.
+        ambient: Radiance of a white matte surface in shadow.
+        directed: Added where it faces the light, at the distance of the centre.
+    """
+
+    direction_world: Float[Tensor, "view 3"]
+    closeness: Float[Tensor, " view"]
+    ambient: Float[Tensor, "view channel"]
+    directed: Float[Tensor, "view channel"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Materials(Record):
+    """Materials of a surface in glTF's terms, one for every cluster of albedo.
+
+    Attributes:
+        roughness: In [0, 1]; its square is GGX's alpha.
+        specular: Times what glTF's dielectric mirrors head on; ``KHR_materials_specular``'s
+            ``specularFactor`` up to 1, ``specularColorFactor`` above.
+    """
+
+    cluster: Int[Tensor, " vertex"]
+    metallic: Float[Tensor, " cluster"]
+    roughness: Float[Tensor, " cluster"]
+    specular: Float[Tensor, " cluster"]
+
+    @classmethod
+    def of(cls, cluster: Int[Tensor, " vertex"], values: Float[Tensor, "cluster 3"]) -> "Materials":
+        """Return materials from metallic, roughness and specular of each cluster."""
+        metallic, roughness, specular = values.unbind(dim=1)
+        return cls(cluster=cluster, metallic=metallic, roughness=roughness, specular=specular)
+
+    @property
+    def values(self) -> Float[Tensor, "cluster 3"]:
+        """Metallic, roughness and specular of every cluster."""
+        return torch.stack([self.metallic, self.roughness, self.specular], dim=1)
+
+    def at_vertices(self) -> Float[Tensor, "vertex 3"]:
+        """Return metallic, roughness and specular of every vertex."""
+        return self.values[self.cluster]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Judged(Record):
+    """Errors of a surface in photographs, each under the light that suits it best.
+
+    Attributes:
+        psnr_db: Of sRGB values in [0, 1], over the object's pixels.
+    """
+
+    psnr_db: Float[Tensor, " view"]
+    lights: ViewLights
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Relighting(Record):
+    """The lights and materials of a result, and what they are worth.
+
+    Attributes:
+        lights: Of the photographs that the surface was made from.
+        held_out: Whether these photographs were held out, or the surface was made from them.
+        textured: With materials, and the asset's textures in place of values of vertices.
+    """
+
+    lights: ViewLights
+    materials: Materials
+    judged: Judged
+    matte: Judged
+    held_out: bool
+    textured: Judged | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Textured(Record):
+    """A mesh with textures, as glTF wants them.
+
+    Attributes:
+        mesh: Its vertices are copied along seams.
+        vertex: That each copy is of.
+        normals: Of its vertices, unit; those that the normal map is relative to.
+        uv: Right and down over the textures, in [0, 1].
+        tangent: Unit along ``u``, and the sign of the bitangent.
+        normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
+        reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
+    """
+
+    mesh: Mesh
+    vertex: Int[Tensor, " copy"]
+    normals: Float[Tensor, "copy 3"]
+    uv: Float[Tensor, "copy 2"]
+    tangent: Float[Tensor, "copy 4"]
+    base_color: UInt8[Tensor, "height width 3"]
+    normal: UInt8[Tensor, "height width 3"]
+    reflectance: Float[Tensor, "height width 3"] | None
+    charts: int
+
+    @property
+    def summary(self) -> dict[str, int | float]:
+        """Return counts and sizes, for ``summary.json``."""
+        height, width = self.normal.shape[:2]
+        faces = len(self.mesh.faces)
+        return {"faces": faces, "charts": self.charts, "width_px": width, "height_px": height}
