@@ -9,9 +9,9 @@ class Wrong(pt.Stage):
 
 
 def refused(chain: pt.CoarseToFine, scene: pt.SparseScene) -> None:
-    chain.factorize("nonsense", 3)  # type: ignore[arg-type, call-arg]
+    chain.factorize("nonsense", 3)  # type: ignore[arg-type]
     chain.factorize = Wrong()  # type: ignore[assignment]
-    pt.Factorize()("nonsense")  # type: ignore[arg-type]
+    pt.Factorize()("nonsense", 3)  # type: ignore[arg-type]
     pt.Warp()(scene)  # type: ignore[call-arg, arg-type]
     result = chain(scene)
     result.mesh.vertices  # type: ignore[attr-defined]  # noqa: B018

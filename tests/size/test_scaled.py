@@ -21,7 +21,9 @@ from pimper_torch.records import (
     FacetPoints,
     Heights,
     InlierPrior,
+    Judged,
     LightPrior,
+    Materials,
     Mesh,
     NormalPrior,
     PatchPriors,
@@ -33,6 +35,8 @@ from pimper_torch.records import (
     SparseScene,
     Surface,
     Templates,
+    Textured,
+    ViewLights,
     Views,
 )
 from pimper_torch.size.scaled import LAST, POSES, POWERS, scaled
@@ -57,6 +61,10 @@ WITHOUT = {
     LightPrior: {"lights", "variance"},
     Surface: {"barycentric", "normals_world", "albedo", "information"},
     Convergence: {"residual"},
+    ViewLights: {"direction_world", "closeness", "ambient", "directed"},  # closeness is a ratio
+    Materials: {"metallic", "roughness", "specular"},
+    Judged: {"psnr_db"},
+    Textured: {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
 }
 
 
