@@ -25,10 +25,10 @@ from scipy.spatial import cKDTree
 from sides import drawn, far_apart, square_round
 from torch import Tensor
 
+from pimper_bench.datasets import read_llff, write_colmap
 from pimper_torch.chains.presets import load_chain, load_config
 from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets import read_llff, write_colmap
 from pimper_torch.exchange.picture_files import file_names
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh, write_ply

@@ -14,12 +14,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.procedural_meshes import moved
-from pimper_torch.evidence.scenes.render_in_memory import render_objects
-from pimper_torch.evidence.scenes.scene_object import SceneObject, Texture
-from pimper_torch.evidence.scenes.scene_objects import RECIPES
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
-from pimper_torch.evidence.scenes.whole_scene import build_scene
+from pimper_bench.scenes.procedural_meshes import moved
+from pimper_bench.scenes.render_in_memory import render_objects
+from pimper_bench.scenes.scene_object import SceneObject, Texture
+from pimper_bench.scenes.scene_objects import RECIPES
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.scenes.whole_scene import build_scene
 from pimper_torch.radiometry import srgb_from_linear
 
 # Scene, size, turn in degrees and place: behind and beside the object, which they do not hide.

@@ -21,6 +21,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics import pair_views, similarity_between_cameras, transfer
+from pimper_bench.metrics.in_view import compare_along_rays
+from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_torch.coarse.fine_surface import (
     POINT_PX,
     REACH_PX,
@@ -34,10 +38,6 @@ from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import CoarseSurface, reliable_points
 from pimper_torch.coarse.trim import CELL_PX, point_distances, seen_surface, supports, view_counts
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras, transfer
-from pimper_torch.evidence.metrics.in_view import compare_along_rays
-from pimper_torch.evidence.metrics.surface_distances import TrueSurface
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageOps
 from skimage.measure import marching_cubes
 
 import pimper_torch
-from pimper_torch.evidence.scenes import SceneConfig, render_scene
+from pimper_bench.scenes import SceneConfig, render_scene
 
 SKULL = Path(pimper_torch.__file__).parent / "data" / "skull"
 

@@ -31,12 +31,12 @@ from guard_sets import SETS, Set, prepared
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from pimper_bench.datasets import read_rendered
+from pimper_bench.metrics.evaluation import camera_figures
+from pimper_bench.metrics.similarity import align_estimate, transfer
+from pimper_bench.metrics.surface_distances import TrueSurface, true_surface
 from pimper_torch.chains.presets import load_chain
 from pimper_torch.errors import PimperError
-from pimper_torch.evidence.datasets import read_rendered
-from pimper_torch.evidence.metrics.evaluation import camera_figures
-from pimper_torch.evidence.metrics.similarity import align_estimate, transfer
-from pimper_torch.evidence.metrics.surface_distances import TrueSurface, true_surface
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.photographs import load_views

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_bench.datasets.diligent import FLIP, decoded_normals, directed_lights
+from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.camera_files.layout import DataSetPath, contents
-from pimper_torch.evidence.datasets.diligent import FLIP, decoded_normals, directed_lights
-from pimper_torch.evidence.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_torch.io.photographs import read_mask
 from pimper_torch.numpy_files import read_npz
 from pimper_torch.radiometry import LINEAR

@@ -22,10 +22,10 @@ from reliefs import align_reliefs
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_bench.scenes import SceneObject, SensorConfig, render_objects
+from pimper_bench.scenes.scene_lights import Lights
+from pimper_bench.scenes.scene_object import Texture
 from pimper_torch.errors import PimperError
-from pimper_torch.evidence.scenes import SceneObject, SensorConfig, render_objects
-from pimper_torch.evidence.scenes.scene_lights import Lights
-from pimper_torch.evidence.scenes.scene_object import Texture
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import linear_from_srgb

@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 import pimper_torch as pt
-from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.metrics.evaluation import EvaluateConfig, evaluate
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.records import Capture, Prior
 

@@ -15,14 +15,14 @@ from derivatives import DerivativeCheck, Tensors, check_derivatives
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pimper_bench.scenes import render_shape, sparse_scene
+from pimper_bench.scenes.render_in_memory import Sphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import wandering_lights
+from pimper_bench.scenes.textures import random_speckle
 from pimper_torch import load_chain, load_views
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
-from pimper_torch.evidence.scenes import render_shape, sparse_scene
-from pimper_torch.evidence.scenes.render_in_memory import Sphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.scene_lights import wandering_lights
-from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.patches.sources import Sources
 from pimper_torch.records import (

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane
-from pimper_torch.evidence.scenes.textures import Waves
+from pimper_bench.scenes.render_in_memory import EndlessPlane
+from pimper_bench.scenes.textures import Waves
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 

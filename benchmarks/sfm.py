@@ -22,10 +22,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from pimper_bench.bench.measure import peak_memory
+from pimper_bench.datasets import read_llff, read_rendered
+from pimper_bench.metrics.evaluation import camera_figures
 from pimper_torch.errors import PimperError, PimperWarning
-from pimper_torch.evidence.bench.measure import peak_memory
-from pimper_torch.evidence.datasets import read_llff, read_rendered
-from pimper_torch.evidence.metrics.evaluation import camera_figures
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Capture, Estimate, Mesh, SparseScene, Views
 from pimper_torch.sfm.colmap import read_model

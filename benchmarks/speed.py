@@ -40,12 +40,12 @@ from typing import Any
 import torch
 from PIL import Image
 
+from pimper_bench.bench.measure import peak_memory, this_machine
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.cores import usable_cores
-from pimper_torch.evidence.bench.measure import peak_memory, this_machine
-from pimper_torch.evidence.scenes.rendered_folder import render_scene
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.results import write_result
 from pimper_torch.outputs.folders import held_output

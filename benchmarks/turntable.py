@@ -14,9 +14,9 @@ from pathlib import Path
 
 import torch
 
+from pimper_bench.datasets import read_rendered
+from pimper_bench.metrics.similarity import similarity_between_cameras
 from pimper_torch.errors import PimperError, PimperWarning
-from pimper_torch.evidence.datasets import read_rendered
-from pimper_torch.evidence.metrics.similarity import similarity_between_cameras
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Cameras, SparseScene, Views

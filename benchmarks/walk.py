@@ -18,11 +18,11 @@ from typing import Any
 
 import torch
 
-from pimper_torch.evidence.bench.measure import peak_memory
-from pimper_torch.evidence.datasets import read_rendered
-from pimper_torch.evidence.metrics.evaluation import camera_figures
-from pimper_torch.evidence.scenes.rendered_folder import render_scene
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_bench.bench.measure import peak_memory
+from pimper_bench.datasets import read_rendered
+from pimper_bench.metrics.evaluation import camera_figures
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh
 from pimper_torch.sfm import reconstruct, registration

@@ -39,7 +39,7 @@ def generator() -> torch.Generator:
 def shapes_checked(pytestconfig: pytest.Config) -> None:
     """Skip where annotations are not checked when functions are called."""
     if not pytestconfig.getoption("jaxtyping_packages"):
-        pytest.skip("needs --jaxtyping-packages=pimper_torch,beartype.beartype")
+        pytest.skip("needs --jaxtyping-packages=pimper_torch,pimper_bench,beartype.beartype")
 
 
 @pytest.fixture
@@ -89,8 +89,8 @@ def reconstruction():
     """A bump on a square seen by three cameras: a small, complete result."""
     from torch.nn.functional import normalize
 
-    from pimper_torch.evidence.scenes.procedural_meshes import table
-    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+    from pimper_bench.scenes.procedural_meshes import table
+    from pimper_bench.scenes.scene_cameras import arc_cameras
     from pimper_torch.geometry.projection import project
     from pimper_torch.geometry.rigid import rigid
     from pimper_torch.geometry.surfaces import vertex_normals
@@ -214,11 +214,11 @@ def lift():
     """
     from types import SimpleNamespace
 
-    from pimper_torch.evidence.scenes import render_shape
-    from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane
-    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-    from pimper_torch.evidence.scenes.scene_lights import wandering_lights
-    from pimper_torch.evidence.scenes.textures import random_speckle
+    from pimper_bench.scenes import render_shape
+    from pimper_bench.scenes.render_in_memory import EndlessPlane
+    from pimper_bench.scenes.scene_cameras import arc_cameras
+    from pimper_bench.scenes.scene_lights import wandering_lights
+    from pimper_bench.scenes.textures import random_speckle
     from pimper_torch.geometry.rigid import rotate
     from pimper_torch.patches.decompose import Decompose, DecomposeConfig
     from pimper_torch.patches.warp import Warp
@@ -294,8 +294,8 @@ def dtu(tmp_path_factory):
     import scipy.io
     from PIL import Image
 
-    from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-    from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+    from pimper_bench.scenes.procedural_meshes import icosphere
+    from pimper_bench.scenes.scene_cameras import arc_cameras
     from pimper_torch.records import Mesh
 
     cameras = arc_cameras(3, width=1600, height=1200, focal_px=2000.0, distance=600.0)

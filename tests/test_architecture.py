@@ -8,15 +8,19 @@ from datetime import date
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import pimper_bench
 import pimper_torch
+from pimper_torch.cli.commands import OF_BENCH
 
 PACKAGE = Path(pimper_torch.__file__).parent
+BENCH = Path(pimper_bench.__file__).parent
 ROOT = Path(__file__).parents[1]
 
-# A room imports from rooms above it in this list: the core never from the wings, which come last
+# A room imports from rooms above it in this list: the core never from the wing, which comes last
 # (the command line names its verbs there, and imports one when it is called). viz stands above io,
 # which draws the contact sheet of a result with it.
 ROOMS = [
@@ -68,7 +72,6 @@ ROOMS = [
     "cli",
     "batches",
     "single_view",
-    "evidence",
     "__main__",
 ]
 
@@ -83,7 +86,7 @@ SOLE_IMPORTERS = {
     "av": {"video/read.py"},
     "numba": {"kernels/compile.py"},
     "yaml": {"config.py"},
-    "tyro": {"cli/", "batches/", "evidence/cli/", "single_view/cli/"},
+    "tyro": {"cli/", "batches/", "pimper_bench/cli/", "single_view/cli/"},
     "matplotlib": {"viz/"},
     "viser": {"viewer/"},
     "onnxruntime": {"priors/network.py"},
@@ -104,6 +107,18 @@ def files() -> list[Path]:
     found = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
     assert len(found) > 30
     return sorted(found)
+
+
+def files_of_both() -> list[Path]:
+    found = sorted(BENCH.rglob("*.py"))
+    assert len(found) > 30
+    return [*files(), *found]
+
+
+def named(path: Path) -> str:
+    """Name a file of the package by its room, one of the other by the package, too."""
+    inside = path.is_relative_to(PACKAGE)
+    return path.relative_to(PACKAGE if inside else BENCH.parent).as_posix()
 
 
 @cache
@@ -130,6 +145,7 @@ def test_imports_point_only_upward(path):
     assert room(path) in ROOMS, f"{room(path)} has no place in the layout"
     for module in imports(path):
         head, _, rest = module.partition(".")
+        assert head != "pimper_bench", "that is another distribution, which imports this one"
         if head == "pimper_torch":
             assert rest, f"{path.name} imports the package as a whole"
             assert ROOMS.index(rest.split(".")[0]) <= ROOMS.index(room(path)), module
@@ -139,8 +155,8 @@ def test_imports_point_only_upward(path):
 def test_a_boundary_is_crossed_in_one_place(package):
     owners = SOLE_IMPORTERS[package]
     found = {
-        path.relative_to(PACKAGE).as_posix()
-        for path in files()
+        named(path)
+        for path in files_of_both()
         if any(module.split(".")[0] == package for module in imports(path))
     }
     assert found
@@ -151,7 +167,7 @@ def test_least_squares_repeat_bit_for_bit():
     """LAPACK's gelsy, the default, gives other bits at every call."""
     calls = [
         (path, ast.unparse(node))
-        for path in files()
+        for path in files_of_both()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("lstsq")
     ]
@@ -159,24 +175,41 @@ def test_least_squares_repeat_bit_for_bit():
     assert all("driver='gelsd'" in call for _, call in calls), calls
 
 
-def test_whatever_is_imported_is_declared():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
+def project(folder: Path) -> dict[str, Any]:
+    return tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+
+
+@pytest.mark.parametrize("package", [PACKAGE, BENCH], ids=lambda package: package.name)
+def test_whatever_is_imported_is_declared(package):
+    declaring = project(ROOT if package == PACKAGE else ROOT / "bench")
+    extras = declaring.get("optional-dependencies", {})
     needed = [entry for name in extras for entry in extras[name] if name not in ("test", "docs")]
-    needed += project["dependencies"]
+    needed += declaring["dependencies"]
     names = [re.split(r"[<>=\[ ]", entry)[0].lower() for entry in needed]
     declared = {MODULES.get(name, name.replace("-", "_")) for name in names}
-    used = {module.split(".")[0] for path in files() for module in imports(path)}
-    assert used - set(sys.stdlib_module_names) - {"pimper_torch"} <= declared
+    own = [path for path in files_of_both() if path.is_relative_to(package)]
+    used = {module.split(".")[0] for path in own for module in imports(path)}
+    assert used - set(sys.stdlib_module_names) - {package.name} <= declared
+
+
+def test_both_distributions_have_one_version_and_need_it():
+    version = project(ROOT)["version"]
+    assert project(ROOT / "bench")["version"] == version
+    assert f"pimper_torch=={version}" in project(ROOT / "bench")["dependencies"]
+
+
+def test_commands_found_without_being_installed_are_those_that_are_installed():
+    assert project(ROOT / "bench")["entry-points"]["pimper.commands"] == OF_BENCH
 
 
 @pytest.mark.parametrize(
     "path",
-    [path for path in files() if path.name == "__init__.py"],
+    [path for path in files_of_both() if path.name == "__init__.py"],
     ids=lambda path: path.parent.name,
 )
 def test_whatever_a_room_exports_is_there(path):
-    module = import_module(".".join(path.parent.relative_to(PACKAGE.parent).parts))
+    home = PACKAGE.parent if path.is_relative_to(PACKAGE) else BENCH.parent
+    module = import_module(".".join(path.parent.relative_to(home).parts))
     assert set(getattr(module, "__all__", ())) <= set(dir(module))
 
 
@@ -196,10 +229,9 @@ CHANGELOG = ROOT / "CHANGELOG.md"
 
 
 def test_the_newest_heading_of_the_changelog_is_the_version():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     headings = re.findall(r"^## (.+)$", CHANGELOG.read_text(), flags=re.MULTILINE)
     version, _, day = next(one for one in headings if one != "Unreleased").partition(" - ")
-    assert version == f"[{project['version']}]"
+    assert version == f"[{project(ROOT)['version']}]"
     assert date.fromisoformat(day)
 
 

@@ -9,6 +9,7 @@ import typing
 import pytest
 import yaml
 
+import pimper_bench
 import pimper_torch
 from pimper_torch.config import Range, build, require_ranges, to_yaml
 from pimper_torch.errors import ConfigError
@@ -43,10 +44,11 @@ def is_config(kind, module):
 
 
 def configs():
-    """List the dataclasses of settings that the package has."""
-    for found in pkgutil.walk_packages(pimper_torch.__path__, "pimper_torch."):
-        module = importlib.import_module(found.name)
-        yield from (kind for kind in vars(module).values() if is_config(kind, found.name))
+    """List the dataclasses of settings that the packages have."""
+    for package in (pimper_torch, pimper_bench):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            module = importlib.import_module(found.name)
+            yield from (kind for kind in vars(module).values() if is_config(kind, found.name))
 
 
 def holds_number(hint):

@@ -12,22 +12,22 @@ from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch as pt
-from pimper_torch.chains.coarse_to_fine import held_apart
-from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.metrics import pair_views, similarity_between_cameras
-from pimper_torch.evidence.metrics.in_view import angles_deg
-from pimper_torch.evidence.scenes import (
+from pimper_bench.metrics import pair_views, similarity_between_cameras
+from pimper_bench.metrics.in_view import angles_deg
+from pimper_bench.scenes import (
     RenderedScene,
     potato_on_table,
     render_shape,
 )
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, Shape, Sphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.scene_lights import wandering_lights
-from pimper_torch.evidence.scenes.textures import random_speckle
-from pimper_torch.evidence.scenes.true_clouds import sparse_scene
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.render_in_memory import EndlessPlane, Shape, Sphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import wandering_lights
+from pimper_bench.scenes.textures import random_speckle
+from pimper_bench.scenes.true_clouds import sparse_scene
+from pimper_torch.chains.coarse_to_fine import held_apart
+from pimper_torch.coarse.surface import CoarseSurface
+from pimper_torch.errors import PimperWarning
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (

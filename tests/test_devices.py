@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch import stages
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.paper.align import Align
 from pimper_torch.paper.integrate import Integrate
 from pimper_torch.paper.refine import Refine

@@ -15,22 +15,23 @@ from photographs import save_photographs
 from stand_ins import CHILD
 from torch.nn.functional import normalize
 
+import pimper_bench
 import pimper_torch
+from pimper_bench.scenes import RenderedScene, render_shape, sparse_scene
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.render_in_memory import Sphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import wandering_lights
+from pimper_bench.scenes.textures import random_speckle
 from pimper_torch.batches import task
 from pimper_torch.chains import presets
 from pimper_torch.chains.presets import load_config
-from pimper_torch.evidence.scenes import RenderedScene, render_shape, sparse_scene
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.render_in_memory import Sphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.scene_lights import wandering_lights
-from pimper_torch.evidence.scenes.textures import random_speckle
 from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.sfm.reconstruct import Reconstruct
 from tests.relighting import ball
 
-PACKAGE = Path(pimper_torch.__file__).parent
+PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
@@ -48,8 +49,9 @@ FEW = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a min
 def modules_with_examples() -> list[str]:
     """List the modules that have an example which is meant to run."""
     return [
-        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
-        for path in sorted(PACKAGE.rglob("*.py"))
+        ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
+        for package in PACKAGES
+        for path in sorted(package.rglob("*.py"))
         if re.search(r">>> (?!.*# doctest: \+SKIP)", path.read_text(encoding="utf-8"))
     ]
 

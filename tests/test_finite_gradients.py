@@ -7,9 +7,9 @@ from priors import prior_of
 from probes import calls, stage_of
 
 import pimper_torch as pt
-from pimper_torch.evidence.datasets.rendered import read_rendered
-from pimper_torch.evidence.scenes import render_scene
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.scenes import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::pimper_torch.errors.PimperWarning", "ignore:Converting a tensor with requires_grad"

@@ -8,8 +8,8 @@ from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch as pt
-from pimper_torch.evidence.scenes import render_scene
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_bench.scenes import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.photometry.factor_priors import FactorPrior, Known
 from pimper_torch.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes

@@ -8,7 +8,7 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.radiometry import linear_from_srgb, to_bytes
 from tests.coarse import ball
 

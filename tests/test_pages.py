@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
+import pimper_bench
 import pimper_torch
 from pimper_torch.cli.options import CommonOptions, InputOptions
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PACKAGE = Path(pimper_torch.__file__).parent
+PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
 PAGES = (*sorted(DOCS.glob("*.md")), ROOT / "benchmarks" / "README.md", ROOT / "README.md")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#{1,4} (.+)$", flags=re.MULTILINE)
@@ -56,9 +57,9 @@ def test_the_walk_finds_links():
 
 
 def messages() -> list[str]:
-    """List the package's texts, with an ellipsis where a message has numbers and names."""
+    """List the packages' texts, with an ellipsis where a message has numbers and names."""
     found = []
-    for path in PACKAGE.rglob("*.py"):
+    for path in (path for package in PACKAGES for path in package.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.JoinedStr):
                 parts = [

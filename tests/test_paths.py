@@ -20,10 +20,11 @@ def functions() -> Iterator[typing.Any]:
     """List what users call: exported names, and the public functions of the rooms at the edge."""
     yield from (getattr(pimper_torch, name) for name in pimper_torch._names)
     for name in EXPORTING:
-        room = importlib.import_module(f"pimper_torch.evidence.{name}")
+        room = importlib.import_module(f"pimper_bench.{name}")
         yield from (getattr(room, exported) for exported in room.__all__)
-    for name in ("store.store", "evidence.bench.run_bench", *modules()):
-        module = importlib.import_module(f"pimper_torch.{name}")
+    inner = (f"pimper_torch.{name}" for name in ("store.store", *modules()))
+    for name in (*inner, "pimper_bench.bench.run_bench"):
+        module = importlib.import_module(name)
         for found in vars(module).values():
             if getattr(found, "__module__", None) == module.__name__:
                 yield found

@@ -4,9 +4,10 @@ import ast
 from functools import cache
 from pathlib import Path
 
+import pimper_bench
 import pimper_torch
 
-PACKAGE = Path(pimper_torch.__file__).parent
+PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
 UNPICKLE = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal"}
 NETWORK = {"socket", "urllib", "http", "ftplib", "requests", "httpx", "aiohttp", "ssl"}
 
@@ -15,8 +16,8 @@ NETWORK = {"socket", "urllib", "http", "ftplib", "requests", "httpx", "aiohttp",
 def _found():
     """List imports and calls of all files: once, and only where a test asks for them."""
     imports, calls = [], []
-    for path in PACKAGE.rglob("*.py"):
-        name = path.relative_to(PACKAGE).as_posix()
+    for package, path in ((each, path) for each in PACKAGES for path in each.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 imports += [(name, alias.name.partition(".")[0]) for alias in node.names]
@@ -61,6 +62,6 @@ def test_only_baselines_and_python_itself_are_run():
     assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
         "asset/atlas.py",  # Python, which calls xatlas
         "batches/task.py",  # Python, which is `pimper reconstruct`
-        "evidence/baselines/openmvs.py",
+        "baselines/openmvs.py",
         "kernels/compile.py",  # Python, which compiles its kernels
     }

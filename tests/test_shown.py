@@ -14,21 +14,24 @@ import understood
 import yaml
 from shown import Shown, commands_in, in_markdown, roles_in, shown_in
 
+import pimper_bench
 import pimper_torch
 from pimper_torch.errors import PimperError
 from pimper_torch.ledger import GUARDS
 
-PACKAGE = Path(pimper_torch.__file__).parent
+PACKAGE, BENCH = (Path(package.__file__).parent for package in (pimper_torch, pimper_bench))
+PACKAGES = {package.name: package for package in (PACKAGE, BENCH)}
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs").rglob("*.rst")),
-    ROOT / "benchmarks" / "README.md",
+    *(ROOT / folder / "README.md" for folder in ("bench", "benchmarks")),
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
 ]
 CODE = re.compile(r"`(?:--|pip|pimper |pt\.|\w+[./(]|--)|:\w+:`|>>>")
-SOURCES = [path for path in sorted(PACKAGE.rglob("*.py")) if CODE.search(path.read_text("utf-8"))]
+FILES = [path for package in PACKAGES.values() for path in sorted(package.rglob("*.py"))]
+SOURCES = [path for path in FILES if CODE.search(path.read_text("utf-8"))]
 
 
 def named(path: Path) -> str:
@@ -52,17 +55,19 @@ def dotted(text: str) -> None:
     """A setting, a guard, or a name in a module, from the package or below it."""
     if text in understood.settings() or text in GUARDS:
         return
-    path = text.removeprefix("pimper_torch.").split(".")
-    if text.startswith("pimper_torch.") or path[0] in {one.name for one in PACKAGE.iterdir()}:
+    first, *rest = path = text.split(".")
+    if first in PACKAGES:
+        assert is_defined(rest, PACKAGES[first]), f"there is no {text}"
+    elif first in {one.name for one in PACKAGE.iterdir()}:
         assert is_defined(path), f"there is no {text}"
     else:
         sections = {name for name in understood.settings() if "." not in name}
         assert path[0] not in sections, f"there is no setting {text}"
 
 
-def is_defined(path: list[str]) -> bool:
+def is_defined(path: list[str], package: Path = PACKAGE) -> bool:
     """Whether names lead to a module, or to what one defines."""
-    place, rest = PACKAGE, [*path]
+    place, rest = package, [*path]
     while rest and (place / rest[0]).is_dir():
         place /= rest.pop(0)
     file = place / f"{rest[0]}.py" if rest else place
@@ -87,23 +92,22 @@ def words_of(file: Path) -> set[str]:
 
 
 def role(name: str) -> None:
-    """A name in full, or one of the module or of another of the package."""
+    """A name in full, or one of the module or of another of the packages."""
     first, *rest = name.split(".")
-    if first == "pimper_torch":
-        assert is_defined(rest), f"{name} leads nowhere"
-    elif not {*filter(None, (first, *rest))} <= words_of_package():
+    if first in PACKAGES:
+        assert is_defined(rest, PACKAGES[first]), f"{name} leads nowhere"
+    elif not {*filter(None, (first, *rest))} <= words_of_packages():
         of_others = bool(first and rest and find_spec(first))
         assert of_others, f"{name} leads nowhere"
 
 
 @functools.cache
-def words_of_package() -> set[str]:
-    files = [*PACKAGE.rglob("*.py")]
-    return {path.stem for path in files}.union(*map(words_of, files))
+def words_of_packages() -> set[str]:
+    return {path.stem for path in FILES}.union(*map(words_of, FILES))
 
 
 def file(text: str) -> None:
-    if not any((root / text.split("/")[0]).exists() for root in (ROOT, PACKAGE)) and "/" in text:
+    if not any((root / text.split("/")[0]).exists() for root in (ROOT, PACKAGE, BENCH)) and "/" in text:
         return  # of another project
     ends = [f"/{named(one)}" for one in every_file()]
     assert any(end.endswith(f"/{text.lstrip('./')}") for end in ends), f"there is no file {text}"
@@ -111,7 +115,7 @@ def file(text: str) -> None:
 
 @functools.cache
 def every_file() -> list[Path]:
-    folders = ("pimper_torch", "tests", "benchmarks", "configs", "docs", "notebooks", ".ci")
+    folders = ("pimper_torch", "bench", "tests", "benchmarks", "configs", "docs", "notebooks", ".ci")
     return [path for folder in folders for path in (ROOT / folder).rglob("*.*")]
 
 

@@ -1,6 +1,6 @@
 """Which publication each module takes its method from, as its docstrings say.
 
-``sources`` writes a list for every room of the package.
+``sources`` writes a list for every room of the packages.
 """
 
 import ast
@@ -15,9 +15,10 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective, switch_source_input
 
+import pimper_bench
 import pimper_torch
 
-PACKAGE = Path(pimper_torch.__file__).parent
+PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
 SOURCE = re.compile(r"^Source: (.*?)(?:\n\n|\Z)", flags=re.MULTILINE | re.DOTALL)
 
 
@@ -38,8 +39,8 @@ class Source:
 
 def sources() -> Iterator[Source]:
     """Find all sources, module by module."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    for package, path in ((one, path) for one in PACKAGES for path in sorted(one.rglob("*.py"))):
+        parts = path.relative_to(package.parent).with_suffix("").parts
         module = ".".join(parts).removesuffix(".__init__")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
@@ -50,11 +51,11 @@ def sources() -> Iterator[Source]:
 
 
 def rooms() -> dict[str, list[Source]]:
-    """Group sources by the room of the package that they are in."""
+    """Group sources by the room of a package that they are in."""
     groups: dict[str, list[Source]] = {}
     for source in sources():
-        inside = source.module.split(".")[1:]
-        room = ".".join(inside[:2] if inside[0] in ("evidence", "single_view") else inside[:1])
+        parts = source.module.removeprefix("pimper_torch.").split(".")
+        room = ".".join(parts[:2] if parts[0] in ("pimper_bench", "single_view") else parts[:1])
         groups.setdefault(room, []).append(source)
     return groups
 

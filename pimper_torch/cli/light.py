@@ -24,11 +24,14 @@ _HEAVY = (
 
 
 @contextmanager
-def absent() -> Iterator[None]:
+def absent(other: str = _PACKAGE) -> Iterator[None]:
     """Import modules in the block without what takes long to load, and forget them after it.
 
     Their classes are not those of the package: they serve to read a command line, which is read
     again if it is sound. Where torch is loaded already, nothing is absent.
+
+    Args:
+        other: A package beside this one that has such modules.
     """
     if "torch" in sys.modules:
         yield
@@ -41,7 +44,7 @@ def absent() -> Iterator[None]:
         sys.meta_path.remove(finder)
         for name in {*sys.modules} - before:
             package, _, last = name.rpartition(".")
-            if name.partition(".")[0] in {_PACKAGE, *_HEAVY}:
+            if name.partition(".")[0] in {_PACKAGE, other, *_HEAVY}:
                 del sys.modules[name]
                 if package in before:
                     vars(sys.modules[package]).pop(last, None)

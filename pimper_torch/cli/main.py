@@ -23,6 +23,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from typing import TextIO
 
+from pimper_torch.cli.commands import OF_BENCH, brought, listed
 from pimper_torch.cli.deaths import limit, write_report
 from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
@@ -59,19 +60,16 @@ albedo and light.
 Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
 143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
 """
-# Where each is carried out, and where its arguments are read if that is elsewhere. `--help` ends
-# `checked` with SystemExit; it and `run` refuse with PimperError before anything is written.
+# Where each of this package is carried out, and where its arguments are read if that is elsewhere.
+# `--help` ends `checked` with SystemExit; it and `run` refuse with PimperError before anything is
+# written.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
     "batch": "pimper_torch.batches.cli",
     "doctor": "pimper_torch.cli.doctor",
     "demo": "pimper_torch.cli.run",
     "config": "pimper_torch.cli.settings",
-    "render": "pimper_torch.evidence.cli.render_command",
     "export": "pimper_torch.cli.export",
-    "evaluate": "pimper_torch.evidence.cli.evaluate",
-    "bench": "pimper_torch.evidence.cli.bench",
-    "convert": "pimper_torch.evidence.cli.convert",
     "gamma": "pimper_torch.single_view.cli.gamma",
     "view": "pimper_torch.cli.view",
     "frames": "pimper_torch.cli.frames",
@@ -125,7 +123,7 @@ def _print_anything() -> None:
 def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help", "--help-all"):
-        sys.stdout.write(_HELP)
+        sys.stdout.write(listed(_HELP, brought()))
         return 0 if given else _BAD_INPUT
     if given[0] == "--version":
         from pimper_torch.io.version import versions
@@ -136,14 +134,28 @@ def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
         output, rest = split(given[1:])
     except PimperError as error:
         return _failed(Output(), error)
-    if given[0] not in _COMMANDS:
-        near = difflib.get_close_matches(given[0], _COMMANDS, n=1)
-        hint = f" Did you mean `{near[0]}`?" if near else ""
-        text = f"there is no command `{given[0]}`.{hint} See `pimper --help`."
-        output.error("ConfigError", text, _BAD_INPUT)
+    home = _COMMANDS.get(given[0]) or brought().get(given[0])
+    if home is None:
+        output.error("ConfigError", _no_command(given[0]), _BAD_INPUT)
         return _BAD_INPUT
     with _readable_warnings(output):
-        return _run(given[0], rest, output, supervised)
+        return _run(given[0], home, rest, output, supervised)
+
+
+def commands() -> dict[str, str]:
+    """List all commands, and where each is carried out."""
+    return brought() | _COMMANDS
+
+
+def _no_command(name: str) -> str:
+    if name in OF_BENCH:
+        return (
+            f"`pimper {name}` comes with pimper-bench, which is not installed: `pip install "
+            "./bench` in a clone of the repository brings it."
+        )
+    near = difflib.get_close_matches(name, commands(), n=1)
+    hint = f" Did you mean `{near[0]}`?" if near else ""
+    return f"there is no command `{name}`.{hint} See `pimper --help`."
 
 
 def _limit_arenas() -> None:
@@ -156,7 +168,7 @@ def _limit_arenas() -> None:
         ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
 
-def _run(command: str, arguments: list[str], output: Output, supervised: bool) -> int:
+def _run(command: str, home: str, arguments: list[str], output: Output, supervised: bool) -> int:
     # Read when torch is loaded. Threads that spin while they wait take the processor from
     # those they wait for when the machine is busy, and many small steps then take ten times
     # as long.
@@ -166,7 +178,6 @@ def _run(command: str, arguments: list[str], output: Output, supervised: bool) -
     if usable_cores() < (os.cpu_count() or 1):  # OpenMP knows of affinity, not of quotas
         os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
     _limit_arenas()
-    home = _COMMANDS[command]
     try:
         for argument in arguments:
             require_name(argument, InputError)
@@ -247,7 +258,7 @@ def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
     if "torch" in sys.modules:
         return
     try:
-        with warnings.catch_warnings(), absent():
+        with warnings.catch_warnings(), absent(home.partition(".")[0]):
             warnings.simplefilter("ignore")  # shown when the arguments are read in earnest
             import_module(home).checked(command, arguments)
     except (PimperError, BrokenPipeError):

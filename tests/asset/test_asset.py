@@ -12,6 +12,7 @@ from PIL import Image
 from torch.nn.functional import grid_sample, normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.asset import atlas as atlases
 from pimper_torch.asset.atlas import MAX_SIDE, by_triangles, unwrapped
 from pimper_torch.asset.bake import baked
@@ -19,7 +20,6 @@ from pimper_torch.asset.make import textured
 from pimper_torch.asset.tangents import tangents
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import write_glb
 from pimper_torch.parallel import on_one_thread

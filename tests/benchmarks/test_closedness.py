@@ -6,8 +6,8 @@ import trimesh
 from closedness import closedness
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Mesh
 
 

@@ -5,8 +5,8 @@ import torch
 from planarity import dihedrals, planar_faces
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh
 

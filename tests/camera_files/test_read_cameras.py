@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Cameras, Views
 from pimper_torch.sfm import colmap

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pimper_torch.cli.main import _COMMANDS, main
+from pimper_torch.cli.main import commands, main
 from pimper_torch.cli.options import parse
 from pimper_torch.config import to_mapping
 
@@ -23,7 +23,7 @@ def test_the_help_that_comes_at_once_is_that_of_the_command(tmp_path, capsys):
     code = f"""if True:
         import sys
         from pimper_torch.cli.main import main
-        for command in {[*_COMMANDS]}:
+        for command in {[*commands()]}:
             try:
                 main([command, "--help-all"])
             except SystemExit:
@@ -32,7 +32,7 @@ def test_the_help_that_comes_at_once_is_that_of_the_command(tmp_path, capsys):
     """
     *at_once, rest = answers(code, tmp_path).split("====\n")
     assert rest == ""
-    for command, told in zip(_COMMANDS, at_once, strict=True):
+    for command, told in zip(commands(), at_once, strict=True):
         with pytest.raises(SystemExit):  # torch is loaded here
             main([command, "--help-all"])
         assert len(told) > 500

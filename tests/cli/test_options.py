@@ -11,6 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import pytest
 from stand_ins import CHILD, children_stand_in, write_slurm
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.batches import task
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.chains.presets import load_config
@@ -18,7 +19,6 @@ from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import read_mesh, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.store import Store

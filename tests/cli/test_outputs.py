@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.outputs.folders import held_output
 from pimper_torch.records import Mesh

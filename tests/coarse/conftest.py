@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.true_clouds import sparse_scene
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.records import SparseScene
 from tests.coarse.ball import all_round, photographed
 

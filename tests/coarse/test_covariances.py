@@ -1,10 +1,10 @@
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.coarse.surface import point_covariances
-from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 
 
 def noisy_cloud(noise_px, seed, span_deg=50.0):

@@ -2,6 +2,10 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere, table
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.coarse.densify import (
     agreeing,
     choose_sources,
@@ -24,10 +28,6 @@ from pimper_torch.coarse.trim import (
     without_small_holes,
 )
 from pimper_torch.coarse.window_matching import Matcher, Windows, level_of, pair
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere, table
-from pimper_torch.evidence.scenes.render_in_memory import Sphere, render_shape
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.records import Mesh, Support

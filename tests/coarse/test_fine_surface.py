@@ -3,13 +3,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.coarse.fine_surface import closed_surface, cropped
 from pimper_torch.coarse.oriented import no_points
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.coarse.trim import FineSurfaceConfig, ViewCounts, seen_surface
 from pimper_torch.errors import ReconstructionError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_components, face_pairs

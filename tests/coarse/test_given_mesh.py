@@ -3,11 +3,11 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.chains.presets import load_chain
 from pimper_torch.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.local_frame import to_local
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import boundary_loops, face_components

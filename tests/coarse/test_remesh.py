@@ -4,9 +4,9 @@ from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, half_edges

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.coarse.splitting import mark_edges, split_edges
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_edges, half_edges
 

@@ -3,6 +3,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.coarse.surface import (
     CoarseSurface,
     facets_of,
@@ -10,8 +12,6 @@ from pimper_torch.coarse.surface import (
     two_faces_an_edge,
 )
 from pimper_torch.errors import InputError, ReconstructionError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_components, face_pairs

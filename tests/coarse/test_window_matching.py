@@ -3,8 +3,8 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch.testing import assert_close
 
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.coarse.window_matching import Matcher, MatchingLevel, Windows, pair
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 
 OFFSETS = [-0.2, -0.003, 0.0, 0.004, 0.05]
 

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
 from pimper_torch.doctor.checks import (
     blur,
@@ -21,7 +22,6 @@ from pimper_torch.doctor.cost import cost, estimate
 from pimper_torch.doctor.machine import available_gb, machine, total_gb
 from pimper_torch.doctor.pairs import match_copies, overlap
 from pimper_torch.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Mesh

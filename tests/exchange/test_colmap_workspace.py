@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.datasets import read_colmap
+from pimper_bench.datasets import read_colmap
 from pimper_torch.exchange.colmap_workspace import write_workspace
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.meshes import read_mesh

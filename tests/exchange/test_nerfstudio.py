@@ -3,7 +3,7 @@ import json
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.datasets import read_transforms
+from pimper_bench.datasets import read_transforms
 from pimper_torch.exchange.nerfstudio import thinned, write_nerfstudio
 from pimper_torch.io.meshes import read_mesh
 

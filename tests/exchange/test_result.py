@@ -6,10 +6,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_bench.datasets import read_transforms
 from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.datasets import read_transforms
 from pimper_torch.exchange import read_result
 from pimper_torch.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.geometry.projection import project

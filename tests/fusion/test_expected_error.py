@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import table
+from pimper_bench.scenes.procedural_meshes import table
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.expected_error import expected_error, regions

@@ -20,11 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
 from dng import write_dng
 from heic_files import UPRIGHT
 
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.camera_files.read_cameras import read_cameras
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.config import build, read_mapping, to_yaml
-from pimper_torch.evidence.datasets import (
+from pimper_bench.datasets import (
     read_colmap,
     read_diligent,
     read_idr,
@@ -37,11 +33,15 @@ from pimper_torch.evidence.datasets import (
     write_idr,
     write_transforms,
 )
-from pimper_torch.evidence.datasets.matlab import read_matlab, read_toolbox_projections
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.rendered_folder import render_scene
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
+from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.camera_files.layout import DataSetPath
+from pimper_torch.camera_files.read_cameras import read_cameras
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.config import build, read_mapping, to_yaml
 from pimper_torch.exchange.alicevision import write_sfm
 from pimper_torch.exchange.openexr import write_exr
 from pimper_torch.geometry.projection import project

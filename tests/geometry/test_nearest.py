@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.records import Mesh
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry import projection
 from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 

@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.supporting_plane import PlaneSearch, fixation, supporting_plane
 
 

@@ -4,7 +4,7 @@ import trimesh
 from slopes import normals_from_slopes
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     face_normals,

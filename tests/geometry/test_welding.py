@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.topology import boundary_loops
 from pimper_torch.geometry.welding import TOLERANCE, welded
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.metrics.in_view import angles_deg, meet_in_view, relative_error
+from pimper_bench.metrics.in_view import angles_deg, meet_in_view, relative_error
 from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 

@@ -1,4 +1,4 @@
-"""Names and calls in pieces of Python, followed through the package without running them."""
+"""Names and calls in pieces of Python, followed through the packages without running them."""
 
 import ast
 import functools
@@ -14,9 +14,9 @@ from pimper_torch.chains.presets import load_config, make_chain
 
 
 def _own(kind: object) -> bool:
-    """Whether a module, a class or a function is of the package."""
+    """Whether a module, a class or a function is of the packages."""
     name = kind.__name__ if inspect.ismodule(kind) else getattr(kind, "__module__", None) or ""
-    return name.partition(".")[0] == pt.__name__
+    return name.partition(".")[0] in (pt.__name__, "pimper_bench")
 
 
 class Of:

@@ -13,7 +13,7 @@ import tyro
 
 from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.arguments import REQUIRED, Option, options_of
-from pimper_torch.cli.main import _COMMANDS, _READERS
+from pimper_torch.cli.main import _READERS, commands
 from pimper_torch.cli.output import split
 from pimper_torch.errors import ConfigError, PimperError
 
@@ -38,7 +38,7 @@ def command_line(text: str, *, whole: bool = True) -> None:
     words = words[1 : words.index(">")] if ">" in words else words[1:]
     if not words or words[0].startswith("--"):
         return  # `pimper --help` and the like
-    if words[0] not in _COMMANDS:
+    if words[0] not in commands():
         raise ConfigError(f"there is no command {words[0]}")
     name, given = words[0], words[1:]
     if "--" in given:  # of `pimper batch`: options for every object
@@ -61,8 +61,8 @@ def option(text: str) -> None:
     named = {word.partition("=")[0] for word in words if word.startswith("--")}
     if named <= {"--help", "--help-all", "--version", "--quiet", "--json", "--log-level"}:
         return
-    commands = [name for name in _COMMANDS if name != "config"]  # which takes any text
-    having = [name for name in commands if named <= {*options(name)}]
+    names = [name for name in commands() if name != "config"]  # which takes any text
+    having = [name for name in names if named <= {*options(name)}]
     if not having:
         raise ConfigError(f"no command has {' '.join(sorted(named))}")
     if len(words) == 1:
@@ -97,7 +97,7 @@ def options(name: str) -> Mapping[str, Option]:
 
 
 def _checker(name: str) -> Callable[[str, Sequence[str]], object]:
-    home = _COMMANDS[name]
+    home = commands()[name]
     return import_module(_READERS.get(home, home)).checked
 
 

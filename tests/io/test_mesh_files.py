@@ -6,9 +6,9 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.asset.finish import MeshFiles
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.results import write_result
 from pimper_torch.radiometry import Encoding

@@ -10,8 +10,8 @@ import trimesh
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.viz.maps import albedo_scale

@@ -12,9 +12,9 @@ import yaml
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.asset.finish import MeshFiles, written_channels
 from pimper_torch.errors import OutputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.rigid import transform

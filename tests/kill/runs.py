@@ -117,8 +117,7 @@ def load() -> None:
     """Load what runs need, so that those that are forked have it."""
     import pycolmap  # noqa: F401
 
-    import pimper_torch.cli.run
-    import pimper_torch.evidence.cli.render_command  # noqa: F401
+    import pimper_bench.cli.render_command  # noqa: F401
     from pimper_torch.kernels.compile import compile_all
 
     compile_all()

@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.meshing import borders
 from tests.meshing.sheets import sheet_of
 

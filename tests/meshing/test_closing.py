@@ -3,8 +3,8 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.topology import face_components
 from pimper_torch.meshing.closing import border_cycles, closed
 from pimper_torch.records import Mesh

@@ -6,7 +6,7 @@ from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import (
     boundary_loops,

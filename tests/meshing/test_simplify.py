@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.meshing.simplify import Bounds, simplify

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.render_in_memory import EndlessPlane, RenderedScene, render_shape
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.render_in_memory import EndlessPlane, RenderedScene, render_shape
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import CoarseMesh, Mesh
 
 TILTED = EndlessPlane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import table
+from pimper_bench.scenes.procedural_meshes import table
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.patches.transfer import coarse_normals, transfer, transferred_normals

@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.scene_cameras import turntable_directions
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import turntable_directions
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster

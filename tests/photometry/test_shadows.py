@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere, join, moved, table
+from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.photometry.light_field import LightField
 from pimper_torch.photometry.shadows import cast_shadows, cast_shadows_on_rasters

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes import SceneConfig, build_scene, render_objects, sparse_scene
+from pimper_bench.scenes import SceneConfig, build_scene, render_objects, sparse_scene
 from pimper_torch.records import Silhouettes
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.linalg.sums import total
 from pimper_torch.meshing.closing import closed

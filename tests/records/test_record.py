@@ -6,8 +6,8 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader
 
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import Cameras, Convergence, Photometry, Record, SparseScene, Views
 from pimper_torch.records.patches import Templates
 

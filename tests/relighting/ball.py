@@ -5,7 +5,7 @@ from functools import cache
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere, join, moved, table
+from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh, ViewLights

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs the package with the lowest versions that it declares, and reconstructs a small scene.
+# Installs the packages with the lowest versions that it declares, and reconstructs a small scene.
 #
 #     tests/scripts/lower_bounds.sh FOLDER
 set -euo pipefail
@@ -11,7 +11,7 @@ root="$(cd "$(dirname "$0")/../.." && pwd)"
 # shellcheck disable=SC1091
 source "$folder/venv/bin/activate"
 pip install --constraint "$folder/constraints.txt" "torch==2.13.0"
-pip install --constraint "$folder/constraints.txt" "$root"
+pip install --constraint "$folder/constraints.txt" "$root" "$root/bench"
 
 cd "$folder"  # the installed package, not the working tree
 pimper --version

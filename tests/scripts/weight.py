@@ -1,4 +1,4 @@
-"""Count what makes the package heavier to read, and fail above the bars.
+"""Count what makes the packages heavier to read, and fail above the bars.
 
     python tests/scripts/weight.py
 
@@ -11,10 +11,11 @@ import ast
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[2] / "pimper_torch"
+ROOT = Path(__file__).parents[2]
+PACKAGES = (ROOT / "pimper_torch", ROOT / "bench" / "pimper_bench")
 
 BARS = {
     "docstrings that begin with Give, Tell, Say, Mark, What or How": 0,
@@ -33,9 +34,10 @@ def classes(text: str) -> Iterator[str]:
     return (x.name for x in nodes if isinstance(x, ast.ClassDef) and not x.name.startswith("_"))
 
 
-def measure(package: Path) -> list[int]:
+def measure(packages: Sequence[Path]) -> list[int]:
     """Return the numbers, in the order of the bars."""
-    texts = {path: path.read_text(encoding="utf-8") for path in package.rglob("*.py")}
+    paths = [path for package in packages for path in package.rglob("*.py")]
+    texts = {path: path.read_text(encoding="utf-8") for path in paths}
     files = Counter(path.name for path in texts if path.name != "__init__.py")
     names = Counter(name for text in texts.values() for name in classes(text))
     return [
@@ -48,7 +50,7 @@ def measure(package: Path) -> list[int]:
 
 def main() -> int:
     """Print every number beside its bar; 1 where one is above it."""
-    numbers = measure(PACKAGE)
+    numbers = measure(PACKAGES)
     for (what, bar), number in zip(BARS.items(), numbers, strict=True):
         sys.stdout.write(f"{number:5d} of {bar:5d} at most: {what}\n")
     return int(any(number > bar for number, bar in zip(numbers, BARS.values(), strict=True)))

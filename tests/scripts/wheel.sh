@@ -1,12 +1,20 @@
 #!/usr/bin/env bash
-# Builds sdist and wheel, and uses the wheel from outside the repository: in an environment of its
-# own, beside the packages of the one that runs this.
+# Builds sdists and wheels of both distributions as an index takes them, and uses the wheels from
+# outside the repository: in an environment of its own, beside the packages of the one that runs this.
 #   tests/scripts/wheel.sh FOLDER
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 folder="$1"
 
-python -m build --no-isolation --outdir "$folder/dist" > /dev/null
+export PIMPER_INDEX=1
+for distribution in . bench; do
+    python -m build --no-isolation --outdir "$folder/dist" "$distribution" > /dev/null
+done
+if tar -xzOf "$folder"/dist/pimper_torch-*.tar.gz --wildcards "*/PKG-INFO" \
+    | grep "^Requires-Dist:.* @ "; then
+    echo "an index refuses what refers to a place" >&2
+    exit 1
+fi
 twine check --strict "$folder"/dist/*
 python -m venv --without-pip "$folder/venv"
 outside="$folder/venv/bin/python"
@@ -18,6 +26,7 @@ pip --python "$outside" install --quiet --no-deps --force-reinstall "$folder"/di
 cp tests/scripts/from_outside.py "$folder"
 cd "$folder"
 env -u PYTHONPATH "$folder/venv/bin/pimper" --version
+env -u PYTHONPATH "$folder/venv/bin/pimper" render --help > /dev/null
 env -u PYTHONPATH "$outside" from_outside.py "$there"
 # Others' types take long to read and are not what is checked.
 printf '[mypy]\nstrict = True\n[mypy-torch.*,numpy.*,scipy.*,matplotlib.*,trimesh.*,PIL.*]\n%s\n' \

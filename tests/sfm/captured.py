@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.scene_cameras import FRONT, UP, arc_cameras
+from pimper_bench.scenes.scene_cameras import FRONT, UP, arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
 from pimper_torch.sfm.camera_in_place import mapped

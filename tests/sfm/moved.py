@@ -2,8 +2,8 @@
 
 import torch
 
-from pimper_torch.evidence.scenes.scene_cameras import turntable_directions
-from pimper_torch.evidence.scenes.whole_scene import upside_down
+from pimper_bench.scenes.scene_cameras import turntable_directions
+from pimper_bench.scenes.whole_scene import upside_down
 from pimper_torch.geometry.pinholes import look_at
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import transform

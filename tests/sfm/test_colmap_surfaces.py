@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import ConfigError
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.records import Mesh
 from pimper_torch.sfm.colmap_surfaces import reduced

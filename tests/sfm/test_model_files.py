@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.projection import project
 from pimper_torch.sfm.colmap import (
     loaded,

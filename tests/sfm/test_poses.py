@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import Lens, Views
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.poses import (

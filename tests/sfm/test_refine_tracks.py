@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.evidence.metrics.similarity import similarity_between_points
+from pimper_bench.metrics.similarity import similarity_between_points
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.sfm.colmap import bundle, observation_errors

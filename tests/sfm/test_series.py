@@ -3,8 +3,8 @@ from itertools import combinations
 import pytest
 import torch
 
+from pimper_bench.scenes.whole_scene import upside_down
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.whole_scene import upside_down
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Lens

@@ -3,9 +3,9 @@ import warnings
 import pytest
 import torch
 
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.scenes.whole_scene import build_scene
 from pimper_torch.errors import PimperWarning
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
-from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.test_turntable import center_errors, photographs

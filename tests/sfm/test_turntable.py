@@ -1,12 +1,12 @@
 import pytest
 import torch
 
+from pimper_bench.metrics.similarity import similarity_between_cameras
+from pimper_bench.scenes.procedural_meshes import potato
+from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.scenes.whole_scene import build_scene
 from pimper_torch.errors import PimperWarning, ReconstructionError
-from pimper_torch.evidence.metrics.similarity import similarity_between_cameras
-from pimper_torch.evidence.scenes.procedural_meshes import potato
-from pimper_torch.evidence.scenes.ray_tracing import TracedObjects, render_frame
-from pimper_torch.evidence.scenes.scene_settings import SceneConfig
-from pimper_torch.evidence.scenes.whole_scene import build_scene
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Views

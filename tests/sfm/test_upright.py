@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
 from pimper_torch.sfm.colmap import pinhole_lenses
 from pimper_torch.sfm.lenses import turned_pose

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import Cameras, Lens, SparseScene, Views

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.evidence.metrics.in_view import angles_deg
+from pimper_bench.metrics.in_view import angles_deg
 from pimper_torch.silhouettes.contours import RayConfig, contour_rays
 from tests.silhouettes.shapes import PIXEL, ball, nearest_to, ring, silhouettes_of
 

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
-from pimper_torch.evidence.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import Lens, Mesh, Silhouettes
 from pimper_torch.sfm.undistort import pinhole_for
 

@@ -6,8 +6,8 @@ import logging
 import pytest
 import torch
 
+from pimper_bench.datasets.rendered import read_rendered
 from pimper_torch.cli.main import main
-from pimper_torch.evidence.datasets.rendered import read_rendered
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.rigid import transform

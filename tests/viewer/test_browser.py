@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Mesh
 from pimper_torch.viewer.show import add_found
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh, stand_of
 from pimper_torch.viewer.layers import LAYERS, painted

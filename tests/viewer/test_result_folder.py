@@ -9,10 +9,10 @@ from urllib.request import urlopen
 
 import pytest
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.evidence.scenes.procedural_meshes import icosphere
 from pimper_torch.io import results
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh

@@ -5,8 +5,8 @@ from reliefs import bumps_in_perspective, regions
 from torch.autograd.functional import jvp
 from torch.testing import assert_close
 
+from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_torch.errors import InputError
-from pimper_torch.evidence.scenes.render_in_memory import Sphere
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.photometric_stereo.perspective import (
     factorize_in_perspective,

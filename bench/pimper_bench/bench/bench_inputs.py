@@ -1,0 +1,215 @@
+"""Settings, scenes and methods of the bench."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from torch import nn
+
+from pimper_bench.baselines.openmvs import OpenMvs
+from pimper_bench.baselines.smoothed import Smoothed
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.evaluation import EvaluateConfig, prepared_surface
+from pimper_bench.metrics.similarity import pair_views
+from pimper_bench.metrics.surface_distances import TrueSurface
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.chains.presets import load_config, make_chain
+from pimper_torch.config import Range, require, require_ranges
+from pimper_torch.errors import ConfigError
+from pimper_torch.io.estimates import estimate_of
+from pimper_torch.io.photographs import load_views
+from pimper_torch.paper.triangulate import Triangulate
+from pimper_torch.records import Capture, CoarseMesh, Estimate, Record, SparseScene
+from pimper_torch.sfm.reconstruct import Reconstruct, find_model, placed_scene
+from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.store import opened
+
+SCENES = ("mug", "jar", "balls", "potatoes")
+METHODS = {"quick": ("default", "smoothed"), "full": ("default", "paper", "smoothed", "openmvs")}
+"""Methods that each scale runs by default."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BenchConfig:
+    """Which methods run on which scenes, and how large the scenes are.
+
+    Attributes:
+        scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
+        scenes: Names of rendered scenes, or folders that `pimper render` wrote.
+        methods: Presets, YAML files of settings, and baselines. By default those of the scale:
+            quick runs default and smoothed; full also paper and openmvs.
+        masks: Give the methods the true masks of the object; without, they see the table too.
+        cameras: found by structure from motion, once a scene and the same for all methods; by
+            its features alone (``reconstruct.track_iterations: 0``); or the true ones with a true
+            cloud.
+        seed: Of scenes and samples.
+        samples: On each surface, for distances between surfaces.
+        processes: That render at the same time.
+    """
+
+    scale: Literal["quick", "full"] = "quick"
+    scenes: tuple[str, ...] = SCENES
+    methods: tuple[str, ...] | None = None
+    masks: bool = False
+    cameras: Literal["found", "features", "true"] = "found"
+    seed: Annotated[int, Range(least=0, most=2**32 - 1)] = 0  # 32 bits
+    samples: Annotated[int, Range(least=1, most=10_000_000)] = 50_000  # 100 bytes each
+    processes: Annotated[int, Range(least=1, most=1024)] = 2
+
+    def __post_init__(self) -> None:
+        """Refuse a table without rows."""
+        require_ranges(self)
+        require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
+        require(len(self.chosen_methods) > 0, "methods", self.methods, "one method or more")
+        for name, given in (("scenes", self.scenes), ("methods", self.chosen_methods)):
+            labels = {Path(one).stem for one in given}
+            require(len(labels) == len(given), name, given, "each name only once, of files too")
+
+    @property
+    def chosen_methods(self) -> tuple[str, ...]:
+        """The methods given, or those of the scale."""
+        return METHODS[self.scale] if self.methods is None else self.methods
+
+    @property
+    def evaluation(self) -> EvaluateConfig:
+        """Settings of the evaluation."""
+        return EvaluateConfig(seed=self.seed, samples=self.samples)
+
+    @property
+    def scene(self) -> SceneConfig:
+        """Settings of the rendered scenes at this scale."""
+        if self.scale == "full":
+            return SceneConfig(seed=self.seed)
+        return SceneConfig(seed=self.seed, num_views=16, width=640, height=480)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Inputs(Record):
+    """A scene of the table, ready for the methods.
+
+    Attributes:
+        scene: Cameras and cloud, found or true, and the photographs.
+        coarse: Facets for the baselines that start from some; of the default preset.
+        capture: The truth, without photographs and maps.
+        maps: The truth in the methods' reference view alone; those of all views fill the memory.
+        sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
+    """
+
+    scene: SparseScene
+    coarse: CoarseMesh
+    capture: Capture
+    surface: TrueSurface
+    maps: Capture
+    sfm_seconds: float
+
+
+def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
+    """Render a scene, or return the folder that `pimper render` wrote."""
+    if (Path(name) / "truth").is_dir():
+        return Path(name)
+    folder = workspace / Path(name).stem
+    return render_scene(name, folder, config.scene, processes=config.processes)
+
+
+def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) -> Inputs:
+    """Read a rendered scene and find its cameras, from the files as a user would.
+
+    Args:
+        cache: Folder of models that were found before, with the seconds that they took.
+    """
+    views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
+    if config.cameras == "true":
+        scene, seconds = Reconstruct()(views, folder / "truth" / "sparse"), 0.0
+    else:
+        refined = ReconstructConfig()
+        settings = replace(refined, track_iterations=0) if config.cameras == "features" else refined
+        model, seconds = find_model(views, settings, opened(cache))
+        began = time.perf_counter()
+        scene = placed_scene(views, model)
+        seconds += time.perf_counter() - began
+    coarse = Triangulate()(scene)
+    capture = read_rendered(folder, maps=False, photographs=False)
+    surface = prepared_surface(capture, config.evaluation)
+    assert surface is not None  # a rendered scene has its mesh
+    _, (view, *_) = pair_views([scene.views.names[coarse.reference]], capture.views.names)
+    return Inputs(
+        scene=scene,
+        coarse=coarse,
+        capture=capture,
+        surface=surface,
+        maps=read_rendered(folder, views=[int(view)], photographs=False),
+        sfm_seconds=seconds,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class MethodRun(Record):
+    """A method's estimate, and its cost.
+
+    Attributes:
+        seconds: Wall clock without structure from motion.
+        samples: Samples of all templates times views, missing ones included.
+        external: Whether another program did the work, in memory that is not this process's.
+    """
+
+    estimate: Estimate
+    seconds: float
+    mesh_points: int | None = None
+    triangles: int | None = None
+    samples: int | None = None
+    missing_fraction: float | None = None
+    external: bool = False
+
+
+Method = Callable[[SparseScene, CoarseMesh], MethodRun]
+
+_BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs": OpenMvs}
+
+
+def method_named(name: str) -> Method:
+    """Find a baseline by name, or a preset, or a YAML file of settings."""
+    if name in _BASELINES:
+        return _baseline(_BASELINES[name]())
+    try:
+        return _preset(name)
+    except ConfigError as error:
+        raise ConfigError(
+            f"method {name!r}: {error} Baselines are {', '.join(_BASELINES)}."
+        ) from error
+
+
+def _preset(name: str) -> Method:
+    config = load_config(name)
+
+    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
+        chain = make_chain(config)
+        began = time.perf_counter()
+        result = chain(scene)
+        seconds = time.perf_counter() - began
+        found = {key: value for report in result.report for key, value in report.figures.items()}
+        return MethodRun(
+            estimate=estimate_of(result),
+            seconds=seconds,
+            mesh_points=int(found["mesh_points"]),
+            triangles=int(found["triangles"]),
+            samples=int(found["samples"]),
+            missing_fraction=found["missing_samples"] / found["samples"],
+        )
+
+    return run
+
+
+def _baseline(module: nn.Module) -> Method:
+    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
+        began = time.perf_counter()
+        estimate = module(scene, coarse)
+        return MethodRun(
+            estimate=estimate,
+            seconds=time.perf_counter() - began,
+            external=isinstance(module, OpenMvs),
+        )
+
+    return run

@@ -1,0 +1,242 @@
+"""A data set of one layout to another."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import torch
+import tyro
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_bench import datasets
+from pimper_bench.datasets.posed import assemble
+from pimper_bench.datasets.sampling import LightOptions, read_shots
+from pimper_torch.cli.arguments import Flag, read_arguments
+from pimper_torch.cli.output import Output
+from pimper_torch.errors import InputError
+from pimper_torch.exchange.nerfstudio import thinned
+from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.radiometry import Encoding
+from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
+from pimper_torch.records import Capture, Truth
+from pimper_torch.reporting import stage
+
+Source = Literal[
+    "colmap",
+    "llff",
+    "idr",
+    "transforms",
+    "meshroom",
+    "metashape",
+    "dtu-points",
+    "dtu-mvs",
+    "diligent-mv",
+    "rendered",
+]
+Target = Literal["colmap", "idr", "transforms"]
+
+
+_PHOTOGRAPHS = ("response", "saturation", "black")
+
+
+def _named(name: str) -> object:
+    return tyro.conf.arg(name=f"photographs.{name}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadOptions:
+    """Options of readers; each goes with the layouts that know it.
+
+    Attributes:
+        scan: Number of the scene or scan; the DTU sets need one.
+        images: Folder of the photographs, if they do not lie where the layout has them.
+        masks: Folder with a mask for each photograph, of the same name; black off the object.
+        mesh: File of the true surface, in the data set's frame; the export's cloud or unit
+            sphere comes from it.
+        response: As photographs.response of `pimper reconstruct`; the layout's own unless given.
+        saturation: As photographs.saturation of `pimper reconstruct`.
+        black: As photographs.black of `pimper reconstruct`.
+        light_seed: Keep one light at each position, chosen by this seed.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
+            leaves them.
+    """
+
+    scan: int | None = None
+    images: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    mesh: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    response: Annotated[ResponseChoice | None, _named("response")] = None
+    saturation: Annotated[SaturationChoice | None, _named("saturation")] = None
+    black: Annotated[float | None, _named("black")] = None
+    light_seed: int | None = None
+    max_size_px: int = 0
+
+
+_OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertJob:
+    """Read a data set of one layout and write its photographs and cameras in another.
+
+    Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
+
+    Attributes:
+        data: The data set's folder; for some layouts its file of cameras.
+        out: Folder for the result; new or empty.
+        source: Layout of DATA.
+        target: Layout to write.
+        overwrite: Replace a former result in OUT.
+        options: Of the reader.
+    """
+
+    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    source: Source
+    target: Target
+    overwrite: Flag = False
+    options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions()
+
+
+def run(command: str, arguments: Sequence[str], output: Output) -> None:
+    """Carry out ``convert``: read, write whole or not at all, and say what came."""
+    job = checked(command, arguments)
+    with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
+        with output.observer(), stage("read") as told:
+            capture = read(job)
+            told["photographs"] = capture.views.num_views
+        write(capture, job.target, staging)
+    output.remark(describe(capture, job))
+    output.result({"folder": job.out}, photographs=capture.views.num_views)
+
+
+def checked(command: str, arguments: Sequence[str]) -> ConvertJob:
+    """Read the arguments, and check what can be checked without reading DATA."""
+    job = parse(arguments)
+    inputs = {
+        "DATA": job.data,
+        "--images": job.options.images,
+        "--masks": job.options.masks,
+        "--mesh": job.options.mesh,
+    }
+    require_apart(job.out, inputs)
+    prepare_output(job.out, "data set", job.overwrite)
+    if not job.data.exists():
+        raise InputError(f"{job.data}: found nothing; needed: the folder or file of a data set.")
+    return job
+
+
+def parse(arguments: Sequence[str]) -> ConvertJob:
+    """Read the arguments of ``convert``."""
+    return read_arguments(ConvertJob, "convert", arguments, levels=True)
+
+
+def readers() -> Mapping[Source, Callable[..., Capture]]:
+    """List the reader of each layout."""
+    return {
+        "colmap": datasets.read_colmap,
+        "llff": datasets.read_llff,
+        "idr": datasets.read_idr,
+        "transforms": datasets.read_transforms,
+        "meshroom": datasets.read_meshroom,
+        "metashape": datasets.read_metashape,
+        "dtu-points": datasets.read_dtu_points,
+        "dtu-mvs": datasets.read_dtu_mvs,
+        "diligent-mv": datasets.read_diligent_mv,
+        # Without its maps, which no layout has a place for.
+        "rendered": lambda folder: datasets.read_rendered(folder, maps=False),
+    }
+
+
+def read(job: ConvertJob) -> Capture:
+    """Read the data set with the options that were given."""
+    reader = readers()[job.source]
+    known = dict(inspect.signature(reader).parameters)
+    if "options" in known:
+        (shared,) = get_args(known["options"].annotation)
+        whole = read_shots if shared is LightOptions else assemble
+        known |= inspect.signature(whole).parameters
+    plain = ReadOptions()
+    given = {
+        name: getattr(job.options, name)
+        for name in _OPTIONS
+        if getattr(job.options, name) != getattr(plain, name)
+    }
+    photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
+    if photographs and "encoding" in known:
+        usual = known["encoding"].default
+        assert isinstance(usual, Encoding), "readers say what their layout's files hold"
+        given["encoding"] = dataclasses.replace(usual, **photographs)
+    elif photographs:
+        given |= photographs
+    strange = [_option(name) for name in given if name not in known]
+    if strange:
+        accepted = {*known, *(_PHOTOGRAPHS if "encoding" in known else ())}
+        goes = [_option(name) for name in _OPTIONS if name in accepted]
+        raise InputError(
+            f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
+            f"{', '.join(goes)}, or another --source."
+        )
+    if "scan" in known and "scan" not in given:
+        raise InputError(f"--source {job.source} holds many scans; needed: --scan with a number.")
+    return reader(job.data, **given)
+
+
+def write(capture: Capture, target: Target, folder: Path) -> None:
+    """Write a capture's photographs and cameras in a layout."""
+    if capture.cameras is None:
+        raise InputError(
+            "this data set says nothing about its cameras; needed: cameras to export. Use its "
+            "photographs as they are."
+        )
+    writers = {
+        "colmap": datasets.write_colmap,
+        "idr": datasets.write_idr,
+        "transforms": datasets.write_transforms,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    points = cloud(capture.truth)
+    writers[target](capture.views, capture.cameras, folder, points_world=points)
+
+
+def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
+    """Return points of the true surface, at most a hundred thousand, or ``None``."""
+    points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
+    return None if points is None else points[thinned(len(points)).to(points.device)]
+
+
+def describe(capture: Capture, job: ConvertJob) -> str:
+    """Report what was read and where it is now."""
+    sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
+    size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+    count, positions, lights = (
+        len(set(numbers.tolist()))
+        for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
+    )
+    light = (
+        "each taken to have its own light"
+        if lights == count
+        else f"under {_count(lights, 'light')}"
+    )
+    known = [
+        name.removesuffix("_world")
+        for name in ("mesh", "points_world", "depth", "normals_world", "albedo", "lights_world")
+        if getattr(capture.truth, name) is not None
+    ]
+    return (
+        f"{_count(count, 'photograph')} of {size} from {_count(positions, 'position')}, {light}, "
+        f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
+        f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
+    )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _option(name: str) -> str:
+    return f"--{'photographs.' * (name in _PHOTOGRAPHS)}{name.replace('_', '-')}"

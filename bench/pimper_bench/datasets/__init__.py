@@ -1,0 +1,40 @@
+"""Readers of public data sets, and their layouts as formats to write.
+
+Where a folder is laid out otherwise, or a file is missing or damaged, a reader raises
+:class:`~pimper_torch.errors.InputError`, which says what was expected and what was found.
+"""
+
+from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
+from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_points, read_dtu_protocol
+from pimper_bench.datasets.formats import (
+    read_colmap,
+    read_idr,
+    read_llff,
+    read_meshroom,
+    read_metashape,
+    read_transforms,
+)
+from pimper_bench.datasets.idr import write_idr
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.datasets.sampling import one_light_per_position
+from pimper_torch.exchange.colmap_workspace import write_colmap
+from pimper_torch.exchange.nerfstudio import write_transforms
+
+__all__ = [
+    "one_light_per_position",
+    "read_colmap",
+    "read_diligent",
+    "read_diligent_mv",
+    "read_dtu_mvs",
+    "read_dtu_points",
+    "read_dtu_protocol",
+    "read_idr",
+    "read_llff",
+    "read_meshroom",
+    "read_metashape",
+    "read_rendered",
+    "read_transforms",
+    "write_colmap",
+    "write_idr",
+    "write_transforms",
+]

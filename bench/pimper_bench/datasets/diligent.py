@@ -1,0 +1,215 @@
+"""DiLiGenT and DiLiGenT-MV: objects under 96 lights, from one viewpoint or twenty."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Unpack
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
+from pimper_bench.datasets.raster import nearest
+from pimper_bench.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots
+from pimper_torch.camera_files.layout import DataSetPath
+from pimper_torch.camera_files.posed_camera import decompose_projections
+from pimper_torch.io.decode import decode
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Capture, Truth
+
+_ONE_VIEW, _MANY_VIEWS = "DiLiGenT", "DiLiGenT-MV"
+# Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.
+FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+_VIEW = re.compile(r"view_(\d{2})")
+
+
+def read_diligent(folder: Path | str, **options: Unpack[LightOptions]) -> Capture:
+    """Read an object of DiLiGenT: one viewpoint, 96 lights, true normals.
+
+    ``folder`` is the object's, such as ``pmsData/bearPNG``::
+
+        001.png ... 096.png              16 bits, linear
+        filenames.txt                    their order; 001.png and so on where it is absent
+        light_directions.txt, light_intensities.txt, mask.png
+        Normal_gt.mat                    or Normal_gt.png, 8 or 16 bits
+
+    The camera was far away and is taken for orthographic, so there are no cameras, and the
+    world is the camera's frame: x right, y down, z forward. The files' light directions and
+    normals have y up and z towards the viewer and are turned. The first 20 photographs of
+    ``bearPNG`` are known to be faulty; leave them out by ``lights=range(21, 97)``.
+
+    Args:
+        options: See :func:`~pimper_bench.datasets.sampling.read_shots`; lights count
+            from 1.
+
+    Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
+    and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
+    """
+    root = DataSetPath(Path(folder), _ONE_VIEW)
+    return _capture(root, {1: root}, None, options)
+
+
+def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Capture:
+    """Read an object of DiLiGenT-MV with its cameras, lights, normals and mesh.
+
+    ``folder`` is the object's, such as ``mvpmsData/bearPNG``::
+
+        Calib_Results.mat                KK, Rc_1 ... Rc_20, Tc_1 ... Tc_20
+        mesh_Gt.ply                      in the calibration's world, millimetres
+        view_01/001.png ... 096.png      16 bits, linear
+        view_01/filenames.txt            their order; 001.png and so on where it is absent
+        view_01/light_directions.txt, light_intensities.txt, mask.png, Normal_gt.mat
+
+    Light directions and normals come in each view's own frame with x right, **y up and z
+    towards the viewer**; they are turned into the world. ``Rc`` is not exactly orthogonal in
+    the published files: what is left over goes into ``K``, so that points project exactly
+    where they do with the files' own product. ``KK`` counts pixel centres from 0.
+
+    Args:
+        options: See :func:`~pimper_bench.datasets.sampling.read_shots`; views and lights
+            count from 1.
+
+    Returns:
+        ``truth.lights_world`` has the lights' mean intensity.
+
+    Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
+    layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
+    """
+    root = DataSetPath(Path(folder), _MANY_VIEWS)
+    root.expect(root.path.is_dir(), "an object's folder such as mvpmsData/bearPNG")
+    folders = {
+        int(match[1]): root.inner(path)
+        for path in sorted(root.path.iterdir())
+        if path.is_dir() and (match := _VIEW.fullmatch(path.name))
+    }
+    root.expect(bool(folders), "folders view_01, view_02 and so on")
+    calibration, mesh = root.inner("Calib_Results.mat"), root.path / "mesh_Gt.ply"
+    capture = _capture(
+        root,
+        folders,
+        lambda views: decompose_projections(read_toolbox_projections(calibration, views)),
+        options,
+    )
+    read = read_mesh(mesh) if mesh.is_file() else None
+    return capture.replace(truth=capture.truth.replace(mesh=read))
+
+
+def decoded_normals(file: DataSetPath) -> Float[Tensor, "height width 3"]:
+    """Read normals kept as colours ``(n + 1) / 2``, y up, into our camera frame."""
+    samples = decode(file.path).samples
+    file.expect(samples.shape[0] == 3, "normals as red, green and blue", "one channel")
+    return _faced(samples.movedim(0, -1) * 2 - 1)
+
+
+def directed_lights(
+    directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
+) -> Float[Tensor, "view 4"]:
+    """Return the first-order light of distant point lights without any ambient light."""
+    directed = strength[:, None] * directions_world
+    return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
+
+
+def _capture(
+    root: DataSetPath,
+    folders: Mapping[int, DataSetPath],
+    cameras: CamerasOf | None,
+    options: LightOptions,
+) -> Capture:
+    """Read photographs of some viewpoints, with lights and normals in the world."""
+    shots = [shot for view, folder in folders.items() for shot in _shots(view, folder, root)]
+    found = read_shots(shots, root, cameras, **options)
+    views, position = found.capture.views, found.capture.position
+    eye = torch.eye(4, dtype=torch.float64).expand(len(position), 4, 4)
+    poses = eye if found.cam_from_world is None else found.cam_from_world
+    world_from_cam = poses[:, :3, :3].mT
+    directions = [shot.direction for shot in found.chosen if shot.direction is not None]
+    strength = torch.tensor([shot.strength for shot in found.chosen], dtype=torch.float64)
+    directions_world = world_from_cam @ torch.stack(directions)[..., None]
+    width, height = views.sizes_px[0].tolist()
+    seen, index = torch.unique(position, return_inverse=True)
+    maps = [_normals(folders[view]) for view in seen.tolist()]
+    first = [position.tolist().index(view) for view in seen.tolist()]
+    normals = [
+        normalize(nearest(one, width, height) @ world_from_cam[row].mT.float(), dim=-1)
+        for one, row in zip(maps, first, strict=True)
+        if one is not None
+    ]
+    return found.capture.replace(
+        truth=Truth(
+            normals_world=_of_shots(normals, index) if len(normals) == len(maps) else None,
+            foreground=views.masks,
+            lights_world=directed_lights(directions_world[..., 0], strength),
+        )
+    )
+
+
+def _of_shots(
+    normals: Sequence[Float[Tensor, "height width 3"]], index: Int[Tensor, " shot"]
+) -> Float[Tensor, "shot height width 3"]:
+    """Put the map of each viewpoint beside all of its photographs, one without a copy."""
+    if len(normals) == 1:
+        return normals[0].expand(len(index), *normals[0].shape)
+    return torch.stack(list(normals))[index]
+
+
+def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
+    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
+    directions, intensities = (
+        _rows_of_three(folder.inner(f"light_{what}.txt")) for what in ("directions", "intensities")
+    )
+    listed = folder.inner("filenames.txt")
+    names = [f"{light + 1:03d}.png" for light in range(len(directions))]
+    if listed.path.is_file():
+        names = listed.read_text().split()
+    folder.expect(
+        len(names) == len(directions) == len(intensities) > 0,
+        "as many photographs as light directions and intensities",
+        f"{len(names)}, {len(directions)} and {len(intensities)}",
+    )
+    folder.expect(len(set(names)) == len(names), "photographs of unlike names", "others")
+    folder.expect(bool((intensities > 0).all()), "intensities above 0", "others")
+    rows = zip(names, normalize(directions, dim=-1), intensities.mean(dim=1), strict=True)
+    return [
+        Shot(
+            position=view,
+            light=light,
+            path=path,
+            name=path.relative_to(root.path).as_posix(),
+            mask=folder.path / "mask.png",
+            direction=direction * FLIP,
+            strength=float(strength),
+        )
+        for light, (name, direction, strength) in enumerate(rows, start=1)
+        for path in (folder.inside(name),)
+    ]
+
+
+def _normals(folder: DataSetPath) -> Float[Tensor, "height width 3"] | None:
+    """Read ``Normal_gt`` in our camera frame (facing the viewer is ``n_z < 0``).
+
+    Zero where the file knows none; ``None`` without such a file.
+    """
+    matlab, picture = folder.inner("Normal_gt.mat"), folder.inner("Normal_gt.png")
+    if not matlab.path.is_file():
+        return decoded_normals(picture) if picture.path.is_file() else None
+    array = read_matlab(matlab, ("Normal_gt",))["Normal_gt"]
+    shape = " x ".join(map(str, array.shape))
+    ok = array.ndim == 3 and array.shape[2] == 3
+    matlab.expect(ok, "Normal_gt of height x width x 3", f"shape {shape}")
+    return _faced(torch.from_numpy(array.astype(np.float32)))
+
+
+def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+    rotated = normals.nan_to_num(0) * FLIP.float()
+    # Shorter ones are background.
+    known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5
+    return torch.where(known, normalize(rotated, dim=-1), 0)
+
+
+def _rows_of_three(file: DataSetPath) -> Float[Tensor, "row 3"]:
+    words = file.read_text().split()
+    file.expect(len(words) % 3 == 0 and bool(words), "rows of three numbers", f"{len(words)}")
+    return file.numbers(words, len(words), "rows of three").reshape(-1, 3)

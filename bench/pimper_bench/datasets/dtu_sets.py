@@ -1,0 +1,222 @@
+"""The two DTU sets: one calibrated camera on a robot's arm, several lights a position."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Unpack
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
+from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
+from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
+from pimper_torch.camera_files.posed_camera import decompose_projections
+from pimper_torch.geometry.rigid import rigid
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.records import Capture, DtuProtocol, Truth
+
+_POINTS = "the DTU point feature set"
+_MVS = "the DTU multi-view stereo set of 2014"
+_SIZE_PX = (1600, 1200)  # that both are calibrated for; copies of half the size exist
+ALL_LIGHTS = 7
+"""Our number for ``max``, the brightest of the seven photographs at each pixel."""
+
+_POINTS_NAME = re.compile(r"Img(\d{3})_(\d{2})\.(?:bmp|png)", re.IGNORECASE)
+_MVS_NAME = re.compile(r"rect_(\d{3})_(\d_r5000|max)\.png")
+_CALIBRATIONS = ("Calib_Results_11.mat", "calibrationFile.mat")
+_SCANS = ("CleanRecon_2009_11_16", "reconstructions", ".")
+
+
+def read_dtu_points(folder: Path | str, scan: int, **options: Unpack[LightOptions]) -> Capture:
+    """Read a scene of the DTU point feature set.
+
+    A robot carried the camera to 119 positions, and at each of them 19 LEDs were lit one after
+    the other. ``folder`` holds what the set's page offers, unpacked::
+
+        SET001/Img001_01.bmp ... Img119_19.bmp     position, LED; 1600 x 1200 or 800 x 600
+        Calib_Results_11.mat                       also as calibrationFile.mat
+        CleanRecon_2009_11_16/Clean_Reconstruction_01.mat    also under reconstructions/
+
+    The world is the calibration's, in metres. The truth is the structured-light scan,
+    where its file is there. The set gives no positions of its LEDs, so lights are unknown.
+    It states no transfer curve either; experiments with it relight scenes by adding
+    photographs up as linear radiance, and so they are read. The calibration counts pixels
+    from the centre of the first one; its lens distortion is neglected, as in the set's own
+    evaluation.
+
+    Args:
+        folder: With ``SET001`` and so on.
+        scan: Number of the scene, from 1.
+        options: See :func:`~pimper_bench.datasets.sampling.read_shots`; positions and
+            LEDs count from 1.
+
+    Source: Aanaes, Dahl & Steenstrup Pedersen, Interesting Interest Points, IJCV 97, 2012,
+    roboimagedata.compute.dtu.dk; layout as in the set's RobotEvalCode (GetCam.m,
+    GenStrLightGrid_v2.m, ReadMe.txt).
+    """
+    root = DataSetPath(Path(folder), _POINTS)
+    shots = _shots(root, f"SET{scan:03d}", _POINTS_NAME, "Img001_01.bmp (position, LED)")
+    calibration = file_in(folder, _CALIBRATIONS, _POINTS)
+    photographs = root.inner(f"SET{scan:03d}")
+    found = read_shots(
+        shots,
+        photographs,
+        lambda positions: decompose_projections(read_toolbox_projections(calibration, positions)),
+        size_px=_SIZE_PX,
+        **options,
+    )
+    return found.capture.replace(truth=Truth(points_world=_halves(root, scan)))
+
+
+def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions]) -> Capture:
+    """Read a scan of the DTU multi-view stereo set.
+
+    49 or 64 positions of a camera on a robot's arm, under seven lights each. ``folder`` is what
+    the set's page calls ``MVS Data``::
+
+        Rectified/scan1/rect_001_0_r5000.png ... rect_064_6_r5000.png     position, light
+        Rectified/scan1/rect_001_max.png ...                              brightest of them
+        Calibration/cal18/pos_001.txt ...                                 3x4 projections
+        Points/stl/stl001_total.ply                                       scan, in mm
+
+    Instead of ``Calibration`` there may be ``Cameras/00000000_cam.txt`` and so on, as MVSNet
+    distributes them for the full photographs: ``extrinsic`` 4x4, ``intrinsic`` 3x3, counted
+    from 0. The world is the same, in millimetres. Photographs are rectified: free of lens
+    distortion. Pixels of both camera files count from the centre of the first one. Nothing
+    is published on the photographs' transfer curve; as those of the set's sister from the
+    same camera they are taken for linear. Directions of the lights are not published.
+
+    Args:
+        folder: With ``Rectified``.
+        options: See :func:`~pimper_bench.datasets.sampling.read_shots`; positions count
+            from 1. Lights are 0 to 6, which are read by default, or :data:`ALL_LIGHTS` for
+            ``max``.
+
+    Source: Jensen et al., Large Scale Multi-view Stereopsis Evaluation, CVPR 2014,
+    roboimagedata.compute.dtu.dk; names as in the set's SampleSet and in MVSNet's loader.
+    """
+    root = DataSetPath(Path(folder), _MVS)
+    inner = f"Rectified/scan{scan}"
+    shots = _shots(root, inner, _MVS_NAME, "rect_001_0_r5000.png")
+    if options.get("lights") is None:
+        shots = [shot for shot in shots if shot.light != ALL_LIGHTS]
+    found = read_shots(
+        shots,
+        root.inner(inner),
+        lambda positions: _mvs_cameras(root, positions),
+        size_px=_SIZE_PX,
+        **options,
+    )
+    scanned = root.path / "Points" / "stl" / f"stl{scan:03d}_total.ply"
+    points = read_mesh(scanned).vertices_world.float() if scanned.is_file() else None
+    return found.capture.replace(truth=Truth(points_world=points))
+
+
+def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
+    """Read the observability mask and the table's plane of the set's own evaluation.
+
+    ``ObsMask/ObsMask<scan>_10.mat`` holds ``ObsMask``, its box ``BB`` (two rows) and voxel
+    size ``Res``; ``ObsMask/Plane<scan>.mat`` the table's ``P``.
+
+    Args:
+        folder: With ``ObsMask``, as for :func:`read_dtu_mvs`.
+
+    Source: PointCompareMain.m of the set's SampleSet.
+    """
+    root = DataSetPath(Path(folder) / "ObsMask", _MVS)
+    mask_file, plane_file = root.inner(f"ObsMask{scan}_10.mat"), root.inner(f"Plane{scan}.mat")
+    arrays = read_matlab(mask_file, ("ObsMask", "BB", "Res"))
+    plane = read_matlab(plane_file, ("P",))["P"]
+    grid, box, step = arrays["ObsMask"], arrays["BB"], arrays["Res"]
+    for file, ok, needed, array in (
+        (mask_file, grid.ndim == 3, "a grid as ObsMask", grid),
+        (mask_file, box.shape == (2, 3), "two corners as BB", box),
+        (mask_file, step.size == 1, "one number as Res", step),
+        (plane_file, plane.size == 4, "four numbers as P", plane),
+    ):
+        file.expect(ok, needed, f"shape {' x '.join(map(str, array.shape))}")
+    return DtuProtocol(
+        obs_mask=torch.from_numpy(grid != 0),
+        bounding_box=torch.from_numpy(box.astype("float64")),
+        resolution=float(step.reshape(-1)[0]),
+        plane=torch.from_numpy(plane.astype("float64").reshape(4)),
+    )
+
+
+def _shots(root: DataSetPath, inner: str, name: re.Pattern[str], example: str) -> list[Shot]:
+    """List a scene's photographs, whose names tell position and light."""
+    photographs = root.inner(inner)
+    root.expect(photographs.path.is_dir(), f"photographs in {inner}")
+    shots = [
+        Shot(
+            position=int(match[1]),
+            light=ALL_LIGHTS if match[2] == "max" else int(match[2].removesuffix("_r5000")),
+            path=path,
+            name=path.name,
+        )
+        for path in sorted(photographs.path.iterdir())
+        if (match := name.fullmatch(path.name))
+    ]
+    photographs.expect(bool(shots), f"photographs such as {example}")
+    return shots
+
+
+def _halves(root: DataSetPath, scan: int) -> Float[Tensor, "point 3"] | None:
+    """Read the structured-light points, of which there is a near and a far half."""
+    name = f"Clean_Reconstruction_{scan:02d}.mat"
+    path = first_of([root.path / folder / name for folder in _SCANS])
+    if path is None:
+        return None
+    file = root.inner(path)
+    columns = []
+    for half, array in read_matlab(file, ("pts3D_near", "pts3D_far")).items():
+        shape = " x ".join(map(str, array.shape))
+        ok = array.ndim == 2 and len(array) >= 3
+        file.expect(ok, f"points as columns of {half}", f"shape {shape}")
+        columns.append(torch.from_numpy(array[:3].astype("float32")).T)
+    points = torch.cat(columns)
+    return points[points.isfinite().all(dim=1)].contiguous()
+
+
+def _mvs_cameras(
+    root: DataSetPath, positions: Sequence[int]
+) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
+    """Read the cameras of positions, from the set's own files or else from MVSNet's."""
+    official, other = root.inner("Calibration/cal18"), root.inner("Cameras")
+    if official.path.is_dir():
+        projections = []
+        for position in positions:
+            file = official.inner(f"pos_{position:03d}.txt")
+            matrix = file.numbers(file.read_text(), 12, "a 3x4 matrix").reshape(3, 4)
+            rank = int(torch.linalg.matrix_rank(matrix[:, :3]))
+            file.expect(rank == 3, "the projection of a camera", f"a matrix of rank {rank}")
+            projections.append(matrix)
+        return decompose_projections(torch.stack(projections))
+    root.expect(
+        other.path.is_dir(),
+        "Calibration/cal18/pos_001.txt and so on, or Cameras/00000000_cam.txt and so on",
+    )
+    parsed = [_mvsnet_camera(other.inner(f"{position - 1:08d}_cam.txt")) for position in positions]
+    intrinsics, poses = zip(*parsed, strict=True)
+    return torch.stack(intrinsics), torch.stack(poses)
+
+
+def _mvsnet_camera(file: DataSetPath) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"]]:
+    words = file.read_text().split()
+    file.expect(
+        len(words) >= 27 and words[0] == "extrinsic" and words[17] == "intrinsic",
+        "the word extrinsic, 16 numbers, the word intrinsic, 9 numbers",
+        f"{len(words)} words, the first {words[:1]}",
+    )
+    extrinsic = file.numbers(words[1:17], 16, "extrinsic").reshape(4, 4)
+    K = file.numbers(words[18:27], 9, "intrinsic").reshape(3, 3)
+    # MVSNet's training copies are 160 x 128: their principal point lies near (80, 64).
+    file.expect(
+        float(K[0, 2]) > _SIZE_PX[0] / 4,
+        "intrinsics of the photographs of 1600 x 1200",
+        f"a principal point at ({float(K[0, 2]):.0f}, {float(K[1, 2]):.0f})",
+    )
+    U, _, Vh = torch.linalg.svd(extrinsic[:3, :3])
+    return K, rigid(U @ Vh, extrinsic[:3, 3])

@@ -1,0 +1,311 @@
+"""Photographs beside their cameras, as programs and data sets lay them out."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Unpack
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_bench.datasets.posed import (
+    PosedOptions,
+    PosedPhotograph,
+    assemble,
+    image_files,
+    mask_finder,
+)
+from pimper_torch.camera_files import meshroom_sfm, metashape_xml, transforms_json
+from pimper_torch.camera_files.camera_arrays import read_camera_arrays
+from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
+from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.errors import some
+from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.io.decode import SUFFIXES, read_header
+from pimper_torch.numpy_files import read_npy
+from pimper_torch.records import Capture, Lens
+from pimper_torch.sfm.colmap import read_model
+
+_COLMAP = "a COLMAP model with its photographs"
+_MODELS = (".", "sparse/0", "sparse", "model", "0")
+_LLFF = "an LLFF set"
+_LLFF_MASKS = ("masks", "mask", "images_mask")
+_IDR = "an IDR or NeuS set"
+_IDR_CAMERAS = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
+_MESHROOM = ("cameras.sfm", "sfm.json", "sfm.sfm", "cameras.json")
+_TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+def read_colmap(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    **options: Unpack[PosedOptions],
+) -> Capture:
+    """Read a COLMAP model, text or binary, and the photographs it was made from.
+
+    COLMAP counts pixels as we do (centre of the top-left one at (0.5, 0.5), "Camera models"
+    in its documentation) and has our camera axes. Lenses with distortion are undistorted.
+    Its cloud was found, not measured, so it is no truth; ``Reconstruct`` reads it.
+
+    Args:
+        folder: With ``cameras``, ``images`` and ``points3D``, or with them in ``sparse/0``,
+            ``sparse``, ``model`` or ``0``.
+        images: Folder of the photographs; by default ``images`` beside or above the model.
+        masks: Folder of masks; by default ``masks`` beside that, if there is one.
+    """
+    root = DataSetPath(Path(folder), _COLMAP)
+    files = [root.path / name / f"cameras{end}" for name in _MODELS for end in (".bin", ".txt")]
+    found = first_of(files)
+    if found is None:
+        root.refuse("cameras.bin or cameras.txt here or in sparse/0")
+    around = [*found.parents[:3], root.path]
+    pictures = Path(images) if images else first_of([one / "images" for one in around])
+    if pictures is None or not pictures.is_dir():
+        root.refuse("a folder `images` beside or above the model, or that of the photographs named")
+    model = read_model(found.parent)
+    cameras = [
+        PosedCamera(name=name, lens=lens, cam_from_world=pose)
+        for name, lens, pose in zip(model.names, model.lenses, model.cam_from_world, strict=True)
+    ]
+    place, drawn = root._replace(path=pictures), masks or first_of([pictures.parent / "masks"])
+    photographs = _beside(cameras, lambda camera: place.inside(camera.name), drawn, place)
+    named = [one.replace(name=name) for one, name in zip(photographs, model.names, strict=True)]
+    return assemble(named, root._replace(path=found.parent), **options)
+
+
+def read_llff(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    **options: Unpack[PosedOptions],
+) -> Capture:
+    """Read the cameras of ``poses_bounds.npy`` and the photographs beside it.
+
+    A row of the file has 17 numbers: a 3x5 matrix, row by row, and the nearest and farthest
+    depth. The matrix's columns are, in the world frame, the camera's directions *down, right
+    and back*, its position, and (height, width, focal length). So
+    ``world_from_cam = [column 1, column 0, -column 2, column 3]`` for our right, down,
+    forward. (LLFF's README, "Using your own poses without running COLMAP", and its
+    ``poses/pose_utils.py``.)
+
+    The file has no principal point. LLFF made it with COLMAP's ``SIMPLE_RADIAL``, which
+    keeps the principal point at (width / 2, height / 2) from the corner of the image, and
+    drops the distortion: so do we, no half pixel is added. The rows belong to the
+    photographs in plain order of their names (``1, 10, 11, 2``).
+
+    Args:
+        folder: With ``poses_bounds.npy``.
+        images: Folder of photographs, full size or a smaller copy, by path or by its name in
+            ``folder``; by default ``images``, else the largest of ``images_2``, ``images_4``
+            and so on.
+        masks: Folder of masks; by default ``masks``, ``mask`` or ``images_mask``, if there is
+            one.
+    """
+    root = DataSetPath(Path(folder), _LLFF)
+    file = root.inner("poses_bounds.npy")
+    rows = file.read(read_npy, "a file")
+    ok = rows.ndim == 2 and rows.shape[1] == 17 and rows.dtype.kind == "f"
+    finite = ok and bool(np.isfinite(rows).all())
+    file.expect(finite, "finite numbers of shape (views, 17)", f"shape {rows.shape}")
+    paths = image_files(root._replace(path=_llff_images(root, images)))
+    root.expect(
+        len(paths) == len(rows),
+        f"{len(rows)} photographs, one for each row of poses_bounds.npy (move those that COLMAP "
+        "did not register to another folder)",
+        f"{len(paths)}",
+    )
+    matrices = torch.from_numpy(rows[:, :15].reshape(-1, 3, 5).astype(np.float64))
+    pictures = {path.name: path for path in paths}
+    cameras = [_llff_camera(name, row, root) for name, row in zip(pictures, matrices, strict=True)]
+    drawn = masks or first_of([root.path / name for name in _LLFF_MASKS])
+    return assemble(_beside(cameras, lambda one: pictures[one.name], drawn, root), root, **options)
+
+
+def _llff_images(root: DataSetPath, images: Path | str | None) -> Path:
+    if images is not None:
+        return first_of([root.path / images, Path(images)]) or root.path / images
+    reduced = [
+        (int(found[1]), path)
+        for path in root.path.iterdir()
+        if (found := re.fullmatch(r"images_(\d+)", path.name))
+    ]
+    whole = root.path / "images"
+    root.expect(whole.is_dir() or bool(reduced), "a folder `images`, or `images_4` and such")
+    return whole if whole.is_dir() else min(reduced)[1]
+
+
+def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> PosedCamera:
+    height, width, focal_px = row[:, 4].tolist()
+    whole = height.is_integer() and width.is_integer()
+    root.expect(
+        min(height, width, focal_px) > 0 and whole,
+        "height, width and focal length in column 5",
+        f"{height}, {width}, {focal_px}",
+    )
+    params = (focal_px, width / 2, height / 2)
+    lens = Lens(
+        camera=1, model="SIMPLE_PINHOLE", params=params, width=int(width), height=int(height)
+    )
+    down, right, back, center = row[:, :4].unbind(dim=1)
+    rotation = torch.stack([right, down, -back], dim=1)
+    pose = invert_rigid(rigid_or_refuse(rotation, center, "poses_bounds.npy", root))
+    return PosedCamera(name=name, lens=lens, cam_from_world=pose)
+
+
+def read_idr(
+    folder: Path | str, *, camera_file: str | None = None, **options: Unpack[PosedOptions]
+) -> Capture:
+    """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
+
+    Their meaning is that of :func:`~pimper_torch.camera_files.camera_arrays.read_camera_arrays`.
+    ``scale_mat_i``, from the unit sphere round the object to the world, is left out: cameras and
+    truth are in the world's units. Arrays and masks belong to the images in plain order of their
+    names.
+
+    Args:
+        camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
+            ``cameras_large.npz``.
+    """
+    root = DataSetPath(Path(folder), _IDR)
+    file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, _IDR)
+    drawn, pictures = root.inner("mask"), root.inner("image")
+    files = image_files(pictures)
+    masks = image_files(drawn) if drawn.path.is_dir() else [None] * len(files)
+    needed = f"{len(files)} masks, one for each image"
+    drawn.expect(len(masks) == len(files), needed, f"{len(masks)}")
+    names = [path.name for path in files]
+    cameras = read_camera_arrays(file.path, names, lambda names: _sizes(pictures, names))
+    photographs = [
+        PosedPhotograph.of(camera, path, mask)
+        for camera, path, mask in zip(cameras, files, masks, strict=True)
+    ]
+    return assemble(photographs, root, **options)
+
+
+def _sizes(folder: DataSetPath, names: Sequence[str]) -> list[tuple[int, int]]:
+    headers = [read_header(_with_suffix(folder.inside(name))) for name in names]
+    return [(header.width, header.height) for header in headers]
+
+
+def read_meshroom(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    **options: Unpack[PosedOptions],
+) -> Capture:
+    """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.
+
+    Their meaning is that of
+    :func:`~pimper_torch.camera_files.meshroom_sfm.read_meshroom_cameras`.
+
+    Args:
+        folder: With ``cameras.sfm`` or ``sfm.json``; or the file itself.
+        images: Folder of the photographs, which are looked up by file name: the paths in the
+            file are those of the machine that wrote it. By default ``images`` beside the file,
+            or the file's own folder.
+    """
+    file = file_in(folder, _MESHROOM, meshroom_sfm.KIND)
+    pictures = _pictures(file, images)
+
+    def find(camera: PosedCamera) -> Path:
+        return pictures.inside(PureWindowsPath(camera.name).name)
+
+    cameras = meshroom_sfm.read_meshroom_cameras(file.path)
+    return assemble(_beside(cameras, find, masks, file), file, **options)
+
+
+def read_metashape(
+    folder: Path | str,
+    *,
+    images: Path | str | None = None,
+    masks: Path | str | None = None,
+    **options: Unpack[PosedOptions],
+) -> Capture:
+    """Read the cameras that Metashape exported as XML, and their photographs.
+
+    Their meaning is that of
+    :func:`~pimper_torch.camera_files.metashape_xml.read_metashape_cameras`.
+
+    Args:
+        folder: With one ``.xml`` file; or the file itself.
+        images: Folder of the photographs, which are called as the cameras are labelled, with
+            or without suffix; by default as of :func:`read_meshroom`.
+    """
+    file = file_in(folder, ("*.xml",), metashape_xml.KIND)
+    pictures = _pictures(file, images)
+
+    def find(camera: PosedCamera) -> Path:
+        files, name = image_files(pictures), PureWindowsPath(camera.name).name
+        found = [path for path in files if path.name == name]
+        found = found or [path for path in files if path.stem == name]
+        found = found or [path for path in files if path.stem == PureWindowsPath(name).stem]
+        there = some([path.name for path in found or files])
+        pictures.expect(len(found) == 1, f"one photograph called {name}", there)
+        return found[0]
+
+    cameras = metashape_xml.read_metashape_cameras(file.path)
+    return assemble(_beside(cameras, find, masks, file), file, **options)
+
+
+def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capture:
+    """Read the cameras of a ``transforms.json`` and the photographs it names.
+
+    Their meaning is that of
+    :func:`~pimper_torch.camera_files.transforms_json.read_transforms_cameras`. Lenses are
+    undistorted. The mask is ``mask_path`` where a frame has one, else the image's alpha channel.
+    Photographs are called as their files, or by whole paths in the file where these are not unique.
+
+    Args:
+        folder: With ``transforms.json`` or ``transforms_train.json``; or a file of that kind.
+    """
+    file = file_in(folder, _TRANSFORMS, transforms_json.KIND)
+    around = file._replace(path=file.path.parent)
+    frames = transforms_json.read_frames(file.path)
+    cameras = transforms_json.read_transforms_cameras(
+        file.path, lambda names: _sizes(around, names)
+    )
+    images = [_with_suffix(around.inside(camera.name)) for camera in cameras]
+    names = [image.name for image in images]
+    if len(set(names)) < len(names):
+        names = [PurePosixPath(image.relative_to(around.path)).as_posix() for image in images]
+    masks = [
+        around.inside(str(frame["mask_path"])) if frame.get("mask_path") else None
+        for frame in frames
+    ]
+    photographs = [
+        PosedPhotograph.of(*one) for one in zip(cameras, images, masks, names, strict=True)
+    ]
+    return assemble(photographs, file, **options)
+
+
+def _with_suffix(image: Path) -> Path:
+    """Find the file of a photograph, whose suffix may be left out."""
+    if image.suffix.lower() in SUFFIXES:
+        return image
+    tried = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]
+    return first_of(tried) or tried[0]
+
+
+def _pictures(file: DataSetPath, images: Path | str | None) -> DataSetPath:
+    """Return the folder of the photographs, by default beside the file of cameras."""
+    beside = file.path.parent / "images"
+    place = Path(images) if images else beside if beside.exists() else file.path.parent
+    return file._replace(path=place)
+
+
+def _beside(
+    cameras: Sequence[PosedCamera],
+    find: Callable[[PosedCamera], Path],
+    masks: Path | str | None,
+    data_set: DataSetPath,
+) -> list[PosedPhotograph]:
+    """Find the photographs of cameras, and their masks by name."""
+    mask_of = mask_finder(masks, data_set.kind)
+    found = [(camera, find(camera)) for camera in cameras]
+    return [PosedPhotograph.of(camera, image, mask_of(image)) for camera, image in found]

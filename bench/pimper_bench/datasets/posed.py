@@ -1,0 +1,206 @@
+"""Photographs whose cameras are known: from files to a capture."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_bench.datasets.raster import read_photographs
+from pimper_torch.camera_files.layout import DataSetPath
+from pimper_torch.camera_files.posed_camera import PosedCamera
+from pimper_torch.errors import InputError, some
+from pimper_torch.io.decode import SUFFIXES
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import FROM_FILES, Encoding
+from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
+from pimper_torch.sfm.colmap import is_pinhole, rescale_lens
+from pimper_torch.sfm.conventions.resized_pictures import resize_fits
+from pimper_torch.sfm.undistort import pinhole_for, undistort
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PosedPhotograph(PosedCamera):
+    """Camera and file of one photograph.
+
+    Attributes:
+        image: Its file; it may be a smaller copy of what the lens is for.
+        mask: File of its mask; ``None`` where there is none. Of any size: it is stretched
+            over the photograph.
+    """
+
+    image: Path
+    mask: Path | None = None
+
+    @classmethod
+    def of(
+        cls, camera: PosedCamera, image: Path, mask: Path | None, name: str = ""
+    ) -> "PosedPhotograph":
+        """Put a photograph, called as its file by default, beside its camera."""
+        return cls(
+            name=name or image.name,
+            cam_from_world=camera.cam_from_world,
+            lens=camera.lens,
+            skew_px=camera.skew_px,
+            image=image,
+            mask=mask,
+        )
+
+
+class PosedOptions(TypedDict, total=False):
+    """Options of every reader of posed photographs.
+
+    Attributes:
+        names: Keep these photographs, in this order; ``None`` for all.
+        mesh: File of the true surface, in the data set's frame.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0 leaves
+            them as they are.
+    """
+
+    names: Sequence[str] | None
+    mesh: Path | str | None
+    encoding: Encoding
+    max_size_px: int
+
+
+def assemble(
+    photographs: Sequence[PosedPhotograph],
+    data_set: DataSetPath,
+    *,
+    names: Sequence[str] | None = None,
+    mesh: Path | str | None = None,
+    encoding: Encoding = FROM_FILES,
+    max_size_px: int = 0,
+) -> Capture:
+    """Read photographs, undistort them and put them beside their cameras.
+
+    A photograph without a mask file shows the object where its alpha channel, if it has one
+    that is somewhere transparent, is opaque; else everywhere.
+
+    Args:
+        photographs: All that the data set has.
+        names: And the others, see :class:`PosedOptions`.
+
+    Returns:
+        Photographs in float32, cameras and truth in float64, on the CPU.
+
+    Raises:
+        InputError: A name that is not there or there twice, a missing or damaged file, or a
+            photograph whose shape is not its camera's.
+    """
+    chosen = _select(photographs, names, data_set)
+    views = read_photographs(
+        [one.image for one in chosen],
+        [one.name for one in chosen],
+        encoding=encoding,
+        max_size_px=max_size_px,
+        masks=[one.mask for one in chosen],
+    )
+    lenses = fitted_lenses(chosen, views)
+    undistorted, _ = undistort(views, lenses)
+    count = views.num_views
+    return Capture(
+        views=undistorted,
+        cameras=Cameras(
+            intrinsics=torch.stack(
+                [_intrinsics(one, lens) for one, lens in zip(chosen, lenses, strict=True)]
+            ),
+            cam_from_world=torch.stack([one.cam_from_world for one in chosen]),
+            sizes_px=undistorted.sizes_px,
+        ),
+        truth=Truth(mesh=None if mesh is None else read_mesh(mesh)),
+        position=torch.arange(count),
+        light=torch.arange(count),
+    )
+
+
+def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
+    """Let each lens follow its photograph to the size it was read at."""
+    lenses = []
+    for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
+        lens = one.lens
+        if not resize_fits((lens.width, lens.height), width, height):
+            raise InputError(
+                f"{one.image}: has the shape {width} x {height}, but its camera is for "
+                f"{lens.width} x {lens.height}. Needed: the photograph that the camera belongs to, "
+                "or a smaller copy of it, not cropped and not turned (EXIF orientation is applied)."
+            )
+        same = (width, height) == (lens.width, lens.height)
+        lenses.append(lens if same else rescale_lens(lens, width, height))
+    return tuple(lenses)
+
+
+def image_files(folder: DataSetPath) -> list[Path]:
+    """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
+
+    Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
+    are followed wherever they lie.
+    """
+    folder.expect(folder.path.is_dir(), "a folder of images")
+    paths = [path for path in folder.path.iterdir() if path.suffix.lower() in SUFFIXES]
+    paths = sorted(path for path in paths if not path.name.startswith(".") and path.is_file())
+    folder.expect(bool(paths), f"images ({', '.join(SUFFIXES)})")
+    return paths
+
+
+def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path | None]:
+    """Return a function that finds the mask of a photograph in a folder.
+
+    A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
+    or begins with that name and goes on with ``-``, ``_`` or a dot (``17-mask.png``).
+
+    Raises:
+        InputError: The folder holds no images; the function raises it for a photograph
+            without a mask or with several.
+    """
+    if folder is None:
+        return lambda photograph: None
+    place = DataSetPath(Path(folder), kind)
+    paths = image_files(place)
+
+    def find(photograph: Path) -> Path | None:
+        stem = photograph.stem
+        exact = [path for path in paths if path.stem in (stem, photograph.name)]
+        longer = [path for path in paths if path.name.startswith((f"{stem}-", f"{stem}_"))]
+        found = exact or longer
+        there = some([path.name for path in found or paths])
+        place.expect(len(found) == 1, f"one mask for {photograph.name}, such as {stem}.png", there)
+        return found[0]
+
+    return find
+
+
+def _select(
+    photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, data_set: DataSetPath
+) -> list[PosedPhotograph]:
+    by_name = {one.name: one for one in photographs}
+    repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})
+    data_set.expect(not repeated, "photographs of unlike names", f"several {some(repeated)}")
+    data_set.expect(bool(photographs), "photographs with cameras", "none")
+    wanted = list(by_name) if names is None else list(names)
+    unknown = [name for name in wanted if name not in by_name]
+    if unknown or not wanted or len(set(wanted)) < len(wanted):
+        raise InputError(
+            f"{data_set.path}: asked for {some(unknown or wanted) or 'no photographs'}; needed: "
+            f"some of its {len(by_name)} photographs, each once: {some(list(by_name))}."
+        )
+    chosen = [by_name[name] for name in wanted]
+    missing = [one.image.name for one in chosen if not one.image.is_file()]
+    data_set.expect(not missing, "the files of its photographs", f"no {some(missing)}")
+    return chosen
+
+
+def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
+    assert one.skew_px == 0 or is_pinhole(lens), "skew and distortion together are undefined here"
+    K = pinhole_for(lens).clone()
+    K[0, 1] = one.skew_px * lens.width / one.lens.width
+    if not bool(K.isfinite().all() & (K.diagonal() > 0).all()):
+        raise InputError(
+            f"{one.image}: its lens ({lens.model}) leaves no pinhole when it is undistorted: "
+            f"{K.tolist()}; needed: distortion of a real lens. Export the cameras again."
+        )
+    return K

@@ -1,0 +1,87 @@
+"""A result's page with its errors against the truth."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_bench.metrics.in_view import angles_deg
+from pimper_bench.metrics.similarity import transfer
+from pimper_torch.asset.finish import MeshFiles, Simplify
+from pimper_torch.asset.make import Texture
+from pimper_torch.asset.write import write_asset
+from pimper_torch.exchange.result import read_result
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.records import Mesh
+from pimper_torch.relighting.held_out import Relight
+from pimper_torch.report.page import write_page
+from pimper_torch.report.predictions import predictions
+from pimper_torch.report.vertex_layers import length_layer, surface_layers
+
+_DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
+
+
+def write_compared_page(
+    folder: Path, truth: Mesh, truth_from_world: Float[Tensor, "4 4"], path: Path | str
+) -> None:
+    """Write the page of a result with layers of its errors.
+
+    Args:
+        truth: A mesh, or points without faces, which have no normals.
+
+    Raises:
+        InputError: The folder is no result, or its photographs are gone.
+    """
+    found = read_result(folder)
+    few = Simplify()(found.mesh, MeshFiles(faces="all")).few
+    scene = found.scene
+    relighting = Relight()(few, scene, found.silhouettes)
+    asset = Texture()(found.mesh, few, relighting)
+    errors = errors_of(asset.mesh.replace(normals_world=asset.normals), truth, truth_from_world)
+    layers = [
+        length_layer(
+            name.lower(),
+            "distance to the truth" if name == _DISTANCE else "error of normals",
+            "At every vertex, to the nearest point of the truth",
+            values,
+            unit="units of the truth" if name == _DISTANCE else "degrees",
+        )
+        for name, values in errors.items()
+    ]
+    with TemporaryDirectory(prefix="pimper_page_") as scratch:
+        glb = Path(scratch) / "asset.glb"
+        write_asset(asset, glb, more=errors)
+        write_page(
+            path,
+            title=f"{folder.absolute().name}, compared with the truth",
+            headline=f"{len(found.mesh.vertices_world):,} vertices",
+            asset=glb.read_bytes(),
+            scene=scene,
+            silhouettes=found.silhouettes,
+            reference=scene.views.names.index(found.reference),
+            predictions=predictions(few, scene, relighting),
+            layers=[*surface_layers(asset.mesh), *layers],
+            summary=found.summary,
+            settings=(folder / "config.yaml").read_text(encoding="utf-8"),
+        )
+
+
+def errors_of(
+    mesh: Mesh, truth: Mesh, truth_from_world: Float[Tensor, "4 4"]
+) -> Mapping[str, Float[Tensor, " vertex"]]:
+    """Return the distance of every vertex to the truth, and the angle between normals in degrees.
+
+    Args:
+        truth: Its normals are those of its faces; without faces, angles are left out.
+    """
+    moved = transfer(mesh, truth_from_world)
+    near = NearestSurface(truth).query(moved.vertices_world)
+    errors = {_DISTANCE: near.distance.float()}
+    if len(truth.faces) and moved.normals_world is not None:
+        normals = unit_face_normals(truth.vertices_world.double(), truth.faces)[near.face]
+        errors[_ANGLE] = angles_deg(normalize(moved.normals_world, dim=-1), normals).float()
+    return errors

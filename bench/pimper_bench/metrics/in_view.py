@@ -1,0 +1,349 @@
+"""Errors along the rays of one view: shape, normals, albedo."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize
+
+from pimper_bench.metrics.surface_distances import joined
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.visibility import Hits, cast_view
+from pimper_torch.records import Cameras, Capture, Mesh, Record, Truth
+
+
+def relative_error(
+    points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
+) -> Float[Tensor, ""]:
+    r"""Return the published 3D error: that of points as a percentage of the true points' spread.
+
+    .. math:: 100 \lVert S - \hat S \rVert_F / \lVert S - \bar S \rVert_F
+
+    Translating both sets, or scaling them, changes nothing. Differentiable where the points
+    differ from the true ones.
+
+    >>> square = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
+    >>> relative_error(square + torch.tensor([0.0, 0, 0.1]), square)
+    tensor(7.0711)
+    """
+    spread = (points_true - points_true.mean(dim=0)).norm()
+    return 100 * (points - points_true).norm() / spread
+
+
+def angles_deg(
+    normals: Float[Tensor, "*batch 3"], normals_true: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch"]:
+    """Return the angles between vectors, accurate also where they nearly agree."""
+    sine = torch.linalg.cross(normals, normals_true).norm(dim=-1)
+    cosine = (normals * normals_true).sum(dim=-1)
+    return torch.rad2deg(torch.atan2(sine, cosine))
+
+
+def pitted_percent(
+    angle_deg: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
+) -> float:
+    """Return the fraction of known pixels whose normals are 5 degrees worse than those around.
+
+    Pits hardly move the mean or the median of all normals. Those around, 21 x 21 pixels, must be
+    less than 3 degrees off in the mean, so that rims that are wrong as a whole do not count.
+
+    Args:
+        angle_deg: Error of the normal; ignored where it is not known.
+
+    >>> angle = torch.zeros(50, 50)
+    >>> angle[10, 10] = 20.0
+    >>> pitted_percent(angle, torch.ones(50, 50, dtype=torch.bool))
+    0.04
+    """
+    weight = known.double()
+    both = torch.stack([torch.where(known, angle_deg, 0).double() * weight, weight])
+    total, count = avg_pool2d(both, 21, stride=1, padding=10)
+    around = total / torch.where(known, count, 1)
+    pit = (around < 3.0) & (angle_deg - around > 5.0)
+    return 100 * float(pit[known].double().mean())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlbedoFigures(Record):
+    """Errors of albedo, which photographs determine up to scale, after a scale was fitted.
+
+    Attributes:
+        one_scale_percent: ``100 ||s a - t|| / ||t||`` over samples and channels, with the
+            scale ``s`` of least squares.
+        channel_scales_percent: The same with one such scale a channel, which forgives the
+            colour of the lights.
+        one_scale_median_percent: Median of ``100 |s a - t| / t``, with ``s`` the median of
+            ``t / a``: robust to outliers.
+        channels: Compared; 1 if either side is grey, whose other side is then averaged.
+    """
+
+    one_scale_percent: float
+    channel_scales_percent: float
+    one_scale_median_percent: float
+    channels: int
+    samples: int
+
+
+def compare_albedo(
+    albedo: Float[Tensor, "sample ours"], albedo_true: Float[Tensor, "sample theirs"]
+) -> AlbedoFigures | None:
+    """Compare linear albedo sample by sample, up to scale.
+
+    Returns:
+        ``None`` if no sample has both: finite, and above zero in the sum of its channels.
+    """
+    ours, truth = albedo.cpu().double(), albedo_true.cpu().double()
+    if ours.shape[1] != truth.shape[1]:
+        ours, truth = ours.mean(dim=1, keepdim=True), truth.mean(dim=1, keepdim=True)
+    known = ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
+    known &= (ours.sum(dim=1) > 0) & (truth.sum(dim=1) > 0)
+    if not bool(known.any()):
+        return None
+    ours, truth = ours[known], truth[known]
+    one = (ours * truth).sum() / ours.square().sum()
+    each = (ours * truth).sum(dim=0) / ours.square().sum(dim=0).clamp_min(1e-300)
+    positive = (ours > 0) & (truth > 0)
+    there, here = truth[positive], ours[positive]
+    robust = (there / here).median()
+    return AlbedoFigures(
+        one_scale_percent=float(100 * (one * ours - truth).norm() / truth.norm()),
+        channel_scales_percent=float(100 * (each * ours - truth).norm() / truth.norm()),
+        one_scale_median_percent=float(100 * ((robust * here - there).abs() / there).median()),
+        channels=ours.shape[1],
+        samples=len(ours),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Meeting(Record):
+    """Intersections of the rays of a view with a mesh and the truth, frame of the truth.
+
+    Attributes:
+        valid: True where a ray meets the truth.
+        both: True where it meets the mesh too.
+        points: Of the mesh, from the camera's centre.
+    """
+
+    valid: Bool[Tensor, "height width"]
+    both: Bool[Tensor, "height width"]
+    points: Float[Tensor, "ray 3"]
+    points_true: Float[Tensor, "ray 3"]
+    center_world: Float[Tensor, " 3"]
+    hits: Hits
+    faces: Int[Tensor, "face 3"]
+
+    @property
+    def coverage(self) -> float:
+        """Fraction of the rays that meet the truth which meet the mesh too."""
+        return float(self.both.sum() / self.valid.sum())
+
+    def only(self, where: Bool[Tensor, "height width"]) -> "Meeting":
+        """Count all other rays as misses of the mesh."""
+        kept = where[self.both]
+        return self.replace(
+            both=self.both & where, points=self.points[kept], points_true=self.points_true[kept]
+        )
+
+    def interpolate(
+        self, per_vertex: Float[Tensor, "vertex channel"]
+    ) -> Float[Tensor, "ray channel"]:
+        """Interpolate values of the mesh's vertices where both are met."""
+        return self.hits.interpolate(per_vertex, self.faces)[self.both]
+
+
+def meet_in_view(
+    mesh: Mesh,
+    cameras_true: Cameras,
+    view: int,
+    depth_true: Float[Tensor, "height width"],
+    where: Bool[Tensor, "height width"] | None = None,
+) -> Meeting:
+    """Cast the rays of a true camera on a mesh.
+
+    Args:
+        mesh: Frame of the truth.
+        depth_true: Along that camera's z; infinite where there is nothing.
+
+    Raises:
+        InputError: No pixel is left to compare, or no ray meets the mesh.
+    """
+    valid = depth_true.isfinite() if where is None else depth_true.isfinite() & where
+    hits = cast_view(mesh, cameras_true, view)
+    both = valid & (hits.face >= 0)
+    if not both.any():
+        raise InputError(
+            f"view {view}: {int(valid.sum())} pixels have a true depth, and the mesh is met by "
+            f"{int((hits.face >= 0).sum())} rays, none of them at those pixels. Check the frame "
+            "of the mesh."
+        )
+    pixels = pixel_centers(both.shape[1], both.shape[0], like=cameras_true.intrinsics)[both]
+    rays = rays_through(pixels, cameras_true.cam_from_world[view], cameras_true.intrinsics[view])
+    return Meeting(
+        valid=valid,
+        both=both,
+        points=hits.distance[both][:, None].to(rays) * rays,
+        points_true=depth_true[both][:, None].to(rays) * rays,
+        center_world=cameras_true.centers_world[view],
+        hits=hits,
+        faces=mesh.faces,
+    )
+
+
+def without_surroundings(met: Meeting, truth: Truth) -> Meeting:
+    """Count rays that meet the surroundings behind the object as misses.
+
+    Where a surface has a hole on the object and continues over the table, a ray through the
+    hole meets the table: no error of the object's shape, but a missing part. Such a point lies
+    behind the true one on its ray, and nearer to the true surroundings than to the true object.
+    """
+    if truth.mesh is None or truth.surroundings is None or not len(truth.surroundings.faces):
+        return met
+    off = (met.points - met.points_true).norm(dim=1)
+    asked = (met.points.norm(dim=1) > met.points_true.norm(dim=1)).nonzero()[:, 0]
+    points = met.center_world.to(met.points) + met.points[asked]
+    aside = NearestSurface(truth.surroundings).query(points).distance
+    # The object is no farther than its point on the ray, so that most need no query.
+    unsure = aside < off[asked]
+    asked, points, aside = asked[unsure], points[unsure], aside[unsure]
+    beside = torch.zeros(len(off), dtype=torch.bool, device=off.device)
+    beside[asked] = aside < NearestSurface(truth.mesh).query(points).distance
+    kept = met.both.clone()
+    kept[met.both] = ~beside
+    return met.only(kept)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AngleFigures(Record):
+    """Angles between normals over the rays that meet both, and :func:`pitted_percent`."""
+
+    mean_deg: float
+    median_deg: float
+    pitted_percent: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewFigures(Record):
+    """Errors of a mesh along the rays of one true camera.
+
+    Attributes:
+        coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
+            the surroundings; the other figures are over these.
+        transferred_normals: Of the normals at the mesh's vertices; ``None`` if it has none or
+            the true ones are unknown.
+        shape_normals: Of the normals of its shape: its faces', averaged at the vertices by
+            area and interpolated between them.
+        albedo: ``None`` where either side has none.
+    """
+
+    name: str
+    relative_error: float
+    coverage: float
+    pixels: int
+    transferred_normals: AngleFigures | None
+    shape_normals: AngleFigures | None
+    albedo: AlbedoFigures | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class TrueMaps(Record):
+    """Depth (infinite where unknown), normals (zero where unknown) and object of a view."""
+
+    depth: Float[Tensor, "height width"]
+    normals_world: Float[Tensor, "height width 3"] | None
+    where: Bool[Tensor, "height width"] | None
+
+
+def compare_along_rays(mesh: Mesh, capture: Capture, view: int) -> ViewFigures | None:
+    """Compare a mesh in the frame of the truth with it, over the rays of :func:`meet_truth`."""
+    met = meet_truth(mesh, capture, view)
+    return None if met is None else figures_of(met, mesh, capture, view)
+
+
+def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
+    """Cast the rays of a true view on a mesh in the frame of the truth.
+
+    The truth's maps are used; where it has no depth map, its mesh is ray cast. The object alone is
+    compared where that is known: the truth's foreground, else the masks of the photographs. Rays
+    that pass the object and meet the mesh on the truth's surroundings are misses.
+
+    Returns:
+        ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
+    """
+    cameras, maps = capture.cameras, true_maps(capture, view)
+    if cameras is None or maps is None or len(mesh.faces) == 0:
+        return None
+    met = meet_in_view(mesh, cameras, view, maps.depth, maps.where)
+    met = without_surroundings(met, capture.truth)
+    if not met.both.any():
+        raise InputError(
+            f"view {capture.views.names[view]}: where rays through the object meet the mesh, it "
+            "lies on the surroundings. Check that the mesh holds the object."
+        )
+    return met
+
+
+def figures_of(met: Meeting, mesh: Mesh, capture: Capture, view: int) -> ViewFigures:
+    """Compare a mesh with the truth over rays that meet both, all or some; at least one."""
+    maps = true_maps(capture, view)
+    assert maps is not None  # it was met
+    albedo = None
+    if mesh.albedo is not None and capture.truth.albedo is not None:
+        albedo = compare_albedo(met.interpolate(mesh.albedo), capture.truth.albedo[view][met.both])
+    shape = vertex_normals(mesh.vertices_world, mesh.faces)
+    return ViewFigures(
+        name=capture.views.names[view],
+        relative_error=float(relative_error(met.points.double(), met.points_true.double())),
+        coverage=met.coverage,
+        pixels=int(met.valid.sum()),
+        transferred_normals=_angles(met, mesh.normals_world, maps),
+        shape_normals=_angles(met, shape, maps),
+        albedo=albedo,
+    )
+
+
+def true_maps(capture: Capture, view: int) -> TrueMaps | None:
+    """Return depth and normals of a view, from the truth's maps or by casting its mesh."""
+    truth, cameras = capture.truth, capture.cameras
+    masks = capture.views.masks if truth.foreground is None else truth.foreground
+    where = None if masks is None else masks[view]
+    if truth.depth is not None:
+        normals = None if truth.normals_world is None else truth.normals_world[view]
+        return TrueMaps(depth=truth.depth[view], normals_world=normals, where=where)
+    if truth.mesh is None or len(truth.mesh.faces) == 0 or cameras is None:
+        return None
+    whole = joined(truth.mesh, truth.surroundings)
+    hits = cast_view(whole, cameras, view)
+    return TrueMaps(
+        depth=hits.distance,
+        normals_world=hits.interpolate(
+            vertex_normals(whole.vertices_world, whole.faces), whole.faces
+        ),
+        where=(hits.face >= 0) & (hits.face < len(truth.mesh.faces)),
+    )
+
+
+def _angles(
+    met: Meeting, normals: Float[Tensor, "vertex 3"] | None, maps: TrueMaps
+) -> AngleFigures | None:
+    if normals is None or maps.normals_world is None:
+        return None
+    ours = met.interpolate(normals).double()
+    truth = maps.normals_world[met.both].double()
+    known = (truth.norm(dim=1) > 0) & (ours.norm(dim=1) > 0)
+    if not bool(known.any()):
+        return None
+    angles = angles_deg(normalize(ours[known], dim=1), normalize(truth[known], dim=1))
+    where = met.both.clone()
+    where[met.both] = known
+    spread = torch.zeros(where.shape, dtype=angles.dtype, device=angles.device)
+    spread[where] = angles
+    return AngleFigures(
+        mean_deg=float(angles.mean()),
+        median_deg=float(angles.median()),
+        pitted_percent=pitted_percent(spread, where),
+    )

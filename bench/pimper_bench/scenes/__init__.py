@@ -1,0 +1,40 @@
+"""Scenes with known truth.
+
+:func:`render_scene` photographs one into a folder, frame by frame; :func:`build_scene` and
+:func:`render_frame` are its parts. :func:`render_objects` and :func:`render_shape` keep a small
+scene in memory.
+"""
+
+from pimper_bench.scenes.ray_tracing import RenderedFrame, TracedObjects, render_frame
+from pimper_bench.scenes.render_in_memory import (
+    RenderedScene,
+    potato_on_table,
+    render_objects,
+    render_shape,
+)
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_object import SceneObject
+from pimper_bench.scenes.scene_objects import RECIPES
+from pimper_bench.scenes.scene_settings import SceneConfig, SensorConfig
+from pimper_bench.scenes.true_clouds import sparse_scene
+from pimper_bench.scenes.whole_scene import Scene, build_scene
+
+SCENES = tuple(RECIPES)
+
+__all__ = [
+    "SCENES",
+    "RenderedFrame",
+    "RenderedScene",
+    "Scene",
+    "SceneConfig",
+    "SceneObject",
+    "SensorConfig",
+    "TracedObjects",
+    "build_scene",
+    "potato_on_table",
+    "render_frame",
+    "render_objects",
+    "render_scene",
+    "render_shape",
+    "sparse_scene",
+]

@@ -1,0 +1,179 @@
+"""Sparse clouds with tracks from the truth, as if structure from motion had run."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_bench.scenes.render_in_memory import RenderedScene
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.records import Cameras, Mesh, SparseScene
+from pimper_torch.sfm.colmap import pinhole_lenses
+from pimper_torch.sfm.model import SparseModel
+
+
+def sparse_scene(
+    scene: RenderedScene,
+    num_points: int,
+    generator: torch.Generator,
+    *,
+    noise_px: float = 0.0,
+    dtype: torch.dtype = torch.float32,
+) -> SparseScene:
+    """Sample visible surface points, follow them through the views and triangulate them.
+
+    Noise is put on the observations, and the points are triangulated from those again, so that
+    their errors are along the rays as in real clouds.
+
+    Args:
+        noise_px: Standard deviation of every observation.
+        dtype: Of photographs, cameras and points.
+    """
+    cameras = scene.cameras
+    points = _pick(scene, 4 * num_points, generator)
+    pixels, seen = _follow(scene, points)
+    (kept,) = torch.nonzero(seen.sum(dim=1) >= 3, as_tuple=True)
+    kept = kept[:num_points]
+    points, pixels, seen = points[kept], pixels[kept], seen[kept]
+    if noise_px > 0:
+        spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+        pixels = pixels + noise_px * spread.to(pixels)
+        points = triangulate_rays(cameras, pixels, seen)
+    where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
+    errors = (where - pixels).norm(dim=-1)
+    point_index, view_index = torch.nonzero(seen, as_tuple=True)
+    return SparseScene(
+        views=scene.views.replace(images=scene.views.images.to(dtype)),
+        cameras=cameras.replace(
+            intrinsics=cameras.intrinsics.to(dtype), cam_from_world=cameras.cam_from_world.to(dtype)
+        ),
+        points_world=points.to(dtype),
+        reprojection_errors_px=((errors * seen).sum(dim=1) / seen.sum(dim=1)).to(dtype),
+        observation_point=point_index,
+        observation_view=view_index,
+        observation_pixels=pixels[seen].to(dtype),
+        lenses=pinhole_lenses(cameras),
+    )
+
+
+def _pick(scene: RenderedScene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Unproject pixels drawn at random from the depth maps."""
+    cameras, found = scene.cameras, []
+    fraction = -(-count // cameras.num_views)
+    for view in range(cameras.num_views):
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
+        (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
+        hit = hit[torch.randperm(len(hit), generator=generator)[:fraction]]
+        pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)[hit]
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+        found.append(cameras.centers_world[view] + depth[hit, None] * rays)
+    points = torch.cat(found)
+    return points[torch.randperm(len(points), generator=generator)]
+
+
+def _follow(
+    scene: RenderedScene, points: Float[Tensor, "point 3"]
+) -> tuple[Float[Tensor, "point view 2"], Bool[Tensor, "point view"]]:
+    """Project points to all views, and compare their depth with what is seen there.
+
+    A point counts as seen when the depths of the 3x3 pixels round it bracket its own and
+    lie on one surface. The rim of an object, and the image's border, are left out.
+    """
+    cameras = scene.cameras
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    seen = torch.zeros(depth.shape, dtype=torch.bool)
+    for view in range(cameras.num_views):
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        u, v = pixels[view].floor().long().unbind(dim=-1)
+        framed = (depth[view] > 0) & (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)
+        (inside,) = torch.nonzero(framed, as_tuple=True)
+        patch = torch.stack(
+            [
+                scene.depth[view, v[inside] + dv, u[inside] + du]
+                for dv in (-1, 0, 1)
+                for du in (-1, 0, 1)
+            ]
+        ).to(depth)
+        own = depth[view, inside]
+        slack = 1e-4 * own
+        smooth = patch.amax(dim=0) - patch.amin(dim=0) < 0.05 * own
+        bracketed = (own > patch.amin(dim=0) - slack) & (own < patch.amax(dim=0) + slack)
+        seen[view, inside] = smooth & bracketed
+    return pixels.movedim(0, 1), seen.mT
+
+
+def true_model(
+    surface: Mesh,
+    blockers: Mesh,
+    cameras: Cameras,
+    names: tuple[str, ...],
+    generator: torch.Generator,
+) -> tuple[SparseModel, Float[Tensor, "point channel"]]:
+    """Draw points evenly over a surface and follow them through the photographs.
+
+    Args:
+        blockers: Everything that may stand in front of it.
+
+    Returns:
+        Cameras, at most 1,500 points with exact observations, and the points' albedo.
+    """
+    points, normals, albedo = _scatter(surface, 6 * 1500, generator)
+    pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+    seen = _seen(points, normals, pixels, depth, blockers, cameras)
+    fewest = min(3, cameras.num_views)
+    (kept,) = torch.nonzero(seen.sum(dim=0) >= fewest, as_tuple=True)
+    kept = kept[:1500]
+    point, view = torch.nonzero(seen[:, kept].mT, as_tuple=True)
+    model = SparseModel(
+        names=names,
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.double(),
+        points_world=points[kept],
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, kept[point]],
+    )
+    return model, albedo[kept]
+
+
+def _scatter(
+    mesh: Mesh, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, "point channel"]]:
+    """Draw points, their faces' normals and their albedo, evenly by area."""
+    assert mesh.albedo is not None
+    normals = face_normals(mesh.vertices_world, mesh.faces)
+    area = normals.norm(dim=-1).cumsum(dim=0)
+    draws = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    face = torch.searchsorted(area, draws[:, 0] * area[-1]).clamp_max(len(mesh.faces) - 1)
+    root = draws[:, 1].sqrt()
+    weights = torch.stack([1 - root, root * (1 - draws[:, 2]), root * draws[:, 2]], dim=-1)
+    corners = mesh.faces[face]
+    points = (weights[..., None] * mesh.vertices_world[corners]).sum(dim=1)
+    albedo = (weights[..., None] * mesh.albedo.double()[corners]).sum(dim=1)
+    return points, normals[face] / normals[face].norm(dim=-1, keepdim=True), albedo
+
+
+def _seen(
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    pixels: Float[Tensor, "view point 2"],
+    depth: Float[Tensor, "view point"],
+    blockers: Mesh,
+    cameras: Cameras,
+) -> Bool[Tensor, "view point"]:
+    caster = RayCaster(blockers.vertices_world, blockers.faces)
+    found = []
+    for view in range(cameras.num_views):
+        eye = cameras.centers_world[view]
+        toward = eye - points
+        distance = toward.norm(dim=-1)
+        # More slanted, features of a surface are not found.
+        facing = (normals * toward).sum(dim=-1) > 0.2 * distance
+        size = cameras.sizes_px[view].to(pixels)
+        framed = (depth[view] > 0) & ((pixels[view] > 1) & (pixels[view] < size - 1)).all(dim=-1)
+        hidden = caster.occluded(points, eye, 1e-3 * distance)
+        found.append(facing & framed & ~hidden)
+    return torch.stack(found)

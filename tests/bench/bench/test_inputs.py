@@ -1,0 +1,44 @@
+"""Structure from motion of a bench's scene, kept from run to run."""
+
+import time
+
+import pytest
+
+from pimper_bench.bench.bench_inputs import BenchConfig, prepare
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+from pimper_torch.sfm import reconstruct
+from pimper_torch.sfm.existing import existing_ways
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered")
+    vertices, faces = icosphere(2)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
+    settings = SceneConfig(num_views=6, width=64, height=48, supersample=1)
+    return render_scene(str(folder / "ball.ply"), folder / "scene", settings, processes=1)
+
+
+def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run(
+    rendered, tmp_path, monkeypatch
+):
+    runs = []
+
+    def structure_from_motion(views, config):
+        runs.append(config)
+        time.sleep(0.3)
+        return existing_ways(views, rendered / "truth" / "sparse").plain[0]
+
+    monkeypatch.setattr(reconstruct, "structure_from_motion", structure_from_motion)
+    config = BenchConfig(scenes=(str(rendered),), samples=500)
+    first, second = (prepare(rendered, config, tmp_path / "cache") for _ in range(2))
+    assert len(runs) == 1
+    assert min(first.sfm_seconds, second.sfm_seconds) >= 0.3
+    assert (first.scene.points_world == second.scene.points_world).all()
+    other = BenchConfig(scenes=(str(rendered),), samples=500, cameras="features")
+    prepare(rendered, other, tmp_path / "cache")
+    assert [run.track_iterations for run in runs] == [2, 0]

@@ -1,0 +1,261 @@
+import json
+import warnings
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.bench import run_bench as runner
+from pimper_bench.bench.bench_inputs import BenchConfig, Inputs, MethodRun, method_named
+from pimper_bench.bench.run_bench import BENCH_NAMES, error_along_rays, run_bench
+from pimper_bench.metrics import TrueSurface
+from pimper_bench.metrics.in_view import meet_truth
+from pimper_bench.scenes import SceneObject, render_objects, sparse_scene
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import wandering_lights
+from pimper_bench.scenes.textures import random_speckle
+from pimper_torch.errors import (
+    ConfigError,
+    MissingProgramError,
+    PimperWarning,
+    ReconstructionError,
+)
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.outputs.marker import MARKER
+from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
+
+RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball before five cameras: its truth, and what structure from motion would give."""
+    generator = torch.Generator().manual_seed(91)
+    vertices, faces = icosphere(4)
+    mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
+    cameras = arc_cameras(5, width=60, height=45, focal_px=80.0, distance=4.0)
+    lights = wandering_lights(5, generator, distance=5.0)
+    texture = random_speckle(generator, cells=(0.3,))
+    scene = render_objects([SceneObject(mesh=mesh, texture=texture)], cameras, lights, generator)
+    numbers = torch.arange(5)
+    capture = Capture(
+        views=scene.views,
+        cameras=cameras,
+        truth=Truth(mesh=mesh),
+        position=numbers,
+        light=numbers,
+    )
+    maps = Capture(
+        views=scene.views.take([2]),
+        cameras=cameras.take([2]),
+        truth=Truth(
+            mesh=mesh,
+            depth=scene.depth[[2]],
+            normals_world=scene.normals_world[[2]],
+            albedo=scene.albedo[[2]],
+            foreground=scene.foreground[[2]],
+        ),
+        position=numbers[[2]],
+        light=numbers[[2]],
+    )
+    return Inputs(
+        scene=sparse_scene(scene, 60, generator),
+        coarse=CoarseMesh(
+            mesh=mesh, reference=2, is_point=torch.ones(len(vertices), dtype=torch.bool)
+        ),
+        capture=capture,
+        surface=TrueSurface(capture, samples=5_000),
+        maps=maps,
+        sfm_seconds=30.0,
+    )
+
+
+def of_radius(radius):
+    """Give a method whose surface is a ball of a radius where the truth has 1."""
+
+    def method(scene, coarse):
+        mesh = coarse.mesh.replace(vertices_world=radius * coarse.mesh.vertices_world)
+        estimate = Estimate(
+            mesh=mesh,
+            names=scene.views.names,
+            cameras=scene.cameras,
+            reference=scene.views.names[coarse.reference],
+        )
+        return MethodRun(estimate=estimate, seconds=6.0, samples=1000, missing_fraction=0.25)
+
+    return method
+
+
+def failing(error):
+    def method(scene, coarse):
+        raise error
+
+    return method
+
+
+@pytest.fixture
+def staged(monkeypatch, ball):
+    """Stand in for rendering and structure from motion, and for the methods' names."""
+    methods = {
+        "exact": of_radius(1.0),
+        "larger": of_radius(1.02),
+        "lost": failing(ReconstructionError("nothing was found")),
+        "absent": failing(MissingProgramError("get it somewhere")),
+    }
+    monkeypatch.setattr(runner, "scene_folder", lambda scene, config, workspace: workspace)
+    monkeypatch.setattr(runner, "prepare", lambda folder, config, cache: ball)
+    monkeypatch.setattr(runner, "method_named", methods.__getitem__)
+    return methods
+
+
+def test_methods_are_measured_alike_and_failures_have_rows(staged, tmp_path):
+    config = BenchConfig(
+        samples=3000, scenes=("ball",), methods=("exact", "larger", "lost", "absent")
+    )
+    table = run_bench(config, tmp_path / "out")
+    exact, larger, lost, absent = table.rows
+    assert exact.relative_error < 0.02  # float32 of the rays
+    assert exact.mean_normal_deg < 0.5  # the truth's are blended between vertices
+    assert (exact.minutes, exact.sfm_minutes) == (0.1, 0.5)
+    assert (exact.samples, exact.missing_percent) == (1000, 25.0)
+    assert_close(exact.coverage_percent, 100.0)
+    # Radially off by 0.02 everywhere, in per cent of the bounding cube's diagonal.
+    diagonal = 2 * 3**0.5
+    assert_close(larger.accuracy, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert_close(larger.completeness_seen, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert_close(larger.chamfer, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
+    assert dict(larger.f_scores)[0.5] == 0.0
+    assert dict(larger.f_scores)[1.0] == 100.0
+    assert "nothing was found" in lost.note
+    assert absent.note.startswith("not installed")
+    assert lost.relative_error is None
+
+
+def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(staged, tmp_path):
+    def half(scene, coarse):
+        outcome = of_radius(1.0)(scene, coarse)
+        mesh = outcome.estimate.mesh
+        # The side that the reference camera sees obliquely is left out.
+        kept = (mesh.vertices_world[mesh.faces].mean(dim=1) @ RIGHT) > 0
+        mesh = mesh.replace(faces=mesh.faces[kept], normals_world=mesh.vertices_world)
+        return outcome.replace(estimate=outcome.estimate.replace(mesh=mesh))
+
+    staged["half"] = half
+    config = BenchConfig(samples=3000, scenes=("ball",), methods=("half", "larger", "lost"))
+    part, larger, lost = run_bench(config, tmp_path / "out").rows
+    assert 30 < part.coverage_percent < 70
+    assert larger.coverage_percent == 100.0
+    assert part.common_percent == larger.common_percent == part.coverage_percent
+    assert_close(part.common_relative_error, part.relative_error, atol=1e-4, rtol=0)
+    assert_close(part.common_mean_normal_deg, part.mean_normal_deg, atol=1e-3, rtol=0)
+    assert larger.common_relative_error > 1
+    assert abs(larger.common_relative_error - larger.relative_error) > 0.01
+    assert lost.common_percent is None
+    alone = run_bench(
+        BenchConfig(samples=3000, scenes=("ball",), methods=("larger",)), tmp_path / "alone"
+    ).rows[0]
+    assert alone.common_percent == alone.coverage_percent
+    assert_close(alone.common_relative_error, alone.relative_error, atol=1e-4, rtol=0)
+
+
+def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
+    config = BenchConfig(samples=3000, scenes=("ball",), methods=("larger", "lost"))
+    table = run_bench(config, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        [*BENCH_NAMES, MARKER]
+    )
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
+    assert [row["method"] for row in rows] == [row.method for row in table.rows]
+    assert "larger" in (tmp_path / "out" / "table.md").read_text()
+    assert [path.name for path in (tmp_path / "out" / "heatmaps").iterdir()] == ["ball_larger.png"]
+    mesh = read_mesh(tmp_path / "out" / "meshes" / "ball_larger.ply")
+    radii = mesh.vertices_world.norm(dim=1)
+    assert_close(radii, torch.full_like(radii, 1.02), rtol=0, atol=1e-4)
+
+
+def test_what_was_complete_before_an_interruption_is_kept(staged, tmp_path, monkeypatch):
+    usual = runner.prepare
+    calls = []
+
+    def prepare(folder, config, cache):
+        calls.append(folder)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return usual(folder, config, cache)
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    config = BenchConfig(samples=3000, scenes=("one", "two"), methods=("exact",))
+    with pytest.warns(PimperWarning, match="two"):
+        table = run_bench(config, tmp_path / "out")
+    assert [row.scene for row in table.rows] == ["one"]
+    assert (tmp_path / "out" / "table.md").is_file()
+
+
+def test_an_interruption_in_the_first_scene_leaves_nothing(staged, tmp_path, monkeypatch):
+    def prepare(folder, config, cache):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(BenchConfig(samples=3000, scenes=("one",), methods=("exact",)), tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_without_cameras_has_a_row_for_every_method(staged, tmp_path, monkeypatch):
+    def prepare(folder, config, cache):
+        raise ReconstructionError("no view was registered")
+
+    monkeypatch.setattr(runner, "prepare", prepare)
+    table = run_bench(
+        BenchConfig(samples=3000, scenes=("one",), methods=("exact", "larger")), tmp_path / "out"
+    )
+    assert [row.method for row in table.rows] == ["exact", "larger"]
+    assert all("no view" in row.note for row in table.rows)
+
+
+def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
+    shift = torch.eye(4).double()
+    camera = ball.maps.cameras.cam_from_world[0]
+    shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
+    mesh = ball.capture.truth.mesh
+    moved = mesh.replace(vertices_world=transform(shift, mesh.vertices_world))
+    error = error_along_rays(meet_truth(moved, ball.maps, 0), ball.maps)
+    foreground = ball.maps.truth.foreground[0]
+    assert torch.equal(error.isnan(), ~foreground)
+    centre = error[22, 30]
+    assert_close(centre, torch.tensor(100 * 0.03 / (2 * 3**0.5)).double(), rtol=0.02, atol=0)
+    half = mesh.replace(faces=mesh.faces[mesh.vertices_world[mesh.faces].mean(dim=1)[:, 0] > 0])
+    missed = error_along_rays(meet_truth(half, ball.maps, 0), ball.maps).isinf()
+    assert 0.3 < missed[foreground].float().mean() < 0.7
+
+
+def test_names_that_are_no_method_are_refused():
+    with pytest.raises(ConfigError, match="smoothed"):
+        method_named("defautl")
+
+
+def test_presets_and_rivals_have_names():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in BenchConfig(scale="full").chosen_methods:
+            assert callable(method_named(name))
+    assert set(BenchConfig().chosen_methods) < set(BenchConfig(scale="full").chosen_methods)
+    assert BenchConfig(methods=("paper",)).chosen_methods == ("paper",)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"scenes": ()},
+        {"methods": ("paper", "paper")},
+        {"methods": ("default", "mine/default.yaml")},  # one name in the table
+        {"methods": ()},
+        {"processes": 0},
+        {"seed": -1},
+    ],
+)
+def test_a_table_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(ConfigError):
+        BenchConfig(**wrong)

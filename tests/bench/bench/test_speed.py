@@ -1,0 +1,164 @@
+"""The script that measures runs: benchmarks/speed.py."""
+
+import importlib.util
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from torch.testing import assert_close
+
+from pimper_bench.bench.measure import peak_memory
+from pimper_torch.records import StageReport
+
+MB = 2**20
+
+
+@pytest.fixture(scope="module")
+def speed():
+    path = Path(__file__).parents[3] / "benchmarks" / "speed.py"
+    spec = importlib.util.spec_from_file_location("speed", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["speed"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["speed"]
+
+
+def told(stage, **figures):
+    return StageReport(name=stage, seconds=0.0, peak_memory_mb=0.0, figures=figures)
+
+
+def test_exponents_are_those_of_the_power_law(speed):
+    sizes = [10.0, 20.0, 40.0]
+    assert_close(speed.exponent(sizes, [3 * size**1.5 for size in sizes]), 1.5)
+    assert_close(speed.exponent(sizes, [7.0, 7.0, 7.0]), 0.0)
+    assert math.isnan(speed.exponent(sizes, [1.0, 0.0, 1.0]))
+    assert math.isnan(speed.exponent([5.0, 5.0, 5.0], [1.0, 2.0, 3.0]))
+
+
+def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
+    first, other, again = (
+        speed.Cost(stage=stage, seconds=2, cpu_seconds=3, page_faults=5, peak_mb=peak)
+        for stage, peak in (("warp", 70.0), ("fuse", 90.0), ("warp", 60.0))
+    )
+    warp, fuse = speed.by_stage([first, other, again])
+    assert (warp.stage, warp.seconds, warp.cpu_seconds, warp.page_faults) == ("warp", 4, 6, 10)
+    assert (warp.peak_mb, fuse.seconds, fuse.peak_mb) == (70.0, 2, 90.0)
+
+
+def test_a_round_without_a_floor_is_as_far_from_it_as_the_others(speed):
+    iterations = [
+        speed.Cost(stage="fuse", seconds=seconds, cpu_seconds=1, page_faults=0, floor_seconds=floor)
+        for seconds, floor in ((6.0, math.nan), (10.0, 0.1), (30.0, 0.7))
+    ]
+    found = speed.added("fuse", iterations)
+    assert_close(found.seconds / found.floor_seconds, (10 + 30) / (0.1 + 0.7))
+    assert math.isnan(speed.added("fuse", iterations[:1]).floor_seconds)
+
+
+def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
+    with peak_memory() as peak:
+        if peak() is None:
+            pytest.skip("this system does not let a process forget its peak")
+    meter = speed.Meter()
+    meter.started("outer")
+    held = np.ones(300 * MB, dtype=np.uint8)
+    assert held.sum() == 300 * MB
+    del held
+    meter.started("inner")
+    meter.finished(told("inner"))
+    meter.finished(told("outer"))
+    inner, outer = meter.costs
+    assert (inner.stage, outer.stage) == ("inner", "outer")
+    assert outer.peak_mb - inner.peak_mb > 250
+    assert outer.page_faults > inner.page_faults
+    assert outer.seconds > inner.seconds > 0
+
+
+def test_each_round_has_the_floor_of_its_own_samples(speed):
+    names = ("reconstruct", "warp", "factorize", "sweep", "warp", "extract")
+    costs = [speed.Cost(stage=name, seconds=1, cpu_seconds=1, page_faults=0) for name in names]
+    floors = {"copy_gb_per_s": 13.0, "batched_product_gflop_per_s": 64.0, "colmap_seconds": 7.0}
+    found = speed.with_floors(costs, floors, [1e9, 4e9])
+    floor = [cost.floor_seconds for cost in found]
+    assert floor[:5] == [7.0, 1.0, 1.0, 1.0, 4.0]
+    assert math.isnan(floor[5])
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch, tmp_path, capsys):
+    class Chain:
+        """The hand-overs of a run, without the work."""
+
+        def __init__(self, config, observer, cache):
+            self.observer = observer
+
+        def __call__(self, views, sparse_model):
+            for stage, figures in (
+                ("reconstruct", {}),
+                ("decompose", {"patches": 7, "template_samples": 100}),
+                ("warp", {}),
+                ("fuse", {}),
+            ):
+                self.observer.started(stage)
+                self.observer.finished(told(stage, **figures))
+            return reconstruction
+
+    monkeypatch.setattr(speed, "make_chain", Chain)
+    monkeypatch.setattr(speed, "load_views", lambda *_, **__: reconstruction.scene.views)
+    monkeypatch.setattr(speed, "copy_bytes_per_s", lambda: 1e9)
+    figures = tmp_path / "figures.json"
+    earlier = tmp_path / "earlier.json"
+    fused = speed.Cost(stage="fuse", seconds=1, cpu_seconds=1, page_faults=1, peak_mb=1.0)
+    earlier.write_text(json.dumps({"costs": [speed.asdict(fused)]}), encoding="utf-8")
+    options = ["--preset", "fast", "--scales", "--against", str(earlier)]
+    speed.main(["demo", *options, "-o", str(figures)])
+    kept = json.loads(figures.read_text(encoding="utf-8"))
+    assert [cost["stage"] for cost in kept["costs"]] == [
+        *("import", "read", "reconstruct", "decompose", "warp", "fuse", "aside", "write"),
+    ]
+    assert kept["preset"] == "fast"
+    assert kept["entries"] == [100 * reconstruction.scene.views.num_views]
+    assert kept["costs"][4]["floor_seconds"] == 13e-9 * kept["entries"][0]
+    assert kept["written_mb"] > 0
+    after = speed.rows_of(kept)[-2]
+    assert after.seconds < speed.rows_of(kept)[-1].seconds
+    assert after.seconds > kept["costs"][-1]["seconds"]
+    whole = speed.rows_of(kept)[-1].seconds
+    assert whole == pytest.approx(kept["clock_seconds"], abs=0.1 + 0.02 * whole)  # nothing hides
+    printed = capsys.readouterr().out
+    measured, compared = printed.split("Over the earlier run's")
+    assert measured.count("| fuse |") == compared.count("| fuse |") == 1
+    assert "s are in no line: " in measured
+    assert "| fuse | - |" not in compared
+    assert "| write | - | - | - | - |" in compared  # the earlier run had none
+
+
+def test_scaling_runs_halves_of_the_size(speed, monkeypatch, tmp_path, capsys):
+    def run(command, **_):
+        out = Path(command[command.index("-o") + 1])
+        size = int(command[-1])
+        costs = [
+            speed.asdict(
+                speed.Cost(
+                    stage="warp",
+                    seconds=size**2,
+                    cpu_seconds=size**2,
+                    page_faults=0,
+                    peak_mb=5.0,
+                )
+            )
+        ]
+        machine = {"cores": 2}
+        found = {"entries": [size**2], "patches": [size], "machine": machine, "costs": costs}
+        out.write_text(json.dumps(found), encoding="utf-8")
+
+    monkeypatch.setattr(speed.subprocess, "run", run)
+    speed.main(["demo", "--scaling", "--max-size-px", "400"])
+    printed = capsys.readouterr().out
+    assert "| warp | 40000.0 / 80089.0 / 160000.0 | 1 | 5 / 5 / 5 | 0 | 0 |" in printed

@@ -1,0 +1,275 @@
+import io
+import json
+import math
+import platform
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from pimper_bench.bench.bench_table import (
+    MISSING,
+    PUBLISHED,
+    BenchRow,
+    Table,
+    cell,
+    columns,
+    markdown,
+    row_of_failure,
+    terminal,
+    with_published,
+    write_json,
+)
+from pimper_bench.bench.measure import Machine, this_machine
+from pimper_torch.config import build
+from pimper_torch.cores import usable_cores
+from pimper_torch.errors import MissingProgramError, ReconstructionError
+
+MACHINE = Machine(
+    cpu="Abacus 12",
+    cores=2,
+    memory_gb=23.4,
+    gpu="",
+    system="Linux",
+    python="3.11.7",
+    versions=("torch 2.13.0",),
+)
+FULL = BenchRow(
+    scene="mug",
+    method="default",
+    mesh_points=251,
+    triangles=480,
+    samples=6_690_000,
+    missing_percent=24.7,
+    minutes=1.5,
+    sfm_minutes=0.25,
+    relative_error=1.234567,
+    coverage_percent=99.0,
+    mean_normal_deg=2.5,
+    median_normal_deg=1.75,
+    mean_shape_normal_deg=3.5,
+    median_shape_normal_deg=2.25,
+    common_percent=72.0,
+    common_relative_error=0.75,
+    common_mean_normal_deg=1.5,
+    common_median_normal_deg=0.25,
+    common_mean_shape_normal_deg=1.25,
+    common_median_shape_normal_deg=0.125,
+    pitted_percent=0.5,
+    chamfer=0.125,
+    accuracy=0.1,
+    completeness=0.15,
+    completeness_seen=0.14,
+    f_scores=((0.5, 97.5), (1.0, 99.25)),
+    peak_memory_mb=1234.0,
+)
+EMPTY = BenchRow(scene="mug", method="pmvs", note="not installed: pmvs2")
+
+
+def table(*rows, **settings):
+    return Table(
+        rows=rows, machine=MACHINE, date="2026-11-21T10:00", scale="quick", settings=settings
+    )
+
+
+def cells(text):
+    """Rows of the Markdown table, by heading."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    split = [[word.strip() for word in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    return [dict(zip(split[0], line, strict=True)) for line in split[2:]]
+
+
+def test_only_zero_is_shown_as_zero():
+    assert cell(0.0, 2) == "0.00"
+    assert cell(0, 0) == "0"
+    assert cell(0.0049, 2) == "<0.01"
+    assert cell(0.0051, 2) == "0.01"
+    for nothing in (None, math.nan, math.inf):
+        assert cell(nothing, 2) == MISSING
+
+
+def test_what_is_missing_is_a_dash_in_every_column():
+    full, empty = cells(markdown(table(FULL, EMPTY)))
+    words = {"scene": "mug", "method": "pmvs", "note": "not installed: pmvs2"}
+    assert empty == dict.fromkeys(full, MISSING) | words
+    assert MISSING not in [full[name] for name in full.keys() - words.keys()]
+
+
+def test_every_figure_stands_in_its_own_column():
+    (full,) = cells(markdown(table(FULL)))
+    assert full == {
+        "scene": "mug",
+        "method": "default",
+        "points": "251",
+        "triangles": "480",
+        "samples, M": "6.69",
+        "missing, %": "24.7",
+        "minutes": "1.5",
+        "SfM, min": "0.2",
+        "memory, MB": "1,234",
+        "3D error, %": "1.23",
+        "covered, %": "99.0",
+        "normals, °": "2.50",
+        "median, °": "1.75",
+        "shape, °": "3.50",
+        "shape median, °": "2.25",
+        "pitted, %": "0.50",
+        "covered by all, %": "72.0",
+        "3D error there, %": "0.75",
+        "normals there, °": "1.50",
+        "median there, °": "0.25",
+        "shape there, °": "1.25",
+        "shape median there, °": "0.12",
+        "Chamfer, %": "0.125",
+        "accuracy, %": "0.100",
+        "complete, %": "0.140",
+        "F 0.5 %": "97.5",
+        "F 1 %": "99.2",
+    }
+
+
+def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
+    text = markdown(table(FULL, EMPTY, FULL.replace(method="a much longer name", minutes=123.0)))
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len({len(line) for line in lines}) == 1
+    rule = lines[1].split("|")[1:-1]
+    assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 25 + [False]
+    points = [line.index(".", line.index("mug")) for line in (lines[2], lines[4])]
+    assert points[0] == points[1]  # decimal points of one column stand under one another
+
+
+def test_columns_that_no_row_fills_are_left_out():
+    bare = FULL.replace(f_scores=(), chamfer=None, relative_error=math.nan)
+    parts = columns([bare, EMPTY])
+    assert [len(part) for part in parts.values()] == [7, 6, 6, 2]
+    headings = [column.heading for part in parts.values() for column in part]
+    assert "Chamfer, %" not in headings
+    assert "3D error, %" not in headings
+    assert not any(heading.startswith("F ") for heading in headings)
+
+
+def test_thresholds_that_differ_between_rows_have_columns_of_their_own():
+    rows = (FULL, FULL.replace(method="paper", f_scores=((0.25, 50.0), (1.0, 60.0))))
+    first, second = cells(markdown(table(*rows)))
+    assert (first["F 0.25 %"], first["F 0.5 %"], first["F 1 %"]) == (MISSING, "97.5", "99.2")
+    assert (second["F 0.25 %"], second["F 0.5 %"], second["F 1 %"]) == ("50.0", MISSING, "60.0")
+
+
+def test_nothing_in_a_name_or_a_note_breaks_the_table():
+    odd = BenchRow(
+        scene="a|b", method="x\ny", minutes=1.0, note="failed: one | two\nIts last lines:"
+    )
+    (row,) = cells(markdown(table(odd)))
+    assert row["scene"] == "a\\|b"
+    assert row["method"] == "x y"
+    assert row["note"] == "failed: one \\| two"
+    long = BenchRow(scene="mug", method="m", minutes=1.0, note="word " * 50)
+    assert len(cells(markdown(table(long)))[0]["note"]) <= 60
+
+
+def test_published_rows_stand_before_ours_and_are_marked():
+    ours = [FULL, FULL.replace(scene="potatoes"), FULL.replace(method="paper"), FULL]
+    rows = with_published(ours)
+    assert [(row.scene, row.published) for row in rows] == [
+        ("mug", True),
+        ("mug", False),
+        ("mug", False),
+        ("mug", False),
+        ("potatoes", True),
+        ("potatoes", True),
+        ("potatoes", False),
+    ]
+    text = markdown(table(*rows))
+    assert cells(text)[0]["method"] == "PiMPeR †"
+    assert cells(text)[1]["method"] == "default"
+    assert "† As published, on other photographs" in text
+    assert "†" not in markdown(table(FULL))
+
+
+def test_published_figures_are_shown_as_printed_and_agree_with_one_another():
+    shown = {(one["scene"], one["method"]): one for one in cells(markdown(table(*PUBLISHED)))}
+    mug = shown["mug", "PiMPeR †"]
+    assert [mug[name] for name in ("samples, M", "missing, %", "3D error, %")] == [
+        "6.69",
+        "24.7",
+        "7.10",
+    ]
+    assert shown["potatoes", "global-stereo †"]["minutes"] == "1,320.0"  # 22 hours
+    for row in PUBLISHED[:4]:
+        # A triangulation of a disk by n points, 3 at least on its border: Euler's formula.
+        assert row.triangles <= 2 * row.mesh_points - 5
+        # The mug has the fewest points, samples and minutes, and errs least.
+        assert row.samples >= PUBLISHED[0].samples
+        assert row.minutes >= PUBLISHED[0].minutes
+        assert row.relative_error >= PUBLISHED[0].relative_error
+    assert PUBLISHED[4].relative_error > PUBLISHED[3].relative_error  # as the paper claims
+
+
+def test_the_legend_says_where_it_was_measured():
+    text = markdown(table(FULL, seed=3))
+    assert "Scale quick, 2026-11-21T10:00, on Abacus 12, 2 cores, 23 GB; Linux" in text
+    assert "torch 2.13.0; seed 3." in text
+
+
+def printed(shown, width):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(shown)
+    return console.file.getvalue()
+
+
+def test_the_terminal_shows_the_same_cells_in_tables_no_wider_than_it():
+    text = printed(terminal(table(*with_published([FULL]))), 80)
+    assert "…" not in text
+    for word in ("PiMPeR †", "6.69", "24.7", "1,234", "1.23", "0.125", "99.2"):
+        assert word in text
+    assert text.count("default") == 4
+    assert text.count("PiMPeR") == 2  # its distances of surfaces were not published
+
+
+def test_the_terminal_says_in_full_why_figures_are_missing():
+    note = "failed: one\nIts last lines:\n  [red]two[/red] " + "word " * 30
+    odd = EMPTY.replace(method="[b]pmvs[/b]", note=note)
+    text = printed(terminal(table(FULL, odd)), 60)
+    assert "mug, [b]pmvs[/b]: failed: one" in text
+    assert "[red]two[/red]" in text
+    assert text.count("word") == 30
+
+
+def test_json_holds_every_field(tmp_path):
+    before = table(FULL, EMPTY, *PUBLISHED, seed=3, scenes=["mug", "jar"])
+    write_json(before, tmp_path / "bench.json")
+    report = json.loads((tmp_path / "bench.json").read_text())
+    assert report["settings"] == {"seed": 3, "scenes": ["mug", "jar"]}
+    assert [build(BenchRow, row, "row") for row in report["rows"]] == [*before.rows]
+    assert build(Machine, report["machine"], "machine") == MACHINE
+
+
+def test_what_is_no_number_becomes_null_in_json(tmp_path):
+    odd = FULL.replace(minutes=math.nan, chamfer=math.inf)
+    write_json(table(odd), tmp_path / "bench.json")
+    report = json.loads((tmp_path / "bench.json").read_text())
+    assert report["rows"][0]["minutes"] is None
+    assert report["rows"][0]["relative_error"] == 1.234567  # all digits
+    assert report["rows"][0]["chamfer"] is None
+
+
+def test_a_missing_program_is_told_from_a_failure():
+    missing = row_of_failure("mug", "pmvs", MissingProgramError("pmvs2 is not on the PATH"))
+    assert missing.note == "not installed\npmvs2 is not on the PATH"
+    failed = row_of_failure("mug", "paper", ReconstructionError("no facet"), minutes=0.5)
+    assert failed.note == "failed: no facet"
+    assert failed.minutes == 0.5
+    assert row_of_failure("mug", "paper", MemoryError()).note == "failed: MemoryError"
+
+
+def test_this_machine_is_described():
+    machine = this_machine()
+    assert machine.cores == usable_cores()
+    memory_kib = re.search(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())[1]
+    assert machine.memory_gb == pytest.approx(int(memory_kib) / 2**20, abs=0.06)  # one decimal
+    assert f"torch {torch.__version__}" in machine.versions
+    assert machine.python == platform.python_version()
+    assert machine.cpu
+    assert machine.cpu in machine.summary

@@ -1,0 +1,166 @@
+import json
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from pimper_bench.cli import convert
+from pimper_bench.cli.convert import Source, cloud, readers
+from pimper_bench.datasets import read_colmap, read_idr, read_transforms
+from pimper_torch.cli.main import main
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.radiometry import LINEAR, Encoding
+from pimper_torch.records import Mesh, Truth
+
+READERS = {"colmap": read_colmap, "idr": read_idr, "transforms": read_transforms}
+# From a camera with OpenGL's axes to the world: at (1, 2, 3 + number), looking along -z.
+POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A transforms.json set of three photographs of levels that 8 bits hold."""
+    folder = tmp_path / "data"
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(0, 256, (9, 12, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / "images" / f"{number}.png")
+        rotation = np.array(POSE, dtype=float)
+        angle = 0.3 * number
+        rotation[0, [0, 2]], rotation[2, [0, 2]] = (
+            (np.cos(angle), np.sin(angle)),
+            (-np.sin(angle), np.cos(angle)),
+        )
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": rotation.tolist()})
+    lens = {"fl_x": 20, "fl_y": 21, "cx": 6.5, "cy": 4.25}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    return folder
+
+
+@pytest.mark.parametrize("target", READERS)
+def test_a_set_goes_to_every_layout_and_comes_back_the_same(data, tmp_path, capsys, target):
+    out = tmp_path / "out"
+    arguments = ["convert", str(data), "-o", str(out), "--source", "transforms"]
+    assert main([*arguments, "--target", target]) == 0
+    before, after = read_transforms(data), READERS[target](out)
+    assert_close(after.views.images, before.views.images)
+    assert_close(after.cameras.intrinsics, before.cameras.intrinsics)
+    assert_close(after.cameras.cam_from_world, before.cameras.cam_from_world)
+    printed = capsys.readouterr().out
+    assert "3 photographs of 12 x 9 from 3 positions" in printed
+    assert f"as {target}" in printed
+
+
+def test_options_reach_the_reader_and_the_writer(data, tmp_path):
+    (tmp_path / "true.obj").write_text("v 1 2 0\nv 2 2 0\nv 1 3 0\nf 1 2 3\n")
+    out = tmp_path / "out"
+    arguments = ["convert", str(data), "--out", str(out), "--source", "transforms"]
+    options = ["--target", "idr", "--max-size-px", "6", "--mesh", str(tmp_path / "true.obj")]
+    assert main([*arguments, *options]) == 0
+    assert read_idr(out).views.sizes_px.tolist() == [[6, 4]] * 3
+    unit_from_world = torch.linalg.inv(
+        torch.from_numpy(np.load(out / "cameras.npz")["scale_mat_0"])
+    )
+    corner = transform(unit_from_world, torch.tensor([[2.0, 2, 0]]).double())
+    assert_close(float(corner.norm()), 0.9)
+
+
+def test_an_option_that_the_reader_does_not_know_is_refused(data, tmp_path, capsys):
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "transforms"]
+    assert main([*arguments, "--target", "idr", "--light-seed", "0"]) == 2
+    assert "--light-seed: the reader of transforms does not know it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_encoding_of_the_files_reaches_the_reader(data, tmp_path, monkeypatch):
+    arguments = ["convert", "--photographs.saturation", "250", str(data)]
+    arguments += ["-o", str(tmp_path / "out"), "--source", "transforms", "--target", "idr"]
+    assert main([*arguments, "--photographs.response", "linear", "--photographs.black", "2"]) == 0
+    told = Encoding(response="linear", saturation=250.0, black=2.0)
+    assert_close(
+        read_idr(tmp_path / "out").views.images,
+        read_transforms(data, encoding=told).views.images,
+        rtol=0,
+        atol=0.01,  # of 8 bits in sRGB
+    )
+
+
+def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
+    asked = {}
+
+    def stand_in(folder, *, scan, encoding=LINEAR):
+        asked["encoding"] = encoding
+        return read_transforms(data)
+
+    monkeypatch.setattr(convert.datasets, "read_dtu_mvs", stand_in)
+    arguments = ["data", "-o", "out", "--source", "dtu-mvs", "--target", "idr", "--scan", "3"]
+    convert.read(convert.parse([*arguments, "--photographs.response", "2.2"]))
+    assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
+
+
+def test_a_set_of_scans_needs_the_scans_number(data, tmp_path, capsys):
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
+    assert main([*arguments, "--target", "idr"]) == 2
+    assert "--scan with a number" in capsys.readouterr().err
+
+
+def test_another_layout_is_refused_and_nothing_is_written(data, tmp_path, capsys):
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
+    assert main([*arguments, "--target", "idr"]) == 2
+    message = capsys.readouterr().err
+    assert "not the layout of an LLFF set" in message
+    assert "poses_bounds.npy" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_large_cloud_is_thinned_from_end_to_end():
+    points = torch.arange(3 * 250_001).reshape(-1, 3).float()
+    thin = cloud(Truth(points_world=points))
+    assert len(thin) == 100_000
+    assert torch.equal(thin[[0, -1]], points[[0, -1]])
+    mesh = Mesh(vertices_world=points[:5], faces=torch.zeros(0, 3, dtype=torch.long))
+    assert torch.equal(cloud(Truth(points_world=points, mesh=mesh)), points[:5])
+    assert cloud(Truth()) is None
+
+
+def test_every_layout_that_is_offered_has_a_reader():
+    assert set(readers()) == set(get_args(Source))
+
+
+def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
+    photographs = tmp_path / "Rectified" / "scan9"
+    calibration = tmp_path / "Calibration" / "cal18"
+    photographs.mkdir(parents=True)
+    calibration.mkdir(parents=True)
+    for place in (1, 2, 3):
+        for point_light in (0, 3):
+            level = Image.new("RGB", (16, 12), (60 * place, 20, 90 + point_light))
+            level.save(photographs / f"rect_{place:03d}_{point_light}_r5000.png")
+        matrix = np.array([[2000.0, 0, 800, place], [0, 2000, 600, 2], [0, 0, 1, 700]])
+        np.savetxt(calibration / f"pos_{place:03d}.txt", matrix)
+    arguments = ["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
+    assert main([*arguments, "--scan", "9", "--light-seed", "0", "--target", "colmap"]) == 0
+    assert "3 photographs of 16 x 12 from 3 positions, under 2 lights" in capsys.readouterr().out
+    assert read_colmap(tmp_path / "out").views.num_views == 3
+
+
+def test_a_rendered_scene_is_read_without_maps(data, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(
+        convert.datasets, "read_rendered", lambda folder, **options: asked.update(options)
+    )
+    readers()["rendered"](data)
+    assert asked == {"maps": False}
+
+
+def test_a_set_without_cameras_is_not_exported(data, tmp_path, monkeypatch, capsys):
+    bare = read_transforms(data).replace(cameras=None)
+    monkeypatch.setattr(convert.datasets, "read_llff", lambda folder: bare)
+    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
+    assert main([*arguments, "--target", "idr"]) == 2
+    assert "says nothing about its cameras" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,236 @@
+import json
+
+import pytest
+import torch
+from PIL import Image
+
+from pimper_bench.cli.evaluate import named_as
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.cli.main import main
+from pimper_torch.io.meshes import read_mesh, write_ply
+from pimper_torch.io.results import write_result
+from pimper_torch.records import Capture, Estimate, Mesh, Truth, Views
+
+
+def run(*arguments):
+    return main(["evaluate", *map(str, arguments)])
+
+
+def sphere(path, radius, level=3):
+    vertices, faces = icosphere(level)
+    write_ply(Mesh(vertices_world=radius * vertices, faces=faces), path)
+    return path
+
+
+@pytest.fixture
+def ball(tmp_path):
+    return sphere(tmp_path / "ball.ply", 1.0)
+
+
+@pytest.fixture(scope="module")
+def rendering(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered")
+    config = SceneConfig(num_views=3, width=50, height=36, supersample=1)
+    return render_scene(sphere(folder / "ball.ply", 1.0), folder / "out", config, processes=1)
+
+
+def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    assert run(larger, ball, "--samples", 3000) == 0
+    told = capsys.readouterr().out
+    assert "none: the frames are taken for the same" in told
+    # Facets of a ball of 1280 faces lie a little under it.
+    (line,) = [line for line in told.splitlines() if line.split()[:1] == ["accuracy"]]
+    assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
+    assert "rays" not in told
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_how_near_a_result_comes_to_photographs_is_told(ball, reconstruction, tmp_path, capsys):
+    write_result(reconstruction, CoarseToFineConfig(), tmp_path / "result")
+    out = tmp_path / "report.json"
+    assert run(tmp_path / "result", ball, "--samples", 3000, "-o", out) == 0
+    told = capsys.readouterr().out
+    figures = json.loads(out.read_text())["relighting"]
+    assert "photographs used" in told
+    assert f"{figures['psnr_db']:.2f} dB" in told
+    assert f"{figures['psnr_matte_db']:.2f} dB" in told
+    assert "mean over 3 photographs" in told
+    assert figures["materials"][0]["vertices"] == 1
+
+
+def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsys):
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    out = tmp_path / "report.json"
+    options = ["--alignment", "icp", "--trimmed-fraction", 0.1]
+    assert run(larger, ball, "--samples", 3000, *options, "-o", out) == 0
+    told = capsys.readouterr().out
+    assert "similarity ICP, point to plane, 10 % of the estimate trimmed, from identity" in told
+    assert str(out) in told
+    report = json.loads(out.read_text())
+    assert report["alignment"]["scale"] == pytest.approx(1 / 1.1, rel=5e-3)
+    assert report["surface"]["accuracy"]["mean"] < 5e-3
+    assert report["settings"]["alignment"] == "icp"
+    assert report["truth"] == str(ball)
+
+
+def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
+    result = rendering / "truth" / "mesh.ply"
+    assert run(result, rendering, "--samples", 3000, "--thresholds-percent", 0.1, 2) == 0
+    told = capsys.readouterr().out
+    assert "f_score at 0.1 %" in told
+    assert "f_score at 2 %" in told
+    assert "along the rays of view_001.png" in told  # the centre one
+    assert "100.0 %" in told
+    assert "seen from 3 positions" in told
+
+
+def test_expected_error_is_compared_with_the_true_one(ball, tmp_path):
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    out = tmp_path / "report.json"
+    mesh = read_mesh(larger)
+    told = mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2]))
+    write_ply(told, larger)
+    assert run(larger, ball, "--samples", 3000, "-o", out) == 0
+    found = json.loads(out.read_text())["surface"]["calibration"]
+    assert len(found["bins"]) == 10
+    assert found["ratio"] == pytest.approx(0.1 / 0.1 / 0.6745, rel=0.1)
+
+
+def test_only_what_evaluate_wrote_is_replaced_and_only_on_demand(ball, tmp_path, capsys):
+    mesh = read_mesh(ball)
+    write_ply(mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2])), ball)
+    out = tmp_path / "report.json"
+    larger = sphere(tmp_path / "larger.ply", 1.1)
+    both = ["-o", out, "--samples"]
+    assert run(ball, larger, *both, 3000) == 0
+    first = out.read_bytes()
+    capsys.readouterr()
+    assert run(ball, larger, *both, 2000) == 2
+    assert f"{out}: is there already" in capsys.readouterr().err
+    assert out.read_bytes() == first
+    assert run(ball, larger, "-o", tmp_path / "nowhere" / "one.json") == 2
+    assert "folder is not there" in capsys.readouterr().err
+    assert run(ball, larger, *both, 2000, "--overwrite") == 0
+    assert json.loads(out.read_text())["settings"]["samples"] == 2000
+
+    mine = tmp_path / "mine.json"
+    mine.write_text('{"thesis": "years of work"}')
+    picture = tmp_path / "mine.png"
+    Image.new("L", (3, 3)).save(picture)
+    (tmp_path / "link").symlink_to(mine)
+    for option, path in (
+        ("-o", mine),
+        ("-o", ball),
+        ("-o", tmp_path / "link"),
+        ("-o", picture),
+        ("--report", out),
+    ):
+        before = path.read_bytes()
+        assert run(ball, larger, option, path, "--overwrite") == 2
+        assert "was not written by this command" in capsys.readouterr().err
+        assert path.read_bytes() == before
+    assert run(ball, larger, "-o", "/dev/null", "--overwrite") == 2
+    assert "is no ordinary file" in capsys.readouterr().err
+    assert run(ball, larger, "-o", tmp_path / ("x" * 300)) == 2
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_a_disk_that_is_full_leaves_the_former_report(ball, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "report.json"
+    assert run(ball, ball, "--samples", 500, "-o", out) == 0
+    before = out.read_bytes()
+
+    def full(path, *_, **__):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(out), "write_text", full)
+    assert run(ball, ball, "--samples", 600, "-o", out, "--overwrite") == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "report.json"]
+
+
+def test_views_may_be_named(rendering, tmp_path, capsys):
+    result, out = rendering / "truth" / "mesh.ply", tmp_path / "report.json"
+    views = ["--views", "view_000.png", "view_002"]
+    assert run(result, rendering, "--samples", 3000, "-o", out, *views) == 0
+    names = [view["name"] for view in json.loads(out.read_text())["views"]]
+    assert names == ["view_000.png", "view_002.png"]
+    capsys.readouterr()
+    assert run(result, rendering, "--samples", 3000, "--views", "nobody") == 2
+    assert "no view 'nobody'" in capsys.readouterr().err
+
+
+def test_what_each_figure_says_stands_beside_it_where_there_is_room(ball, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run(ball, ball, "--samples", 500) == 0
+    (wide,) = [line for line in capsys.readouterr().out.splitlines() if "chamfer_mean" in line]
+    assert wide.endswith("mean of mean accuracy and mean completeness")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(ball, ball, "--samples", 500) == 0
+    (narrow,) = [line for line in capsys.readouterr().out.splitlines() if "chamfer_mean" in line]
+    assert "mean of" not in narrow
+
+
+def test_a_result_is_judged_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
+    result, out = sphere(tmp_path / "result.ply", 10.5, level=4), tmp_path / "report.json"
+    options = ["--truth-layout", "dtu-mvs", "--scan", 9, "--samples", 3000, "-o", out]
+    assert run(result, dtu, *options) == 0
+    report = json.loads(out.read_text())["dtu"]
+    assert report["mean_completeness"] == pytest.approx(0.5, rel=0.1)
+    assert report["overall"] == pytest.approx(
+        (report["mean_accuracy"] + report["mean_completeness"]) / 2
+    )
+    assert "thinned to 0.2 mm" in capsys.readouterr().out
+    assert run(result, dtu, "--truth-layout", "dtu-mvs") == 2
+    assert "--scan" in capsys.readouterr().err
+
+
+def test_views_of_a_set_are_paired_by_position_whatever_their_light():
+    names = ("rect_001_0_r5000.png", "rect_002_0_r5000.png", "rect_003_0_r5000.png")
+    count = torch.arange(3)
+    capture = Capture(
+        views=Views(
+            images=torch.zeros(3, 1, 1, 1),
+            sizes_px=torch.ones(3, 2, dtype=torch.long),
+            names=names,
+            focals_px=torch.zeros(3),
+        ),
+        cameras=None,
+        truth=Truth(),
+        position=count,
+        light=count,
+    )
+    mesh = Mesh(vertices_world=torch.zeros(1, 3), faces=torch.zeros(0, 3, dtype=torch.long))
+    mine = ("rect_003_5_r5000.png", "rect_001_2_r5000.png", "rect_001_6_r5000.png")
+    found = named_as(capture, Estimate(mesh=mesh, names=mine))
+    assert found.views.names == (*names[:2], "rect_003_5_r5000.png")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--alignment", "cameras"], "needed: two at least"),
+        (["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
+        (["-o", "."], "is a folder"),
+        (["-o", "nowhere/report.json"], "its folder is not there"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_a_sentence(ball, capsys, options, words):
+    assert run(ball, ball, *options) == 2
+    assert words in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_truth_that_is_none_is_told(ball, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert run(ball, tmp_path / "empty") == 2
+    assert "a folder without truth/ in it" in capsys.readouterr().err
+    assert run(tmp_path / "empty", ball) == 2
+    assert "holds no mesh.ply" in capsys.readouterr().err
+    assert run(ball, tmp_path / "away.ply") == 2
+    assert "found nothing" in capsys.readouterr().err

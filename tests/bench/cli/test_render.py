@@ -1,0 +1,73 @@
+import json
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.cli.main import main
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.records import Mesh
+
+
+@pytest.fixture
+def ball(tmp_path):
+    vertices, faces = icosphere(2)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
+    return tmp_path / "ball.ply"
+
+
+def render(scene, out, *options):
+    small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
+    return main(["render", str(scene), "-o", str(out), *small, *options])
+
+
+def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
+    options = ("--path", "turntable", "--bits", "16", "--encoding", "linear", "--seed", "4")
+    assert render(ball, tmp_path / "out", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["path"] == "turntable"
+    assert settings["bits"] == 16
+    assert settings["seed"] == 4
+    assert settings["point_light_distance"] == 2.5
+    told = capsys.readouterr()
+    assert f"{tmp_path}/out/photos" in told.out
+    assert "--photographs.response linear" in told.out
+    assert "photographs 2" in told.err
+
+
+def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_object_turns(
+    ball, tmp_path, capsys
+):
+    options = ("--fixed-point-light", "--fixed-room", "--fixed-table")
+    assert render(ball, tmp_path / "out", *options) == 2
+    assert "fixed_point_light is True; needed: path turntable" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
+
+
+def test_an_object_is_turned_over_on_demand_and_not_before_a_room(ball, tmp_path, capsys):
+    turned = ("--turned-over", "--path", "turntable", "--num-views", "2")
+    assert render(ball, tmp_path / "out", "--fixed-room", *turned) == 2
+    assert "turned_over is True; needed: 2 views or more" in capsys.readouterr().err
+    assert render(ball, tmp_path / "out", *turned) == 0
+    capture = read_rendered(tmp_path / "out")
+    assert capture.truth.surroundings is None  # elsewhere in the second half
+    below = capture.cameras.centers_world[:, 2] < capture.truth.mesh.vertices_world[:, 2].mean()
+    assert below.tolist() == [False, True]
+
+
+def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_path):
+    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
+    assert render(ball, tmp_path / "out", "--constant-light", *options) == 0
+    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
+    assert settings["albedo"] == [0.6, 0.5, 0.4]
+    assert settings["table"] == "patterned"
+    lights = json.loads((tmp_path / "out" / "truth" / "lights.json").read_text())
+    assert len({tuple(position) for position in lights["positions_world"]}) == 1
+    assert settings["rotation_deg"] == 30
+    capture = read_rendered(tmp_path / "out")
+    seen = capture.truth.albedo[capture.truth.foreground]
+    assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16

@@ -1,0 +1,144 @@
+from pathlib import Path
+
+import kornia_rs.io
+import numpy as np
+import pytest
+import scipy.io
+import torch
+from PIL import Image
+
+from pimper_bench.datasets import posed
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import rigid
+from pimper_torch.radiometry import linear_from_srgb
+from pimper_torch.records import Cameras, Capture, Truth, Views
+from pimper_torch.sfm.colmap import distort
+from pimper_torch.sfm.undistort import undistort
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(12)
+
+
+@pytest.fixture
+def paint():
+    """Write a photograph of one level with a brighter top-left quarter."""
+
+    def write(path: Path, level: int, width: int = 16, height: int = 12, mode: str = "RGB") -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.full((height, width, 3), level, dtype=np.uint8)
+        pixels[: height // 2, : width // 2] += 20
+        Image.fromarray(pixels).convert(mode).save(path)
+
+    return write
+
+
+@pytest.fixture
+def paint_deep():
+    """Write a 16-bit PNG of one colour, or of colours pixel by pixel."""
+
+    def write(path: Path, levels: object, width: int, height: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.broadcast_to(np.asarray(levels, dtype=np.uint16), (height, width, 3))
+        kornia_rs.io.write_image_png_u16(str(path), np.ascontiguousarray(pixels), "rgb")
+
+    return write
+
+
+@pytest.fixture
+def rig():
+    """Three cameras round the origin, for photographs of 1600 x 1200."""
+    return arc_cameras(3, width=1600, height=1200, focal_px=2900.0, distance=0.7)
+
+
+@pytest.fixture
+def save_calibration(rig):
+    """Save the rig as Bouguet's toolbox does: pixel centres from 0."""
+
+    def save(path: Path, **more: object) -> None:
+        K, pose = rig.intrinsics[0].numpy(), rig.cam_from_world.numpy()
+        arrays = {"fc": K[[0, 1], [0, 1]][:, None], "cc": K[:2, 2:] - 0.5} | more
+        for view in range(3):
+            arrays[f"Rc_{view + 1}"] = pose[view, :3, :3]
+            arrays[f"Tc_{view + 1}"] = pose[view, :3, 3:]
+        scipy.io.savemat(path, arrays)
+
+    return save
+
+
+@pytest.fixture
+def hand_camera():
+    """``cam_from_world`` of a camera at (-4, 2, 3) that looks along the world's x.
+
+    Its right is the world's y, its down the world's z. The point (6, 3, 5) is 1 to the right,
+    2 down and 10 ahead; no two of these numbers are alike, so that no axis may be swapped.
+    """
+    rows = [[0.0, 1, 0, -2], [0, 0, 1, -3], [1, 0, 0, 4], [0, 0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@pytest.fixture
+def sees():
+    """Tell where a view of a capture sees the point (6, 3, 5)."""
+
+    def pixel(capture, view: int = 0) -> list[float]:
+        point = torch.tensor([[6.0, 3.0, 5.0]], dtype=torch.float64)
+        cameras = capture.cameras
+        pixels, depth = project(point, cameras.cam_from_world[view], cameras.intrinsics[view])
+        assert depth.tolist() == pytest.approx([10])
+        return pixels[0].tolist()
+
+    return pixel
+
+
+@pytest.fixture
+def capture(hand_camera, generator):
+    """Two photographs of unlike sizes with masks, taken by unlike pinholes, levels of 8 bits."""
+    rotation = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]], dtype=torch.float64)
+    )
+    other = rigid(rotation @ hand_camera[:3, :3], torch.tensor([0.3, -0.4, 9.0]).double())
+    K = [[[20.0, 0, 7], [0, 30, 5], [0, 0, 1]], [[21.0, 0, 6.25], [0, 19, 4.5], [0, 0, 1]]]
+    sizes = torch.tensor([[16, 12], [13, 9]])
+    images = linear_from_srgb(torch.randint(256, (2, 3, 12, 16), generator=generator) / 255)
+    masks = torch.rand(2, 12, 16, generator=generator) > 0.4
+    views = Views(
+        images=images,
+        sizes_px=sizes,
+        names=("first.jpg", "side/second.tif"),
+        masks=masks,
+        focals_px=torch.full((2,), torch.nan),
+    )
+    inside = views.inside
+    return Capture(
+        views=views.replace(images=images * inside[:, None], masks=masks & inside),
+        cameras=Cameras(
+            intrinsics=torch.tensor(K, dtype=torch.float64),
+            cam_from_world=torch.stack([hand_camera, other]),
+            sizes_px=sizes,
+        ),
+        truth=Truth(),
+        position=torch.arange(2),
+        light=torch.arange(2),
+    )
+
+
+@pytest.fixture
+def lens_of(monkeypatch):
+    """Tell where the first lens that a reader finds images the direction (x, y, 1)."""
+
+    def pixel(read, folder, x: float, y: float) -> list[float]:
+        found = []
+
+        def spy(views, lenses):
+            found.extend(lenses)
+            return undistort(views, lenses)
+
+        monkeypatch.setattr(posed, "undistort", spy)
+        read(folder)
+        ray = torch.tensor([[x, y, 1.0]], dtype=torch.float64)
+        return distort(found[0], ray)[0].tolist()
+
+    return pixel

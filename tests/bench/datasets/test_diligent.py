@@ -1,0 +1,222 @@
+import numpy as np
+import pytest
+import scipy.io
+import torch
+from one_viewpoint import read_normal_map, read_uw_ps, read_yale_b
+from PIL import Image
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.projection import project
+
+WIDTH, HEIGHT = 20, 16
+# In the sets' axes (x right, y up, z to the viewer): from the right, from above, head on.
+DIRECTIONS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]])
+INTENSITIES = np.array([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0], [3.0, 2.0, 1.0]])
+
+
+@pytest.fixture
+def viewpoint(paint_deep):
+    """Write one viewpoint as DiLiGenT has it; its normals look half up."""
+
+    def write(folder, *, named: bool = True) -> None:
+        names = [f"{point_light:03d}.png" for point_light in (1, 2, 3)]
+        for point_light, name in enumerate(names, start=1):
+            paint_deep(folder / name, (6000 * point_light, 3000 * point_light, 1000), WIDTH, HEIGHT)
+        if named:
+            (folder / "filenames.txt").write_text("\n".join(names) + "\n")
+        np.savetxt(folder / "light_directions.txt", DIRECTIONS)
+        np.savetxt(folder / "light_intensities.txt", INTENSITIES)
+        mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        mask[4:12, 5:15] = 255
+        Image.fromarray(mask).save(folder / "mask.png")
+        normals = np.zeros((HEIGHT, WIDTH, 3))
+        normals[mask > 0] = [0.0, 0.6, 0.8]
+        scipy.io.savemat(folder / "Normal_gt.mat", {"Normal_gt": normals})
+
+    return write
+
+
+@pytest.fixture
+def turntable(tmp_path, rig, viewpoint):
+    """Write an object of DiLiGenT-MV whose published rotations are a little stretched."""
+    arrays = {"KK": rig.intrinsics[0].numpy().copy()}
+    arrays["KK"][:2, 2] -= 0.5
+    for view in (1, 2, 3):
+        viewpoint(tmp_path / f"view_{view:02d}", named=view != 2)
+        pose = rig.cam_from_world[view - 1].numpy()
+        arrays[f"Rc_{view}"] = np.diag([1.003458, 1, 1]) @ pose[:3, :3]
+        arrays[f"Tc_{view}"] = pose[:3, 3:]
+    scipy.io.savemat(tmp_path / "Calib_Results.mat", arrays)
+    return tmp_path
+
+
+def test_views_and_lights_are_told_apart_and_points_project_as_the_files_say(turntable, rig):
+    capture = read_diligent_mv(turntable)
+    assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert capture.light.tolist() == [1, 2, 3] * 3
+    assert capture.views.names[3] == "view_02/001.png"
+    assert_close(
+        capture.views.images[4, :, 0, 0], torch.tensor([12000.0, 6000, 1000]) / 65535
+    )  # linear, at full depth
+    point = torch.tensor([[0.03, -0.02, 0.05]], dtype=torch.float64)
+    stretch = torch.diag(torch.tensor([1.003458, 1, 1], dtype=torch.float64))
+    pose = rig.cam_from_world[1]
+    image = rig.intrinsics[0] @ (stretch @ pose[:3, :3] @ point[0] + pose[:3, 3])
+    found, depth = project(
+        point.float(), capture.cameras.cam_from_world[3], capture.cameras.intrinsics[3]
+    )
+    assert_close(found[0], (image[:2] / image[2]).float(), atol=2e-3, rtol=0)
+    assert (depth > 0).all()
+    rotation = capture.cameras.cam_from_world[:, :3, :3]
+    assert_close(rotation @ rotation.mT, torch.eye(3).expand(9, 3, 3))
+
+
+def test_lights_and_normals_are_turned_into_the_world(turntable, rig):
+    capture = read_diligent_mv(turntable, positions=[3])
+    lights = capture.truth.lights_world
+    toward_camera = normalize(rig.centers_world[2].float(), dim=0)
+    # Light 3 comes from the camera, light 2 from above it: up is -y in our camera.
+    assert_close(normalize(lights[2, 1:], dim=0), toward_camera, atol=0.01, rtol=0)
+    up = -rig.cam_from_world[2, 1, :3].float()
+    assert_close(lights[1, 1:] @ up, torch.tensor(0.6), atol=0.01, rtol=0)
+    right = rig.cam_from_world[2, 0, :3].float()
+    assert_close(normalize(lights[0, 1:], dim=0) @ right, torch.tensor(0.6), atol=0.01, rtol=0)
+    assert_close(lights[:, 1:].norm(dim=1), torch.tensor([3.5 / 3, 1.0, 2.0]))
+    normal = capture.truth.normals_world[0, 8, 8]
+    assert_close(normal @ up, torch.tensor(0.6), atol=0.01, rtol=0)
+    assert_close(normal @ toward_camera, torch.tensor(0.8), atol=0.01, rtol=0)
+    assert capture.truth.normals_world[0, 0, 0].tolist() == [0, 0, 0]
+    assert capture.views.masks[0].sum() == 80
+
+
+def test_one_light_a_view_shrunk(turntable):
+    capture = read_diligent_mv(turntable, light_seed=2, max_size_px=10)
+    assert capture.position.tolist() == [1, 2, 3]
+    assert sorted(capture.light.tolist()) == [1, 2, 3]
+    assert capture.truth.normals_world.shape == (3, 8, 10, 3)
+    assert capture.views.masks.shape == (3, 8, 10)
+    full = read_diligent_mv(turntable, light_seed=2).cameras.intrinsics
+    assert_close(2 * capture.cameras.intrinsics[:, :2], full[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda folder: (folder / "view_02" / "mask.png").unlink(), r"mask\.png: there is no"),
+        (
+            lambda folder: (folder / "view_02" / "light_directions.txt").write_text("1 0 0\n"),
+            r"view_02: .*Found: 1, 1 and 3",
+        ),
+        (
+            lambda folder: (folder / "view_01" / "filenames.txt").write_text(
+                "../a 002.png 003.png"
+            ),
+            r"'\.\./a', which leads out of it",
+        ),
+        (lambda folder: (folder / "Calib_Results.mat").unlink(), r"Calib_Results\.mat"),
+        (
+            lambda folder: [path.rename(folder / path.name[5:]) for path in folder.glob("view_*")],
+            r"view_01, view_02.*Found: 01, 02, 03",
+        ),
+    ],
+)
+def test_another_layout_is_refused_by_what_was_expected_and_found(turntable, break_it, message):
+    break_it(turntable)
+    with pytest.raises(InputError, match=message):
+        read_diligent_mv(turntable)
+
+
+def test_a_single_viewpoint_is_read_in_its_cameras_frame(tmp_path, viewpoint):
+    viewpoint(tmp_path / "ballPNG")
+    capture = read_diligent(tmp_path / "ballPNG")
+    assert capture.cameras is None
+    assert capture.light.tolist() == [1, 2, 3]
+    assert capture.position.tolist() == [1, 1, 1]
+    # From the right, from above, from the viewer: x right, y down, z forward.
+    directions = normalize(capture.truth.lights_world[:, 1:], dim=1)
+    assert_close(directions, torch.tensor([[0.6, 0, -0.8], [0, -0.6, -0.8], [0, 0, -1]]))
+    assert_close(capture.truth.normals_world[2, 8, 8], torch.tensor([0, -0.6, -0.8]))
+    assert read_diligent(tmp_path / "ballPNG", lights=[2, 3]).light.tolist() == [2, 3]
+
+
+def test_normals_kept_as_colours_serve_when_there_is_no_matlab_file(
+    tmp_path, viewpoint, paint_deep
+):
+    viewpoint(tmp_path)
+    (tmp_path / "Normal_gt.mat").unlink()
+    levels = [round((component + 1) / 2 * 65535) for component in (0.0, 0.6, 0.8)]
+    paint_deep(tmp_path / "Normal_gt.png", levels, WIDTH, HEIGHT)
+    normals = read_diligent(tmp_path).truth.normals_world
+    assert_close(normals[0, 8, 8], torch.tensor([0, -0.6, -0.8]), atol=1e-4, rtol=0)
+
+
+def test_a_normal_map_comes_with_its_depth_and_pinhole(tmp_path, paint_deep):
+    levels = [round((component + 1) / 2 * 65535) for component in (0.6, 0.0, 0.8)]
+    paint_deep(tmp_path / "normal_map.png", levels, WIDTH, HEIGHT)
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    mask[2:5] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    found = read_normal_map(tmp_path)
+    assert found.intrinsics is None
+    assert found.depth is None
+    np.savetxt(tmp_path / "K.txt", [[900.0, 0, 9.5], [0, 890, 7.5], [0, 0, 1]])
+    depth = np.full((HEIGHT, WIDTH), np.nan)
+    depth[2:5] = 1500
+    np.savez(tmp_path / "depth_gt.npz", depth_gt=depth)
+    found = read_normal_map(tmp_path)
+    assert found.intrinsics.tolist() == [[900, 0, 10], [0, 890, 8], [0, 0, 1]]  # the very centre
+    assert_close(found.normals[3, 4], torch.tensor([0.6, 0, -0.8]), atol=1e-4, rtol=0)
+    assert found.normals[8].abs().sum() == 0
+    assert found.depth[3, 4] == 1500
+    assert found.depth[8, 4].isposinf()
+
+
+def test_a_depth_file_with_objects_in_it_is_refused(tmp_path, paint_deep):
+    paint_deep(tmp_path / "normal_map.png", (65535, 32768, 32768), WIDTH, HEIGHT)
+    Image.fromarray(np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)).save(tmp_path / "mask.png")
+    np.savez(tmp_path / "depth_gt.npz", depth_gt=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match=r"depth_gt\.npz: cannot be read"):
+        read_normal_map(tmp_path)
+
+
+def test_the_uw_set_is_read_by_its_lists(tmp_path, paint):
+    for number in range(3):
+        paint(tmp_path / "cat" / f"cat.{number}.png", 40 * number + 10)
+    paint(tmp_path / "cat" / "cat.mask.png", 235)
+    names = "\n".join([*(f"cat.{number}.png" for number in range(3)), "cat.mask.png"])
+    (tmp_path / "cat" / "cat.txt").write_text(f"3\n{names}\n")
+    rows = "\n".join(" ".join(str(x) for x in row) for row in DIRECTIONS)
+    (tmp_path / "lights.txt").write_text(f"Header: ../images/chrome/chrome.txt\n3\n{rows}\n")
+    capture = read_uw_ps(tmp_path, "cat")
+    assert capture.views.names == ("cat.0.png", "cat.1.png", "cat.2.png")
+    assert_close(
+        capture.truth.lights_world[:, 1:],
+        torch.tensor([[0.6, 0, -0.8], [0, -0.6, -0.8], [0, 0, -1]]),
+    )
+    with pytest.raises(InputError, match=r"dog/dog\.txt.*Found: cat, lights\.txt"):
+        read_uw_ps(tmp_path, "dog")
+    (tmp_path / "cat" / "cat.txt").write_text("4\n" + names)
+    with pytest.raises(InputError, match=r"'4' and 4 names"):
+        read_uw_ps(tmp_path, "cat")
+
+
+def test_a_yale_face_tells_its_lights_by_name(tmp_path, paint):
+    paint(tmp_path / "yaleB02_P00A+090E+00.pgm", 100, mode="L")
+    paint(tmp_path / "yaleB02_P00A-000E+90.pgm", 60, mode="L")
+    paint(tmp_path / "yaleB02_P00_Ambient.pgm", 10, mode="L")
+    capture = read_yale_b(tmp_path)
+    # Positive azimuth is the left of the image, positive elevation above.
+    assert_close(
+        capture.truth.lights_world[:, 1:],
+        torch.tensor([[-1.0, 0, 0], [0, -1, 0]]),
+        atol=1e-6,
+        rtol=0,
+    )
+    assert_close(capture.views.images[:, 0, -1, -1], torch.tensor([90.0, 50.0]) / 255)
+    kept = read_yale_b(tmp_path, subtract_ambient=False)
+    assert_close(kept.views.images[:, 0, -1, -1], torch.tensor([100.0, 60.0]) / 255)
+    with pytest.raises(InputError, match=r"yaleB02_P00A\+035E-20\.pgm"):
+        read_yale_b(tmp_path / "..")

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+import scipy.io
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.datasets.dtu_sets import read_dtu_points
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.projection import project
+from pimper_torch.io import radiance
+
+
+@pytest.fixture
+def folder(tmp_path, save_calibration, paint):
+    for place in (1, 2, 3):
+        for point_light in (1, 2, 19):
+            paint(
+                tmp_path / "SET004" / f"Img{place:03d}_{point_light:02d}.bmp",
+                40 * place + point_light,
+            )
+    save_calibration(tmp_path / "Calib_Results_11.mat")
+    (tmp_path / "CleanRecon_2009_11_16").mkdir()
+    scipy.io.savemat(
+        tmp_path / "CleanRecon_2009_11_16" / "Clean_Reconstruction_04.mat",
+        {
+            "pts3D_near": np.arange(20.0).reshape(5, 4),
+            "pts3D_far": np.full((5, 2), 7.0),
+        },
+    )
+    return tmp_path
+
+
+def test_all_photographs_come_with_position_point_light_camera_and_scan(folder, rig):
+    capture = read_dtu_points(folder, 4)
+    assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert capture.light.tolist() == [1, 2, 19] * 3
+    assert capture.views.names[4] == "Img002_02.bmp"
+    # Linear: 82 of 255, not what sRGB would make of it.
+    assert_close(capture.views.images[4, :, -1, -1], torch.full((3,), 82 / 255))
+    # Points are columns of both halves, of which only the first three rows are places.
+    points = capture.truth.points_world
+    assert points.shape == (6, 3)
+    assert_close(points[1], torch.tensor([1.0, 5.0, 9.0]))
+    assert_close(points[5], torch.full((3,), 7.0))
+    # The photographs are a hundredth as wide as the calibration's.
+    at = torch.tensor([[0.02, -0.03, 0.01]], dtype=torch.float64)
+    full, _ = project(at, rig.cam_from_world[1], rig.intrinsics[1])
+    small, depth = project(at.float(), *_camera(capture, 4))
+    assert_close(small, (full / 100).float(), atol=1e-4, rtol=0)
+    assert (depth > 0).all()
+
+
+def _camera(capture, view):
+    return capture.cameras.cam_from_world[view], capture.cameras.intrinsics[view]
+
+
+def test_only_the_chosen_photographs_are_decoded(folder, monkeypatch):
+    decoded = []
+    monkeypatch.setattr(
+        radiance,
+        "decode",
+        lambda path, real=radiance.decode: decoded.append(path.name) or real(path),
+    )
+    capture = read_dtu_points(folder, 4, light_seed=5, lights=(1, 2))
+    assert capture.position.tolist() == [1, 2, 3]
+    assert capture.light[0] != capture.light[1] != capture.light[2]
+    assert decoded == list(capture.views.names)
+    assert len(decoded) == 3
+
+
+def test_shrinking_takes_the_cameras_along(folder):
+    full, small = read_dtu_points(folder, 4), read_dtu_points(folder, 4, max_size_px=8)
+    assert small.views.sizes_px[0].tolist() == [8, 6]
+    assert small.cameras.sizes_px[0].tolist() == [8, 6]
+    halved = full.cameras.intrinsics.clone()
+    halved[:, :2] /= 2
+    assert_close(small.cameras.intrinsics, halved)
+
+
+def test_the_calibration_may_bear_the_name_of_the_download(folder):
+    (folder / "Calib_Results_11.mat").rename(folder / "calibrationFile.mat")
+    assert read_dtu_points(folder, 4).cameras.num_views == 9
+
+
+def test_a_scene_without_its_scan_has_no_points(folder):
+    (folder / "CleanRecon_2009_11_16" / "Clean_Reconstruction_04.mat").unlink()
+    assert read_dtu_points(folder, 4).truth.points_world is None
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda folder: (folder / "SET004").rename(folder / "scan4"), r"SET004.*Found: .*scan4"),
+        (lambda folder: (folder / "Calib_Results_11.mat").unlink(), r"calibrationFile\.mat"),
+        (
+            lambda folder: scipy.io.savemat(folder / "Calib_Results_11.mat", {"K": np.eye(3)}),
+            r"variables fc, cc, Rc_1.*Found: variables K",
+        ),
+        (
+            lambda folder: (folder / "Calib_Results_11.mat").write_bytes(b"\x89HDF\r\n"),
+            r"Calib_Results_11\.mat: cannot be read as a MATLAB file",
+        ),
+    ],
+)
+def test_another_layout_is_refused_by_what_was_expected_and_found(folder, break_it, message):
+    break_it(folder)
+    with pytest.raises(InputError, match=message):
+        read_dtu_points(folder, 4)
+
+
+def test_a_calibration_of_the_wrong_shape_is_refused(folder, save_calibration):
+    save_calibration(folder / "Calib_Results_11.mat", KK=np.eye(4))
+    with pytest.raises(InputError, match=r"KK as finite numbers of shape 3 x 3.*4 x 4"):
+        read_dtu_points(folder, 4)

@@ -1,0 +1,154 @@
+import json
+
+import pytest
+import torch
+
+from pimper_bench.metrics import EvaluateConfig, evaluate, report, rows
+from pimper_bench.metrics.evaluation import chosen_views
+from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.geometry.rigid import rigid
+from pimper_torch.records import Estimate, Truth
+
+FEW = {"samples": 3000}
+
+
+@pytest.fixture
+def parts(make, generator):
+    """A sphere with cameras and lights, and its own copy in another frame of half the size."""
+    truth, cameras = make.sphere(level=4), make.cameras()
+    lights = torch.randn(5, 4, generator=generator, dtype=torch.float64)
+    rotation = make.rotation(generator)
+    shift = torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64)
+    rotated = lights.clone()
+    rotated[:, 1:] = lights[:, 1:] @ rotation.mT
+    estimate = Estimate(
+        mesh=make.moved(truth, rigid(0.5 * rotation, shift)).replace(
+            normals_world=truth.vertices_world @ rotation.mT
+        ),
+        names=tuple(f"view_{index}.png" for index in (4, 2, 0)),
+        cameras=make.transferred(cameras, 0.5, rotation, shift).take([4, 2, 0]),
+        lights_world=rotated[[4, 2, 0]],
+        reference="view_2.png",
+    )
+    return estimate, make.capture(Truth(mesh=truth, lights_world=lights), cameras=cameras)
+
+
+def test_a_copy_in_another_frame_has_no_error_anywhere(parts):
+    found = evaluate(*parts, EvaluateConfig(**FEW))
+    assert found.alignment.method == "cameras"
+    assert found.alignment.scale == pytest.approx(2)
+    assert found.surface.accuracy.mean < 1e-10
+    assert found.surface.whole.completeness.mean < 1e-10
+    assert found.surface.whole.thresholds[0].f_score == 1
+    (view,) = found.views
+    assert view.name == "view_2.png"
+    assert view.relative_error < 1e-3
+    assert view.transferred_normals.mean_deg < 0.5  # facets of the truth's shape
+    assert view.shape_normals.mean_deg < 0.1
+    assert found.lights.mean_deg < 1e-5
+    assert found.lights.lights == 3
+    assert found.cameras.missing == 2
+    assert found.cameras.mean_center < 1e-9
+    assert found.cameras.mean_center_percent == pytest.approx(0, abs=1e-6)
+    assert found.dtu is None
+
+
+def test_without_alignment_the_frames_are_taken_as_they_are(parts):
+    estimate, capture = parts
+    config = EvaluateConfig(alignment="none", **FEW)
+    with pytest.raises(InputError, match="Check the frame"):
+        evaluate(estimate, capture, config)
+    blind = capture.replace(cameras=None)
+    found = evaluate(estimate, blind, config)
+    assert found.alignment.method == "none"
+    assert found.surface.accuracy.mean > 1
+    assert found.views == ()
+    assert found.cameras is None
+
+
+def test_a_truth_without_a_surface_still_judges_cameras_and_lights(parts):
+    estimate, capture = parts
+    bare = capture.replace(truth=Truth(lights_world=capture.truth.lights_world))
+    found = evaluate(estimate, bare, EvaluateConfig(**FEW))
+    assert found.surface is None
+    assert found.views == ()
+    assert found.lights.mean_deg < 1e-5
+    assert found.cameras.missing == 2
+
+
+def test_a_mesh_alone_is_judged_by_its_surface_and_the_centre_view(parts, make):
+    _, capture = parts
+    found = evaluate(Estimate(mesh=make.sphere(1.1, level=4)), capture, EvaluateConfig(**FEW))
+    assert found.alignment.method == "none"
+    assert found.surface.accuracy.mean == pytest.approx(0.1, rel=0.02)
+    assert [view.name for view in found.views] == ["view_2.png"]
+    assert found.lights is None
+    assert found.cameras is None
+
+
+def test_views_are_chosen_by_name_whatever_their_suffix(parts):
+    estimate, capture = parts
+    config = EvaluateConfig(views=("view_4.jpg", "view_1.png", "view_4.png"))
+    assert chosen_views(estimate, capture, config) == (4, 1)
+    assert chosen_views(estimate.replace(reference="other.png"), capture, EvaluateConfig()) == (2,)
+    with pytest.raises(InputError, match=r"no view 'nobody.png' in the truth; it has view_0.png"):
+        chosen_views(estimate, capture, EvaluateConfig(views=("nobody.png",)))
+
+
+def test_the_same_seed_gives_the_same_figures(parts):
+    one, same, other = (
+        report(evaluate(*parts, EvaluateConfig(alignment="icp", seed=seed, **FEW)))
+        for seed in (3, 3, 4)
+    )
+    assert one == same
+    assert one != other
+
+
+def test_maps_of_a_few_views_may_come_apart_from_the_rest(parts):
+    estimate, capture = parts
+    only = capture.replace(
+        views=capture.views.take([2]),
+        cameras=capture.cameras.take([2]),
+        truth=Truth(mesh=capture.truth.mesh),
+    )
+    found = evaluate(estimate, capture, EvaluateConfig(**FEW), maps=only)
+    assert [view.name for view in found.views] == ["view_2.png"]
+    assert found.cameras.views == 5
+
+
+def test_the_account_is_json_that_says_everything(parts):
+    plain = report(evaluate(*parts, EvaluateConfig(**FEW)))
+    again = json.loads(json.dumps(plain, allow_nan=False))
+    assert again == plain
+    assert plain["alignment"]["method"] == "cameras"
+    assert plain["surface"]["whole"]["thresholds"][0]["threshold_percent"] == 0.25
+    assert plain["dtu"] is None
+
+
+def test_what_is_not_finite_is_null(parts):
+    estimate, capture = parts
+    bare = capture.replace(truth=Truth())
+    plain = report(evaluate(estimate, bare, EvaluateConfig(**FEW)))
+    assert plain["cameras"]["mean_center_percent"] is None
+
+
+def test_every_row_has_a_unit_and_a_meaning(parts):
+    sections = rows(evaluate(*parts, EvaluateConfig(**FEW)))
+    assert [title for title, _ in sections] == [
+        "alignment",
+        "surface",
+        "along the rays of view_2.png",
+        "lights",
+        "cameras",
+    ]
+    said = {row.name: row for _, found in sections for row in found}
+    assert said["method"].meaning == "similarity on 3 cameras"
+    assert said["chamfer_mean"].meaning.startswith("mean of mean accuracy")
+    assert said["chamfer_sum"].meaning.startswith("sum of mean accuracy")
+    assert said["missing"].value == "2 of 5"
+    assert all(row.meaning for row in said.values())
+
+
+def test_evaluate_config_refuses_a_threshold_of_nothing():
+    with pytest.raises(ConfigError, match="thresholds_percent"):
+        EvaluateConfig(thresholds_percent=(0.5, 0.0))

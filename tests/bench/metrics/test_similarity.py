@@ -1,0 +1,114 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.metrics import (
+    pair_views,
+    similarity_between_cameras,
+    similarity_between_points,
+)
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_torch.errors import InputError
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.records import Cameras
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(81)
+
+
+def random_rotation(generator):
+    Q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    return Q * torch.linalg.det(Q)
+
+
+def transferred(cameras: Cameras, target_from_source, scale, rotation) -> Cameras:
+    centers = transform(target_from_source, cameras.centers_world)
+    rotated = cameras.cam_from_world[:, :3, :3] @ rotation.mT
+    return cameras.replace(cam_from_world=rigid(rotated, -(rotated @ centers[..., None])[..., 0]))
+
+
+def test_points_transferred_by_a_similarity_are_transferred_back(generator):
+    rotation = random_rotation(generator)
+    known = rigid(2.5 * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
+    points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    assert_close(similarity_between_points(points, transform(known, points)), known)
+
+
+def test_no_other_similarity_brings_noisy_points_nearer(generator):
+    points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    target = 1.5 * points + 0.3 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    best = similarity_between_points(points, target)
+
+    def cost(matrix):
+        return (transform(matrix, points) - target).square().sum()
+
+    for _ in range(200):
+        twist = 1e-3 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+        change = torch.linalg.matrix_exp(twist - twist.mT)
+        change = change * (1 + 1e-3 * torch.randn(1, generator=generator, dtype=torch.float64))
+        shift = 1e-3 * torch.randn(3, generator=generator, dtype=torch.float64)
+        assert cost(rigid(change, shift) @ best) > cost(best)
+
+
+def test_mirrored_points_still_get_a_rotation(generator):
+    points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    found = similarity_between_points(points, points * points.new_tensor([1, 1, -1]))
+    assert torch.linalg.det(found[:3, :3]) > 0
+
+
+@pytest.mark.parametrize("num_views", [2, 3, 12])
+def test_cameras_on_an_arc_are_transferred_back_however_few_they_are(generator, num_views):
+    truth = arc_cameras(num_views, width=64, height=48, focal_px=70.0, distance=4.0, sway_deg=0.0)
+    rotation = random_rotation(generator)
+    known = rigid(0.2 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
+    ours = transferred(truth, known, 0.2, rotation)
+    found = similarity_between_cameras(ours, truth)
+    assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
+
+
+def test_cameras_in_a_row_leave_no_rotation_open(generator):
+    eyes = torch.stack([torch.tensor([x, 0.0, 5.0]).double() for x in (-1.0, 0.0, 1.0)])
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    truth = pinholes(look_at(eyes, torch.zeros(3, dtype=torch.float64), up), 70.0, 64, 48)
+    rotation = random_rotation(generator)
+    known = rigid(3.0 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
+    found = similarity_between_cameras(transferred(truth, known, 3.0, rotation), truth)
+    assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
+
+
+def test_cameras_in_one_position_do_not_tell_the_scale():
+    arc = arc_cameras(2, width=64, height=48, focal_px=70.0, distance=4.0)
+    same = arc.replace(cam_from_world=arc.cam_from_world[[0, 0]])
+    with pytest.raises(InputError, match="scale"):
+        similarity_between_cameras(same, arc)
+
+
+def test_unequal_numbers_of_cameras_are_refused():
+    two, three = (arc_cameras(n, width=64, height=48, focal_px=70.0, distance=4.0) for n in (2, 3))
+    with pytest.raises(InputError, match="2 cameras and 3 true ones"):
+        similarity_between_cameras(two, three)
+
+
+def test_views_are_paired_by_name():
+    ours, truth = pair_views(["c", "a", "x"], ["a", "b", "c"])
+    assert ours.tolist() == [0, 1]
+    assert truth.tolist() == [2, 0]
+    with pytest.raises(InputError, match="the same names in both"):
+        pair_views(["p"], ["q"])
+
+
+def test_folder_and_suffix_do_not_part_views_of_one_name():
+    ours, truth = pair_views(["raw/07.tif", "08.png", "9.jpg"], ["08.png", "07.png", "9.png"])
+    assert ours.tolist() == [0, 1, 2]
+    assert truth.tolist() == [1, 0, 2]
+
+
+def test_a_stem_that_two_views_share_pairs_nothing():
+    ours, truth = pair_views(["a/1.png", "b/1.png", "c.png"], ["1.jpg", "c.png"])
+    assert ours.tolist() == [2]
+    assert truth.tolist() == [1]
+    ours, truth = pair_views(["1.tif", "1.png"], ["1.png"])  # the same name comes first
+    assert ours.tolist() == [1]

@@ -1,0 +1,240 @@
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.scenes.procedural_meshes import icosphere, join, potato, table
+from pimper_bench.scenes.render_in_memory import (
+    Sphere,
+    render_objects,
+    render_shape,
+)
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import Lights, wandering_lights
+from pimper_bench.scenes.scene_object import SceneObject
+from pimper_bench.scenes.scene_settings import SensorConfig
+from pimper_bench.scenes.textures import random_speckle
+from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.topology import half_edges
+from pimper_torch.records import Mesh
+
+QUIET = SensorConfig(supersample=1, read_noise=0.0, shot_noise=0.0)
+
+
+def white(points):
+    return torch.ones_like(points)
+
+
+def point_light(position, **changes):
+    settings = {
+        "positions_world": torch.tensor([position], dtype=torch.float64),
+        "irradiance": torch.tensor([1.0], dtype=torch.float64),
+        "ambient": torch.tensor([0.0], dtype=torch.float64),
+        "target_world": torch.zeros(3, dtype=torch.float64),
+    }
+    return Lights(**(settings | changes))
+
+
+def above(width=31, height=31):
+    return arc_cameras(1, width=width, height=height, focal_px=60.0, distance=5.0, span_deg=0.0)
+
+
+def ball(center, radius, subdivisions=4):
+    vertices, faces = icosphere(subdivisions)
+    return Mesh(vertices_world=vertices * radius + vertices.new_tensor(center), faces=faces)
+
+
+def test_closed_forms_obey_first_order_lighting_exactly(cameras, generator):
+    lights = torch.rand(3, 4, generator=generator, dtype=torch.float64)
+    scene = render_shape(Sphere(), cameras, lights, random_speckle(generator))
+    harmonics = torch.cat([torch.ones_like(scene.depth)[..., None], scene.normals_world], dim=-1)
+    shading = torch.einsum("vhwc,vc->vhw", harmonics, lights)
+    expected = (scene.albedo * shading.clamp_min(0)[..., None]).movedim(-1, 1)
+    assert_close(scene.views.images, expected.float(), atol=1e-6, rtol=0)
+    assert scene.lit.any()
+    assert_close(scene.lit, scene.foreground & (shading > 0))
+    assert scene.views.images.std() > 0.1
+
+
+def test_depth_times_ray_is_the_surface_in_closed_forms(cameras):
+    lights = torch.zeros(3, 4, dtype=torch.float64)
+    scene = render_shape(Sphere(radius=0.9), cameras, lights, white)
+    pixels = pixel_centers(40, 30, like=cameras.intrinsics).reshape(-1, 2)
+    for view in range(3):
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+        depth = scene.depth[view].reshape(-1)
+        hit = depth.isfinite()
+        points = (cameras.centers_world[view] + depth[:, None] * rays)[hit]
+        assert_close(points.norm(dim=1), torch.full((len(points),), 0.9, dtype=torch.float64))
+        assert_close(points / 0.9, scene.normals_world[view].reshape(-1, 3)[hit])
+        found, along = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+        assert_close(found, pixels[hit])
+        assert_close(along, depth[hit])
+
+
+def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
+    lights = point_light([0.0, 0.0, 2.0])
+    generator = torch.Generator().manual_seed(62)
+    scene = render_objects(
+        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
+    )
+    image = scene.views.images[0, 0]
+    assert_close(image[15, 15], torch.tensor(1.0), atol=1e-4, rtol=0)
+    # A pixel is 5/60 wide on the table; 12 pixels aside, x = 1: cos / d^2 = (2 / d) (2 / d)^2.
+    distance = (1 + 4) ** 0.5
+    assert_close(image[15, 27], torch.tensor((2 / distance) ** 3), atol=1e-4, rtol=0)
+
+
+def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
+    objects = [
+        SceneObject(mesh=table(3.0), texture=white),
+        SceneObject(mesh=ball((1.0, 0.0, 1.0), 0.3), texture=white, surroundings=True),
+    ]
+    # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
+    lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
+    generator = torch.Generator().manual_seed(63)
+    scene = render_objects(objects, above(), lights, generator, QUIET)
+    image = scene.views.images[0, 0]
+    assert not scene.lit[0, 15, 15]
+    assert_close(image[15, 15], torch.tensor(0.1), atol=1e-6, rtol=0)
+    # The cone's half angle is asin(0.3 / sqrt 2), so the shadow ends at x = -1.108; columns 3
+    # and 1 see x = -1 and x = -1.167.
+    assert not scene.lit[0, 15, 3]
+    assert scene.lit[0, 15, 1]
+    assert scene.lit[0, 27, 15]
+    assert scene.foreground[0, 15, 15]
+    assert not scene.foreground[0, 15, 30]  # the ball stands before the table there
+
+
+def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
+    window = torch.tensor([0.3, 0.0, 0.4], dtype=torch.float64)
+    colour = torch.tensor([[1.2, 1.0, 0.8]], dtype=torch.float64)
+    lights = point_light(
+        [0.0, 0.0, 2.0],
+        irradiance=torch.tensor([0.2], dtype=torch.float64),
+        window=window,
+        colour=colour,
+    )
+    generator = torch.Generator().manual_seed(66)
+    scene = render_objects(
+        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
+    )
+    soft = 0.5 * ((1 + 0.8) / 2) ** 2
+    expected = torch.tensor([0.24, 0.2, 0.16]) + soft
+    assert_close(scene.views.images[0, :, 15, 15], expected, atol=1e-4, rtol=0)
+
+
+def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
+    matte = SceneObject(mesh=table(3.0), texture=white)
+    glossy = SceneObject(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)
+    dim = {"irradiance": torch.tensor([0.1], dtype=torch.float64)}
+    difference = []
+    for item in (matte, glossy):
+        generator = torch.Generator().manual_seed(66)
+        scene = render_objects(
+            [item], above(), point_light([2.0, 0.0, 5.0], **dim), generator, QUIET
+        )
+        difference.append(scene.views.images[0, 0])
+    extra = difference[1] - difference[0]
+    assert (extra >= -0.012).all()  # what is mirrored is taken from the matte part
+    # Camera and point light stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
+    row, column = divmod(int(extra.argmax()), 31)
+    assert row == 15
+    assert abs(column - 27) <= 1
+
+
+def test_a_ray_traced_ball_agrees_with_its_closed_form():
+    cameras = arc_cameras(2, width=40, height=30, focal_px=50.0, distance=4.0)
+    generator = torch.Generator().manual_seed(67)
+    far = Lights(
+        positions_world=torch.tensor([[3e3, 0.0, 4e3], [0.0, 3e3, 4e3]], dtype=torch.float64),
+        irradiance=torch.full((2,), 0.7, dtype=torch.float64),
+        ambient=torch.full((2,), 0.1, dtype=torch.float64),
+        target_world=torch.zeros(3, dtype=torch.float64),
+    )
+    texture = random_speckle(generator, cells=(0.5,))
+    traced = render_objects(
+        [SceneObject(mesh=ball((0.0, 0.0, 0.0), 1.0, subdivisions=6), texture=texture)],
+        cameras,
+        far,
+        generator,
+        QUIET,
+    )
+    closed = render_shape(Sphere(), cameras, traced.lights_world, texture)
+    both = traced.foreground & closed.lit & traced.lit
+    assert both.float().mean() > 0.1
+    gap = (traced.views.images - closed.views.images).abs().amax(dim=1)[both]
+    assert gap.max() < 0.03  # facets of 1/60 tilt the surface by as much at the rim
+    assert gap.mean() < 0.002
+    depth = (traced.depth - closed.depth).abs()[both]
+    assert depth.mean() < 1e-3
+    normals = (traced.normals_world - closed.normals_world).norm(dim=-1)[both]
+    assert normals.mean() < 2e-3
+
+
+def test_noise_and_saturation_are_those_of_the_sensor():
+    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.5], dtype=torch.float64))
+    noisy = SensorConfig(supersample=1, read_noise=0.01, shot_noise=0.0)
+    item = SceneObject(mesh=table(3.0), texture=white)
+    generator = torch.Generator().manual_seed(68)
+    image = render_objects([item], above(), lights, generator, noisy).views.images
+    assert abs(image.std() - 0.01) < 0.001
+    again = torch.Generator().manual_seed(68)
+    assert_close(render_objects([item], above(), lights, again, noisy).views.images, image)
+    bright = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([5.0], dtype=torch.float64))
+    assert (render_objects([item], above(), bright, generator, noisy).views.images == 1).all()
+
+
+def test_a_pixel_gathers_the_light_of_its_whole_area():
+    def halves(points):  # black and white meet at x = 0, the centre of the centre pixel
+        return (points[..., :1] > 0).to(points).expand_as(points)
+
+    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8], dtype=torch.float64))
+    sensor = SensorConfig(supersample=4, read_noise=0.0, shot_noise=0.0)
+    generator = torch.Generator().manual_seed(69)
+    item = SceneObject(mesh=table(3.0), texture=halves)
+    image = render_objects([item], above(), lights, generator, sensor).views.images[0, 0, 15]
+    assert_close(image[15], torch.tensor(0.4), atol=2e-3, rtol=0)
+    assert image[14] == 0
+    assert_close(image[16], torch.tensor(0.8), atol=2e-3, rtol=0)
+
+
+def test_point_lights_wander_within_their_cone_and_differ(generator):
+    lights = wandering_lights(12, generator, distance=4.0, toward=(0.0, -1.0, 1.0))
+    toward = lights.positions_world / lights.positions_world.norm(dim=1, keepdim=True)
+    axis = torch.tensor([0.0, -(0.5**0.5), 0.5**0.5], dtype=torch.float64)
+    tilt = torch.rad2deg(torch.acos(toward @ axis))
+    assert (tilt > 15 - 1e-6).all()
+    assert (tilt < 65 + 1e-6).all()
+    assert torch.linalg.svdvals(lights.harmonics_world())[3] > 0.05  # four unlike lights at least
+    distance = lights.positions_world.norm(dim=1)
+    assert (distance >= 3).all()
+    assert (distance <= 5).all()
+
+
+def test_a_potato_is_closed_rests_on_the_table_and_depends_on_its_seed_only():
+    first = potato(torch.Generator().manual_seed(70), subdivisions=3)
+    assert_close(first.vertices_world[:, 2].min(), torch.tensor(0.0, dtype=torch.float64))
+    edges = half_edges(first.faces).sort(dim=1).values
+    assert (torch.unique(edges, dim=0, return_counts=True)[1] == 2).all()
+    centre = first.vertices_world.mean(dim=0)
+    outward = ((first.vertices_world - centre) * first.normals_world).sum(dim=1)
+    assert (outward > 0).all()
+    again = potato(torch.Generator().manual_seed(70), subdivisions=3)
+    assert_close(first.vertices_world, again.vertices_world)
+    other = potato(torch.Generator().manual_seed(71), subdivisions=3)
+    assert (first.vertices_world - other.vertices_world).norm(dim=1).mean() > 0.01
+
+
+def test_joined_meshes_keep_their_triangles():
+    one, two = table(1.0), ball((0.0, 0.0, 2.0), 0.5, subdivisions=1)
+    both = join(one, two)
+    corners = both.vertices_world[both.faces]
+    assert_close(corners[:2], one.vertices_world[one.faces])
+    assert_close(corners[2:], two.vertices_world[two.faces])
+
+
+def test_a_sensor_without_rays_is_refused():
+    with pytest.raises(ConfigError, match="supersample is 0"):
+        SensorConfig(supersample=0)

@@ -1,0 +1,174 @@
+import filecmp
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
+from pimper_bench.scenes.rendered_folder import render_scene, unpack_maps
+from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.scenes.whole_scene import build_scene
+from pimper_torch.errors import ConfigError, OutputError, PimperWarning
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import LINEAR
+from pimper_torch.records import Mesh
+from pimper_torch.sfm.colmap import read_model
+
+SMALL = SceneConfig(num_views=3, width=48, height=36, supersample=1)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    path = tmp_path_factory.mktemp("meshes") / "ball.ply"
+    vertices, faces = icosphere(3)
+    write_ply(Mesh(vertices_world=vertices, faces=faces), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def rendering(ball, tmp_path_factory):
+    return render_scene(ball, tmp_path_factory.mktemp("out") / "scene", SMALL, processes=1)
+
+
+def test_a_rendering_holds_what_it_says(rendering):
+    assert sorted(path.name for path in rendering.iterdir()) == [
+        ".pimper.json",
+        "masks",
+        "photos",
+        "truth",
+    ]
+    truth = {path.name for path in (rendering / "truth").iterdir()}
+    assert truth == {"scene.json", "sparse", "lights.json", "mesh.ply", "surroundings.ply", "maps"}
+    for part, suffix in (("photos", "png"), ("masks", "png"), ("truth/maps", "npz")):
+        held = sorted(path.name for path in (rendering / part).iterdir())
+        assert held == [f"view_{view:03d}.{suffix}" for view in range(3)]
+    report = json.loads((rendering / "truth" / "scene.json").read_text())
+    assert report["settings"]["width"] == 48
+
+
+def test_photographs_and_masks_are_those_of_the_frames(rendering, ball):
+    scene = build_scene(ball, SMALL)
+    views = load_views(rendering / "photos", masks=rendering / "masks")
+    stage = TracedObjects(scene.objects)
+    for view in range(3):
+        frame = render_frame(
+            stage, scene.cameras, scene.lights, view, scene.noise(view), SMALL.sensor
+        )
+        # Half a byte, where sRGB is steepest: 2.4 / 1.055 of it.
+        assert_close(views.images[view], frame.image, atol=0.5 / 255 * 2.4, rtol=0)
+        assert_close(views.masks[view], frame.foreground)
+
+
+def test_deep_linear_photographs_are_read_back_to_the_last_bit(ball, tmp_path):
+    config = SceneConfig(
+        num_views=3, width=32, height=24, bits=16, encoding="linear", supersample=1
+    )
+    render_scene(ball, tmp_path / "deep", config, processes=1)
+    views = load_views(tmp_path / "deep" / "photos", encoding=LINEAR)
+    scene = build_scene(ball, config)
+    frame = render_frame(
+        TracedObjects(scene.objects), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
+    )
+    assert_close(views.images[1], frame.image, atol=0.51 / 65535, rtol=0)
+
+
+def test_true_points_lie_on_the_surface_that_the_maps_show(rendering):
+    model = read_model(rendering / "truth" / "sparse")
+    assert model.names == tuple(f"view_{view:03d}.png" for view in range(3))
+    assert len(model.points_world) > 500
+    center = model.points_world.new_tensor([0.0, 0.0, 1.2])
+    radius = (model.points_world - center).norm(dim=1)
+    assert ((radius < 1.2 + 1e-6) & (radius > 1.2 * 0.99)).all()  # facets lie inside the ball
+    compared = 0
+    for view, lens in enumerate(model.lenses):
+        with np.load(rendering / "truth" / "maps" / f"view_{view:03d}.npz") as arrays:
+            maps = unpack_maps(arrays)
+        own = model.observation_view == view
+        points = model.points_world[model.observation_point[own]]
+        fx, fy, cx, cy = lens.params
+        K = points.new_tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        pixels, depth = project(points, model.cam_from_world[view], K)
+        assert_close(pixels, model.observation_pixels[own], atol=1e-6, rtol=0)
+        u, v = pixels.long().unbind(dim=-1)
+        inner = maps["foreground"][v, u]
+        gap = (maps["depth"][v, u].double() - depth).abs()[inner]
+        # Half a pixel is 0.04 wide here; the steepest facet that counts rises 5 times that.
+        assert gap.max() < 0.25
+        assert gap.median() < 0.03
+        compared += int(inner.sum())
+    assert compared > 1000
+
+
+def test_lights_in_the_file_predict_what_the_photographs_show(rendering):
+    lights = json.loads((rendering / "truth" / "lights.json").read_text())
+    harmonics = torch.tensor(lights["harmonics_world"])
+    views = load_views(rendering / "photos")
+    for view in range(3):
+        with np.load(rendering / "truth" / "maps" / f"view_{view:03d}.npz") as arrays:
+            maps = unpack_maps(arrays)
+        shown = maps["foreground"] & maps["lit"]
+        ones = torch.ones_like(maps["depth"])[..., None]
+        shading = torch.cat([ones, maps["normals_world"]], dim=-1) @ harmonics[view]
+        predicted = (maps["albedo"] * shading[..., None])[shown].mean(dim=1)
+        found = views.images[view].movedim(0, -1)[shown].mean(dim=1)
+        # Near light falls off, and first order is exact at the target only.
+        ratio = found / predicted
+        assert 0.7 < ratio.median() < 1.4
+        # 0.74 at most with the light of another view.
+        assert torch.corrcoef(torch.stack([found, predicted]))[0, 1] > 0.85
+
+
+@pytest.mark.slow
+def test_the_files_are_the_same_whatever_the_number_of_processes(rendering, ball, tmp_path):
+    render_scene(ball, tmp_path / "two", SMALL, processes=2)
+    names = sorted(path.relative_to(rendering) for path in rendering.rglob("*") if path.is_file())
+    assert len(names) > 10
+    for name in names:
+        if name.name == ".pimper.json":  # the times of the files
+            continue
+        if name.suffix == ".npz":  # a zip notes the time of day
+            with np.load(rendering / name) as one, np.load(tmp_path / "two" / name) as two:
+                assert all(np.array_equal(one[key], two[key], equal_nan=True) for key in one)
+        else:
+            assert filecmp.cmp(rendering / name, tmp_path / "two" / name, shallow=False), name
+
+
+def test_a_folder_in_use_is_refused_before_any_work(ball, rendering, tmp_path):
+    with pytest.raises(OutputError, match="already holds"):
+        render_scene(ball, rendering, SMALL, processes=1)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match=r"letter\.txt"):
+        render_scene(ball, tmp_path / "mine", SMALL, processes=1, overwrite=True)
+
+
+def test_no_processes_are_refused(ball, tmp_path):
+    with pytest.raises(ConfigError, match="processes is 0"):
+        render_scene(ball, tmp_path / "out", SMALL, processes=0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_several_lights_a_pose_are_one_camera_and_a_folder_each(ball, tmp_path):
+    config = SceneConfig(num_views=6, lights_per_pose=2, width=48, height=36, supersample=1)
+    folder = render_scene(ball, tmp_path / "scene", config, processes=1)
+    with pytest.warns(PimperWarning, match="3 poses of the camera"):
+        views = load_views(folder / "photos", masks=folder / "masks")
+    assert views.names[2:4] == ("pose_01/light_00.png", "pose_01/light_01.png")
+    assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]
+    model = read_model(folder / "truth" / "sparse")
+    assert model.names == views.names
+    assert torch.equal(model.cam_from_world[::2], model.cam_from_world[1::2])
+    assert not torch.equal(model.cam_from_world[1], model.cam_from_world[2])
+    assert torch.equal(views.masks[::2], views.masks[1::2])
+    lights = torch.tensor(json.loads((folder / "truth/lights.json").read_text())["positions_world"])
+    assert len(lights.unique(dim=0)) == 6
+    capture = read_rendered(folder)
+    assert torch.equal(capture.views.images, views.images)
+    assert capture.position.tolist() == capture.views.poses.tolist() == views.poses.tolist()
+    assert capture.truth.depth.shape == (6, 36, 48)
