@@ -107,7 +107,8 @@ def words_of_packages() -> set[str]:
 
 
 def file(text: str) -> None:
-    if not any((root / text.split("/")[0]).exists() for root in (ROOT, PACKAGE, BENCH)) and "/" in text:
+    roots = (ROOT, PACKAGE, BENCH)
+    if not any((root / text.split("/")[0]).exists() for root in roots) and "/" in text:
         return  # of another project
     ends = [f"/{named(one)}" for one in every_file()]
     assert any(end.endswith(f"/{text.lstrip('./')}") for end in ends), f"there is no file {text}"
@@ -115,8 +116,8 @@ def file(text: str) -> None:
 
 @functools.cache
 def every_file() -> list[Path]:
-    folders = ("pimper_torch", "bench", "tests", "benchmarks", "configs", "docs", "notebooks", ".ci")
-    return [path for folder in folders for path in (ROOT / folder).rglob("*.*")]
+    kept = ("bench", "benchmarks", "configs", "docs", "notebooks", "pimper_torch", "tests", ".ci")
+    return [path for folder in kept for path in (ROOT / folder).rglob("*.*")]
 
 
 @functools.cache

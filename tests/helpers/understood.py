@@ -17,6 +17,8 @@ from pimper_torch.cli.main import _READERS, commands
 from pimper_torch.cli.output import split
 from pimper_torch.errors import ConfigError, PimperError
 
+COMMANDS = commands()
+
 # What stands for something of the reader's.
 PLACEHOLDER = re.compile(r"[A-Z]+|…|\(x,y,z,x,y,z\)")
 
@@ -38,7 +40,7 @@ def command_line(text: str, *, whole: bool = True) -> None:
     words = words[1 : words.index(">")] if ">" in words else words[1:]
     if not words or words[0].startswith("--"):
         return  # `pimper --help` and the like
-    if words[0] not in commands():
+    if words[0] not in COMMANDS:
         raise ConfigError(f"there is no command {words[0]}")
     name, given = words[0], words[1:]
     if "--" in given:  # of `pimper batch`: options for every object
@@ -61,7 +63,7 @@ def option(text: str) -> None:
     named = {word.partition("=")[0] for word in words if word.startswith("--")}
     if named <= {"--help", "--help-all", "--version", "--quiet", "--json", "--log-level"}:
         return
-    names = [name for name in commands() if name != "config"]  # which takes any text
+    names = [name for name in COMMANDS if name != "config"]  # which takes any text
     having = [name for name in names if named <= {*options(name)}]
     if not having:
         raise ConfigError(f"no command has {' '.join(sorted(named))}")
@@ -97,7 +99,7 @@ def options(name: str) -> Mapping[str, Option]:
 
 
 def _checker(name: str) -> Callable[[str, Sequence[str]], object]:
-    home = commands()[name]
+    home = COMMANDS[name]
     return import_module(_READERS.get(home, home)).checked
 
 
