@@ -16,7 +16,10 @@ from pimper_torch.cli.options import CommonOptions, InputOptions
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
-PAGES = (*sorted(DOCS.glob("*.md")), ROOT / "benchmarks" / "README.md", ROOT / "README.md")
+PAGES = (
+    *sorted(DOCS.glob("*.md")),
+    *(ROOT / folder / "README.md" for folder in ("", "bench", "benchmarks")),
+)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#{1,4} (.+)$", flags=re.MULTILINE)
 MODULE = re.compile(r"^\.\. automodule:: (\S+)$", flags=re.MULTILINE)

@@ -18,7 +18,7 @@ from sphinx.util.docutils import SphinxDirective, switch_source_input
 import pimper_bench
 import pimper_torch
 
-PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
+PACKAGES = [Path(str(one.__file__)).parent for one in (pimper_torch, pimper_bench)]
 SOURCE = re.compile(r"^Source: (.*?)(?:\n\n|\Z)", flags=re.MULTILINE | re.DOTALL)
 
 

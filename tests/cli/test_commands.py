@@ -1,4 +1,4 @@
-"""Commands that other distributions bring are found, named in the help, and missed in a sentence."""
+"""Commands of other distributions are found, named in the help, and missed in a sentence."""
 
 from importlib.metadata import EntryPoint
 

@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 folder="$1"
 
-export PIMPER_INDEX=1
+export PIMPER_BENCH=""
 for distribution in . bench; do
     python -m build --no-isolation --outdir "$folder/dist" "$distribution" > /dev/null
 done
