@@ -38,14 +38,15 @@ from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.surface import CoarseSurface, reliable_points
 from pimper_torch.coarse.trim import CELL_PX, point_distances, seen_surface, supports, view_counts
 from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
-from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.undistort import undistorted
-from pimper_torch.silhouettes.contours import Contours, TraceContours
+from pimper_torch.silhouettes.trace import TraceContours
 
 Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 

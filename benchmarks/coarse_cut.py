@@ -16,8 +16,8 @@ from torch import Tensor
 from pimper_torch.coarse.densify import DepthMaps
 from pimper_torch.coarse.oriented import OrientedPoints
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.visual_hull import Hull
 from pimper_torch.records import ContourPoints
-from pimper_torch.silhouettes.hull import Hull
 
 # Capacities are integers there.
 _UNIT = 100

@@ -23,8 +23,8 @@ from pimper_bench.scenes.textures import random_speckle
 from pimper_torch import load_chain, load_views
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.chains.published import Published
+from pimper_torch.geometry.pyramids import Sources
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
-from pimper_torch.patches.sources import Sources
 from pimper_torch.records import (
     CoarseMesh,
     PatchViews,

@@ -27,11 +27,11 @@ from pimper_bench.scenes.render_in_memory import render_objects
 from pimper_bench.scenes.scene_lights import Lights
 from pimper_bench.scenes.scene_settings import SceneConfig, SensorConfig, expose
 from pimper_bench.scenes.whole_scene import Scene, build_scene
+from pimper_torch.geometry.lens_models import undistort_pixels
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.io.estimates import estimate_of
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Capture, Lens, Truth, Views
-from pimper_torch.sfm.colmap import undistort_pixels
 
 RENDERED_FOCAL = 1.3  # widths of a picture that all cameras' pictures are cut from
 NOISELESS = SensorConfig(read_noise=0.0, shot_noise=0.0, exposure=0.4)

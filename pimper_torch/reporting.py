@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.topology import boundary_loops
 from pimper_torch.journal import HASH, KEEP, Journal, current, writing
 from pimper_torch.records import (
@@ -28,7 +29,6 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.silhouettes.contours import Contours
 
 R = TypeVar("R")
 

@@ -28,6 +28,7 @@ from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.chains.coarse_to_fine import held_apart
 from pimper_torch.coarse.surface import CoarseSurface
 from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (
@@ -38,7 +39,6 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
 from tests.coarse import ball
 

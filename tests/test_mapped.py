@@ -11,9 +11,9 @@ from PIL import Image
 
 from pimper_torch import mapped
 from pimper_torch.errors import OutputError
+from pimper_torch.geometry.pyramids import prepare
 from pimper_torch.io.photographs import load_views
 from pimper_torch.memory import resident_bytes
-from pimper_torch.patches.sources import prepare
 from pimper_torch.records import Lens, Silhouettes
 from pimper_torch.sfm.undistort import undistort
 from pimper_torch.store import digest, settled

@@ -6,15 +6,15 @@ from twins import using
 
 import pimper_torch as pt
 from pimper_torch.chains.photometric import Photometric
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.pyramids import prepare
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.sources import prepare
 from pimper_torch.patches.warp import Warp
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.fit_light import FitLight
 from pimper_torch.photometry.lights import thinned
 from pimper_torch.records import Silhouettes, SparseScene, StageReport
 from pimper_torch.reporting import Silent
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Given
 from pimper_torch.sweep.sweep import Sweep
 

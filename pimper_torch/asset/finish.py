@@ -8,12 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.config import require
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.meshing.closing import closed
 from pimper_torch.meshing.simplify import simplify
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Closed, Finished, Mesh
-from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.stage import Stage
 from pimper_torch.viz.maps import base_color
 

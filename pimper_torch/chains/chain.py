@@ -17,6 +17,7 @@ from pimper_torch.coarse.reference import view_named
 from pimper_torch.config import nearest
 from pimper_torch.errors import ConfigError, InputError
 from pimper_torch.failures import OnFailure, collecting, distinct, warn_of
+from pimper_torch.geometry.mesh_frame import refuse_other_axes
 from pimper_torch.kernels.compile import compile_ahead
 from pimper_torch.ledger import left_out_of
 from pimper_torch.records import (
@@ -42,7 +43,6 @@ from pimper_torch.records import (
 )
 from pimper_torch.relighting.held_out import Relight, judge_textures
 from pimper_torch.reporting import Observer, Silent, gathered, recorded, stage
-from pimper_torch.sfm.conventions.mesh_frame import refuse_other_axes
 from pimper_torch.sfm.poses import with_poses
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.sparse_scene import sound

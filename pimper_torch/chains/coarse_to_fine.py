@@ -17,11 +17,12 @@ from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import OnFailure
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.pyramids import prepare
 from pimper_torch.memory import bytes_of, largest_problem
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.meshing.repair import Repair
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.sources import prepare
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.fit_light import FitLight, FitLightConfig, Illumination
@@ -42,14 +43,14 @@ from pimper_torch.records import (
     SweptPatches,
     Views,
 )
+from pimper_torch.records.scene_parts import with_views
 from pimper_torch.reporting import Observer
 from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.sparse_scene import with_views
-from pimper_torch.silhouettes.contours import Contours, TraceContours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.silhouettes.trace import TraceContours
 from pimper_torch.store import Store, opened
 from pimper_torch.sweep.sweep import Sweep, SweepConfig
 

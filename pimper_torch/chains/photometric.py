@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from pimper_torch.errors import caution
+from pimper_torch.geometry.pyramids import Sources
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.sources import Sources
 from pimper_torch.photometry.fit_light import Illumination
 from pimper_torch.records import (
     Cameras,

@@ -12,6 +12,7 @@ from pimper_torch.chains.photometric import Factorizing, Warping
 from pimper_torch.chains.running import Running
 from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
 from pimper_torch.failures import OnFailure
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.meshing.extract import Extract, ExtractConfig
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.paper.integrate import Integrate
@@ -38,7 +39,6 @@ from pimper_torch.reporting import Observer
 from pimper_torch.sfm.poses import one_view_a_pose
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.store import Store, opened

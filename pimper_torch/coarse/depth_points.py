@@ -21,12 +21,12 @@ from pimper_torch.coarse.densify import (
 )
 from pimper_torch.coarse.window_matching import Matcher, Windows, pair
 from pimper_torch.errors import caution
+from pimper_torch.geometry.lens_models import photographed
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.geometry.supporting_plane import fixation
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, SparseScene, Views
-from pimper_torch.sfm.sparse_scene import photographed
 
 # Points that fill space, and steps of inverse depth along each ray: choices. More take memory, as
 # each is compared with all views.

@@ -14,14 +14,14 @@ from pimper_torch.coarse.densify import DensifyConfig
 from pimper_torch.coarse.oriented import OrientedPoints, matched_cloud, no_points, pixel_size_at
 from pimper_torch.coarse.window_matching import level_of
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.pixels import crop_intrinsics
+from pimper_torch.geometry.poisson import poisson_surface
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import by_view, each, zeros
 from pimper_torch.records import Cameras, ContourPoints, Record, Silhouettes, SparseScene
-from pimper_torch.sfm.colmap_surfaces import poisson_surface
-from pimper_torch.silhouettes.contours import Contours
 
 # Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
 # those of the surface through points and contours (rims) that benchmarks/README.md measures:

@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
+from pimper_torch.geometry.mesh_frame import compare_with_scene
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals, side_lengths
@@ -13,7 +14,6 @@ from pimper_torch.geometry.topology import face_components, first_of_each
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.geometry.welding import welded
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
-from pimper_torch.sfm.conventions.mesh_frame import compare_with_scene
 
 
 def prepared(

@@ -11,13 +11,13 @@ from pimper_torch.coarse import splitting
 from pimper_torch.coarse.trim import enclosed_holes
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.geometry.topology import face_edges, vertex_fans
+from pimper_torch.geometry.visual_hull import Hull
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
-from pimper_torch.silhouettes.contours import Contours
-from pimper_torch.silhouettes.hull import Hull
 from pimper_torch.stage import Stage
 
 # Barycentric coordinate below which a subdivided mesh vertex lies on an edge: subdivided meshes

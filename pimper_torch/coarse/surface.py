@@ -16,15 +16,15 @@ from pimper_torch.coarse.reference import reference_view
 from pimper_torch.coarse.trim import FineSurfaceConfig, min_fraction, supported_components
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.projection import triangulation_angles
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
-from pimper_torch.sfm.colmap_surfaces import reduced
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
 # Pixels of the finest depth maps between a facet and the points of the cloud on it. A choice.

@@ -15,13 +15,13 @@ from pimper_torch.coarse.oriented import OrientedPoints
 from pimper_torch.coarse.window_matching import MatchingLevel
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.geometry import surfaces, topology
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
 from pimper_torch.linalg.sums import total
 from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import ContourPoints, Record, Support
-from pimper_torch.silhouettes.contours import Contours
 
 # Of the surface's octree, pixels of the finest depth maps at the cloud's median depth. A choice.
 CELL_PX = 4.0

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pimper_torch.exchange.picture_files import file_names, refuse_skew, write_mask, write_picture
 from pimper_torch.exchange.result import Result
+from pimper_torch.geometry.lens_models import pinhole_lenses, undistort_pixels
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras, SparseScene, Views
-from pimper_torch.sfm.colmap import pinhole_lenses, undistort_pixels, write_binary
+from pimper_torch.sfm.colmap import write_binary
 from pimper_torch.sfm.model import SparseModel, select_views
 from pimper_torch.sfm.sparse_scene import model_of_scene, point_colors
 from pimper_torch.viz.maps import view_maps

@@ -23,9 +23,9 @@ from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.least_squares import compressed_equations, normal_equations
 from pimper_torch.linalg.prepared import SingularSystemError
+from pimper_torch.linalg.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.linalg.sums import total
 from pimper_torch.linalg.systems import solutions, solve_compressed
-from pimper_torch.photometry.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.records import Failure, Record
 
 # Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a

@@ -20,7 +20,6 @@ from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import solved_or
 from pimper_torch.fusion.blend import Blend, ray_directions, vertex_spacing
 from pimper_torch.fusion.blocks import Coarse, Key, Typical, block_of, parts_of, pooled, sampled
-from pimper_torch.fusion.continuation import about_mean, enclosed
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.fusion.expected_error import expected_error
@@ -36,14 +35,15 @@ from pimper_torch.fusion.terms import (
     own_slope_variance,
     rotation,
 )
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.subdivision import Subdivision, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.ledger import leave_out
+from pimper_torch.linalg.continuation import about_mean, enclosed
 from pimper_torch.linalg.sums import average
 from pimper_torch.memory import release_memory
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.stage import Stage
 
 # Errors that facets share are estimated on a subdivided mesh so many times as coarse. The noise
@@ -109,7 +109,7 @@ class Fuse(Stage):
     normal. Terms are linear in it: edges are at right angles to photometric normals, the sweep
     knows heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and
     where there is no photometric normal the surface keeps its slopes, or continues those of lit
-    surface that encloses it (:mod:`~pimper_torch.fusion.continuation`). Across contours and folds,
+    surface that encloses it (:mod:`~pimper_torch.linalg.continuation`). Across contours and folds,
     as seen along the directions, heights cannot follow normals, and keep their differences. Each
     kind comes with the variances that its source claims; the factor that corrects these is
     estimated from the residuals (:mod:`~pimper_torch.fusion.estimate`). Normals of one facet have a

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from pimper_torch.fusion.continuation import continued, enclosed
 from pimper_torch.fusion.equations import (
     Contacts,
     Equations,
@@ -28,10 +27,11 @@ from pimper_torch.fusion.equations import (
 )
 from pimper_torch.fusion.normal_bias import MEDIAN_OF_TILT, common, common_variance, normal_bias
 from pimper_torch.fusion.problem import Problem
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.linalg.continuation import continued, enclosed
 from pimper_torch.linalg.sums import total
-from pimper_torch.silhouettes.contours import Contours
 
 # Least squared angle from vertex to vertex, radians, and least variance of the slopes that a
 # surface has already: they keep weights finite on flat facets and exact surfaces.

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
+from pimper_torch.geometry.lens_models import pinhole_lenses
 from pimper_torch.geometry.local_frame import NO_OFFSET, local_origin, to_local
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, SparseScene, Views
-from pimper_torch.sfm.colmap import pinhole_lenses
 
 _DECODED = (
     " Bytes hold sRGB as a rule: `radiometry.linear_from_srgb(images / 255)` decodes them, "

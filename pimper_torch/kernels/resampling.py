@@ -1,6 +1,6 @@
 """All views resampled on a bucket of templates in one pass: twin of ``patches.warp``.
 
-Pyramids are rows of pixels (see ``patches.sources``), the finest level in an array of its own;
+Pyramids are rows of pixels (see ``geometry.pyramids``), the finest level in an array of its own;
 ``levels`` lists height, width and offset of each.
 """
 

@@ -1,4 +1,4 @@
-"""Robust scale of residuals: twin of ``photometry.robust.robust_variance``."""
+"""Robust scale of residuals: twin of ``linalg.robust.robust_variance``."""
 
 import math
 from typing import Any

@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.fusion.continuation import continued
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
+from pimper_torch.linalg.continuation import continued
 from pimper_torch.meshing.faults import diagonal
 from pimper_torch.records import Closed, Mesh
 

@@ -17,11 +17,11 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require_ranges
 from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
-from pimper_torch.fusion.continuation import about_mean
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_edges
+from pimper_torch.linalg.continuation import about_mean
 from pimper_torch.linalg.sums import average
 from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.geometry.pyramids import PriorMaps
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.patches.sources import PriorMaps
 from pimper_torch.records import Cameras, LightPrior, Observations, PatchPriors, Templates
 
 

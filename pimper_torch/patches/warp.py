@@ -15,6 +15,16 @@ from torch.nn.functional import interpolate, normalize
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.pyramids import (
+    PriorMaps,
+    Sources,
+    centers_in_patches,
+    image_from_patch,
+    kernel_geometry,
+    look_up,
+    prepare,
+    pyramid_level,
+)
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.kernels.arrays import (
@@ -28,16 +38,6 @@ from pimper_torch.kernels.arrays import (
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.sources import (
-    PriorMaps,
-    Sources,
-    centers_in_patches,
-    image_from_patch,
-    kernel_geometry,
-    look_up,
-    prepare,
-    pyramid_level,
-)
 from pimper_torch.patches.template_priors import merged
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
@@ -218,7 +218,7 @@ class Warp(Stage):
 
         Args:
             patches: All, or some buckets of them.
-            sources: Pyramids as :func:`~pimper_torch.patches.sources.prepare` builds them; built
+            sources: Pyramids as :func:`~pimper_torch.geometry.pyramids.prepare` builds them; built
                 here where not given.
         """
         sources = sources or prepare(views, self.config.saturation_level)

@@ -4,6 +4,7 @@ The factorization works alone: pose a :class:`Bilinear` problem and hand it to a
 manifolds and solvers are in :mod:`pimper_torch.single_view.factorization`.
 """
 
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.cone import Cone
@@ -12,7 +13,6 @@ from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.fit_light import FitLight, FitLightConfig, Illumination
 from pimper_torch.photometry.gauge import FixGauge
 from pimper_torch.photometry.lights import thinned
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 __all__ = [

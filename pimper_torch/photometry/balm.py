@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.linalg.robust import Squares
 from pimper_torch.photometry.bilinear import (
     REWEIGHT_EVERY,
     RUNNING,
@@ -34,7 +35,6 @@ from pimper_torch.photometry.bilinear import (
     robust_weights,
 )
 from pimper_torch.photometry.quadratics import diagonal, solve_packed
-from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import StopCause
 
 # The penalty starts at this fraction of the mean eigenvalue of a sample's data term, and grows by

@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.kernels.twin_constants import MAX_STEP, MIN_DEVIATION
+from pimper_torch.linalg.robust import Loss, Squares, robust_deviation
 from pimper_torch.photometry.cone import Cone, Manifold
 from pimper_torch.photometry.quadratics import (
     PackedCholesky,
@@ -36,7 +37,6 @@ from pimper_torch.photometry.quadratics import (
     dot,
     outer,
 )
-from pimper_torch.photometry.robust import Loss, Squares, robust_deviation
 from pimper_torch.records import Convergence, Record, StopCause
 
 # Steps between updates of the robust weights: they change slowly, and the scale of the residuals

@@ -22,6 +22,7 @@ from torch.autograd.function import once_differentiable
 
 from pimper_torch.kernels.arrays import as_array
 from pimper_torch.kernels.switch import compiled_for
+from pimper_torch.linalg.robust import Squares, with_slope
 from pimper_torch.photometry.bilinear import (
     Bilinear,
     Factors,
@@ -37,7 +38,6 @@ from pimper_torch.photometry.quadratics import (
     outer,
     unpacked,
 )
-from pimper_torch.photometry.robust import Squares, with_slope
 from pimper_torch.records import Record
 
 # The step of the lights, over these, that ends Newton's method: a choice.

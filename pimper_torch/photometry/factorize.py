@@ -13,11 +13,12 @@ from torch.nn.functional import pad
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped_patches
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ledger import leave_out
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.memory import recomputed
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.photometry.balm import solve_balm
 from pimper_torch.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.photometry.cone import Cone
@@ -37,7 +38,6 @@ from pimper_torch.photometry.light_field import (
     harmonics,
     is_strong,
 )
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.sample_estimates import (
     Rows,
     fit_albedo,

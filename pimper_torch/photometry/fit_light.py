@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.geometry.rigid import invert_rigid, rotate
-from pimper_torch.patches.transfer import transferred_normals
+from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.photometry.factor_priors import RELATIVE_NOISE
 from pimper_torch.photometry.light_field import LightField, harmonics, rotate_lights
 from pimper_torch.photometry.lights import light_of_mesh

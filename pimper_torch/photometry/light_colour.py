@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.kernels.twin_constants import MIN_DEVIATION
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.photometry.light_models import left_out, predicts_better
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 
 # Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
 # sensor's noise is most of its residuals. Views that near to the median are of one exposure, as

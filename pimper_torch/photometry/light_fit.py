@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.kernels.twin_constants import MIN_DEVIATION
+from pimper_torch.linalg.robust import with_slope
 from pimper_torch.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
-from pimper_torch.photometry.robust import with_slope
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's

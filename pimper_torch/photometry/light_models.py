@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
-from pimper_torch.photometry.robust import cauchy_weights, robust_deviation
+from pimper_torch.linalg.robust import cauchy_weights, robust_deviation
 
 # Residuals have to fall by so many standard errors over the views, 99.7 % confidence, and by this
 # fraction at least, a choice: what won less on glossy scenes was no light.

@@ -30,6 +30,7 @@ from pimper_torch.kernels.twin_constants import (
     SHADING_STEPS,
     ZERO_ROUNDINGS,
 )
+from pimper_torch.linalg.robust import Squares
 from pimper_torch.photometry.bilinear import (
     RUNNING,
     Bilinear,
@@ -44,7 +45,6 @@ from pimper_torch.photometry.bilinear import (
     update_shading,
 )
 from pimper_torch.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
-from pimper_torch.photometry.robust import Squares
 from pimper_torch.records import Convergence, StopCause
 
 

@@ -17,8 +17,8 @@ from torch.nn.functional import avg_pool2d, normalize, pad
 
 from pimper_torch.geometry.directions import even_directions
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.parallel import side_by_side
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,

@@ -1,11 +1,5 @@
 """COLMAP's models: of cameras, and of what they see."""
 
-import signal
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,52 +8,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.errors import OutputError, caution
+from pimper_torch.errors import OutputError
+from pimper_torch.geometry.colmap_library import loaded, quiet
+from pimper_torch.geometry.lens_models import camera_of, distort, lens_of
 from pimper_torch.geometry.rigid import transform
-from pimper_torch.records import Cameras, Lens
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.model_files import read_files, sound_model
-
-
-def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace.
-
-    Pillow is loaded before it: both carry zlib, and where pycolmap's comes first, Pillow damages
-    its memory as soon as it writes a PNG.
-    """
-    fresh = "pycolmap" not in sys.modules
-    import PIL.Image  # noqa: F401 - see above
-    import pycolmap
-
-    if fresh and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    _tell_order()
-    return pycolmap
-
-
-@cache
-def _tell_order() -> None:
-    """Warn, once, where a script has loaded pycolmap before Pillow."""
-    names = list(sys.modules)  # in the order of loading
-    if names.index("pycolmap") < names.index("PIL._imaging"):
-        caution(
-            "pycolmap was imported before Pillow: both carry zlib, and writing a PNG will end this "
-            "process. Put `import PIL.Image` before `import pycolmap`."
-        )
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off stderr; what matters comes back as results or exceptions."""
-    pycolmap = loaded()
-
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
-
 
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
@@ -105,59 +59,7 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
             ) from error
 
 
-def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
-    """Return ``K`` with the lens's focal length and principal point, in float64."""
-    return torch.from_numpy(np.array(_camera_of(lens).calibration_matrix(), dtype=np.float64))
-
-
-def is_pinhole(lens: Lens) -> bool:
-    """Return whether the lens images straight lines as straight lines.
-
-    COLMAP calls a lens undistorted whose coefficients are all zero; of a fisheye that is the
-    equidistant one, ``r = f theta``.
-    """
-    return "FISHEYE" not in lens.model and bool(_camera_of(lens).is_undistorted())
-
-
-def distort(lens: Lens, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 2"]:
-    """Find where the lens images directions, in pixels of the photograph.
-
-    Args:
-        rays_cam: Camera frame, any length.
-
-    Returns:
-        NaN for directions that the lens cannot image. A constant to autograd.
-    """
-    rays = np.ascontiguousarray(rays_cam.detach().cpu().double().numpy())
-    pixels = np.array(_camera_of(lens).img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
-    return torch.from_numpy(pixels).to(rays_cam)
-
-
-def undistort_pixels(lens: Lens, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
-    """Return ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel, as :func:`distort`."""
-    columns = np.ascontiguousarray(pixels.detach().cpu().double().numpy())
-    found = np.array(_camera_of(lens).cam_from_img(columns), dtype=np.float64).reshape(-1, 2)
-    return torch.from_numpy(found).to(pixels)
-
-
-def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
-    """Follow a resize of the photograph."""
-    camera = _camera_of(lens)
-    camera.rescale(width, height)
-    return _lens_of(camera)
-
-
-def _camera_of(lens: Lens) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    pycolmap = loaded()
-
-    camera = pycolmap.Camera.create_from_model_name(
-        lens.camera, lens.model, 1.0, lens.width, lens.height
-    )
-    camera.params = np.array(lens.params)
-    return camera
-
-
-def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see _camera_of
+def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_of
     """Read COLMAP's own model; views by their ids, points by theirs."""
     image_ids = sorted(reconstruction.reg_image_ids())
     number = {image_id: index for index, image_id in enumerate(image_ids)}
@@ -178,7 +80,7 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see _camera_
     bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(images), 1, 4))
     return SparseModel(
         names=tuple(image.name for image in images),
-        lenses=tuple(_lens_of(reconstruction.camera(image.camera_id)) for image in images),
+        lenses=tuple(lens_of(reconstruction.camera(image.camera_id)) for image in images),
         cam_from_world=torch.from_numpy(np.concatenate([poses, bottom], axis=1)),
         points_world=torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3)),
         observation_point=track[:, 0],
@@ -187,23 +89,13 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see _camera_
     )
 
 
-def _lens_of(camera: Any) -> Lens:  # noqa: ANN401 - see _camera_of
-    return Lens(
-        camera=int(camera.camera_id),
-        model=str(camera.model_name),
-        params=tuple(float(value) for value in camera.params),
-        width=int(camera.width),
-        height=int(camera.height),
-    )
-
-
-def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see _camera_of
+def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see camera_of
     """Make COLMAP's own model; its ids keep the order of views and points."""
     pycolmap = loaded()
 
     reconstruction = pycolmap.Reconstruction()
     for lens in {lens.camera: lens for lens in model.lenses}.values():
-        reconstruction.add_camera_with_trivial_rig(_camera_of(lens))
+        reconstruction.add_camera_with_trivial_rig(camera_of(lens))
     view, pixels = model.observation_view.numpy(), model.observation_pixels.numpy()
     position = np.empty(len(view), dtype=np.int64)  # of each observation in its image
     for index, (name, lens) in enumerate(zip(model.names, model.lenses, strict=True)):
@@ -227,21 +119,6 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | Non
         reconstruction.add_point3D(xyz, track, rgb[index])
     reconstruction.update_point_3d_errors()
     return reconstruction
-
-
-def pinhole_lenses(cameras: Cameras) -> tuple[Lens, ...]:
-    """Assign every view its pinhole; views with equal ones share a camera."""
-    numbers: dict[tuple[float, ...], int] = {}
-    lenses = []
-    for K, (width, height) in zip(
-        cameras.intrinsics.detach().cpu().double(), cameras.sizes_px.tolist(), strict=True
-    ):
-        params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        camera = numbers.setdefault((*params, width, height), len(numbers) + 1)
-        lenses.append(
-            Lens(camera=camera, model="PINHOLE", params=params, width=width, height=height)
-        )
-    return tuple(lenses)
 
 
 def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:

@@ -12,9 +12,9 @@ from kornia.geometry.epipolar import (
 )
 from torch import Tensor
 
+from pimper_torch.geometry.lens_models import pinhole_of, undistort_pixels
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
-from pimper_torch.sfm.colmap import pinhole_of, undistort_pixels
 from pimper_torch.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.sfm.model import SparseModel
 

@@ -10,6 +10,7 @@ from PIL import Image
 from pimper_torch.camera_files.read_cameras import read_cameras
 from pimper_torch.errors import InputError, ReconstructionError, some
 from pimper_torch.file_names import match_files
+from pimper_torch.geometry.lens_models import rescale_lens
 from pimper_torch.records import Views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.conventions.resized_pictures import (
@@ -163,7 +164,7 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         if lens.camera not in known:
             cameras[lens.camera, *size, quarters] = lens.camera
         camera = cameras.setdefault((lens.camera, *size, quarters), fresh + len(cameras))
-        resized = colmap.rescale_lens(lens, *size).replace(camera=camera)
+        resized = rescale_lens(lens, *size).replace(camera=camera)
         lenses.append(turned_lens(resized, quarters))
         scale = pixels.new_tensor([size[0] / lens.width, size[1] / lens.height])
         here = model.observation_view == view

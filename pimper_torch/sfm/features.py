@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.mapped import drop_pages
 from pimper_torch.memory import release_memory
 from pimper_torch.progress import track
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 
 

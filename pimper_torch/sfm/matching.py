@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.parallel import side_by_side
 from pimper_torch.progress import track
 from pimper_torch.records import Record
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import Workspace, image_ids
 from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 

@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.errors import caution, some
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Record
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.doubt import FEWEST_VIEWS, JOINING, agreement
 from pimper_torch.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.sfm.matching import (

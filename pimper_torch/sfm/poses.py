@@ -6,7 +6,6 @@ of one photograph a pose. Lights are fitted to all.
 """
 
 from collections.abc import Collection
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -15,8 +14,8 @@ from torch import Tensor
 from pimper_torch.errors import InputError, some
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
+from pimper_torch.records.scene_parts import OneAPose, with_views
 from pimper_torch.sfm.model import SparseModel, select_views
-from pimper_torch.sfm.sparse_scene import with_views
 
 
 def pictures_of_poses(views: Views) -> Views:
@@ -83,19 +82,6 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
     # Bundle adjustment leaves photographs of one pose 0.1 px apart; between neighbours lie tens.
     same = focal[:, None] * (turned + moved / extent) < 0.5
     return same.long().argmax(dim=1)  # the first of each pose
-
-
-class OneAPose(NamedTuple):
-    """A scene with one photograph of every pose.
-
-    Attributes:
-        scene: Those photographs alone, with what all of their poses observe.
-        of: Which of them has the pose of each view of the whole scene.
-    """
-
-    scene: SparseScene
-    chosen: Int[Tensor, " pose"]
-    of: Int[Tensor, " view"]
 
 
 def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPose:

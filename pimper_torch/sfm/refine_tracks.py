@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.geometry.lens_models import distort
 from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Views, pairs_table
-from pimper_torch.sfm import colmap
 from pimper_torch.sfm.colmap import bundle, observation_errors
 from pimper_torch.sfm.model import SparseModel, longest_tracks
 from pimper_torch.sfm.reconstruct_config import MIN_POINTS
@@ -117,7 +117,7 @@ def _photographed(
     for index, lens in enumerate(model.lenses):
         here = view == index
         rays = torch.linalg.solve(cameras.intrinsics[index], ends[here].mT).mT
-        found[here] = colmap.distort(lens, rays)
+        found[here] = distort(lens, rays)
     return found
 
 

@@ -15,9 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import ReconstructionError, caution
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.ledger import leave_out
 from pimper_torch.progress import report
-from pimper_torch.sfm.colmap import loaded, model_of, quiet
+from pimper_torch.sfm.colmap import model_of
 from pimper_torch.sfm.doubt import FEWEST_VIEWS, MOVE, count_views_with_depth, doubt, judged
 from pimper_torch.sfm.features import Workspace
 from pimper_torch.sfm.matching import (

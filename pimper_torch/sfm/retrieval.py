@@ -17,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.parallel import on_one_thread
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import Workspace, image_ids
 from pimper_torch.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, read_features
 

@@ -4,19 +4,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.errors import ReconstructionError
 from pimper_torch.failures import skipped
+from pimper_torch.geometry.lens_models import photographed, pinhole_lenses, undistort_pixels
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
-from pimper_torch.geometry.pixels import grid_from_pixels, homogeneous
+from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import each
 from pimper_torch.radiometry import SATURATED, to_bytes
 from pimper_torch.records import Cameras, Failure, Lens, SparseScene, Views
+from pimper_torch.records.scene_parts import with_points, with_views
 from pimper_torch.sfm import colmap
 from pimper_torch.sfm.camera_in_place import least_squares_map, mapped
 from pimper_torch.sfm.colmap import reprojection_errors
@@ -77,7 +79,7 @@ def _undistorted_map(
     across = torch.linspace(0, 1, 9, dtype=one.dtype)
     raster = torch.cartesian_prod(lens.width * across, lens.height * across)
     ends = raster, mapped(one, raster)
-    first, second = (mapped(intrinsics, colmap.undistort_pixels(lens, pixels)) for pixels in ends)
+    first, second = (mapped(intrinsics, undistort_pixels(lens, pixels)) for pixels in ends)
     return least_squares_map(first, second)
 
 
@@ -90,7 +92,7 @@ def model_of_scene(scene: SparseScene) -> SparseModel:
     offset = torch.tensor(scene.offset_world, dtype=torch.float64)
     return SparseModel(
         names=scene.views.names,
-        lenses=colmap.pinhole_lenses(scene.cameras),
+        lenses=pinhole_lenses(scene.cameras),
         cam_from_world=from_local(poses, scene.offset_world),
         points_world=scene.points_world.detach().cpu().double() + offset,
         observation_point=scene.observation_point.cpu(),
@@ -110,20 +112,6 @@ def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
         observation_view=model.observation_view.to(like.device),
         observation_pixels=pixels.to(like),
     )
-
-
-def photographed(
-    scene: SparseScene, pixels: Float[Tensor, "pixel 2"], view: Int[Tensor, " pixel"]
-) -> Float[Tensor, "pixel 2"]:
-    """Return where the photographs, before undistortion, have pixels of the undistorted ones."""
-    found = pixels.clone()
-    pinholes = colmap.pinhole_lenses(scene.cameras)
-    for index, (own, pinhole) in enumerate(zip(scene.lenses, pinholes, strict=True)):
-        if own.replace(camera=pinhole.camera) != pinhole:
-            here = view == index
-            ends = homogeneous(colmap.undistort_pixels(pinhole, pixels[here]))
-            found[here] = colmap.distort(own, ends)
-    return found
 
 
 def write_model(scene: SparseScene, folder: Path) -> None:
@@ -184,39 +172,6 @@ def sound(scene: SparseScene) -> SparseScene:
     done = "These views are left out, as if they had not been taken"
     skipped(*(_failure("view", names[view], reason, done) for view, reason in reasons.items()))
     return with_views(scene, torch.tensor([view not in reasons for view in range(len(names))]))
-
-
-def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
-    """Keep some of the views, and what these observe; the others count as not registered."""
-    index = kept.nonzero()[:, 0].tolist()
-    observed = kept.to(scene.observation_view.device)[scene.observation_view]
-    number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
-    maps, series, names = scene.background_from_view, scene.series, scene.views.names
-    left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
-    return scene.replace(
-        views=scene.views.take(index),
-        cameras=scene.cameras.take(index),
-        observation_point=scene.observation_point[observed],
-        observation_view=number[scene.observation_view[observed]],
-        observation_pixels=scene.observation_pixels[observed],
-        lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
-        unregistered=(*scene.unregistered, *left_out),
-        background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
-        series=series[kept.to(series.device)] if len(series) else series,
-    )
-
-
-def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene:
-    """Keep some of the points, and where they were observed."""
-    observed = kept[scene.observation_point]
-    number = kept.long().cumsum(dim=0) - 1
-    return scene.replace(
-        points_world=scene.points_world[kept],
-        reprojection_errors_px=scene.reprojection_errors_px[kept],
-        observation_point=number[scene.observation_point[observed]],
-        observation_view=scene.observation_view[observed],
-        observation_pixels=scene.observation_pixels[observed],
-    )
 
 
 def _failure(what: str, name: str, reason: str, done: str) -> Failure:

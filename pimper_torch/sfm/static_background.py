@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.ledger import leave_out
 from pimper_torch.progress import track
 from pimper_torch.records import Record
@@ -30,7 +31,6 @@ from pimper_torch.sfm.camera_in_place import (
     shift_px,
     still_length_px,
 )
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.sfm.matching import (
     Keypoints,

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from pimper_torch.errors import caution
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.memory import release_memory
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.sfm import epipolar, matching
-from pimper_torch.sfm.colmap import loaded, model_of, observation_errors, quiet, reconstruction_of
+from pimper_torch.sfm.colmap import model_of, observation_errors, reconstruction_of
 from pimper_torch.sfm.conventions.by_matches import choose_way
 from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.features import Workspace, find_features, image_ids, too_small, workspace

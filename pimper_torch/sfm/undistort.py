@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from pimper_torch.geometry.lens_models import distort, is_pinhole, pinhole_of, undistort_pixels
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.mapped import zeros
 from pimper_torch.memory import release_memory
@@ -26,7 +27,6 @@ from pimper_torch.records import (
     SparseScene,
     Views,
 )
-from pimper_torch.sfm.colmap import distort, is_pinhole, pinhole_of, undistort_pixels
 
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:

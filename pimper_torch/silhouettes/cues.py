@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.opencv import convex_hull_of
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import (
     Fixation,
@@ -19,11 +20,10 @@ from pimper_torch.geometry.supporting_plane import (
     supporting_plane,
     well_tracked,
 )
+from pimper_torch.geometry.visual_hull import Hull
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
 from pimper_torch.silhouettes import parallax
-from pimper_torch.silhouettes.hull import Hull
-from pimper_torch.silhouettes.opencv import convex_hull_of
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 
 FEW = 3  # soft masks: fewer have no majority

@@ -10,11 +10,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from pimper_torch.mapped import by_view
-from pimper_torch.records import Record, Silhouettes
-from pimper_torch.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
-from pimper_torch.silhouettes.hull import margins, visual_hull
-from pimper_torch.silhouettes.opencv import (
+from pimper_torch.geometry.opencv import (
     BACKGROUND,
     OBJECT,
     PERHAPS_BACKGROUND,
@@ -30,6 +26,10 @@ from pimper_torch.silhouettes.opencv import (
     signed_distance,
     without_specks,
 )
+from pimper_torch.geometry.visual_hull import margins, visual_hull
+from pimper_torch.mapped import by_view
+from pimper_torch.records import Record, Silhouettes
+from pimper_torch.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
 from pimper_torch.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 

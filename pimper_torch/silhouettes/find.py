@@ -8,14 +8,13 @@ from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
 from pimper_torch.failures import skipped
+from pimper_torch.geometry.visual_hull import box_round, margins, visual_hull
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import by_view
 from pimper_torch.records import Failure, Silhouettes, SparseScene
-from pimper_torch.sfm.poses import OneAPose
-from pimper_torch.sfm.sparse_scene import with_views
+from pimper_torch.records.scene_parts import OneAPose, with_views
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import Cuts, cut_in_iterations
-from pimper_torch.silhouettes.hull import box_round, margins, visual_hull
 from pimper_torch.silhouettes.reliability import (
     Agreement,
     agreement_of,

@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.geometry.opencv import shrunk, warped, window_means
 from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.mapped import stacked, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.radiometry.response import srgb_from_linear
 from pimper_torch.records import Cameras, Record, Views
-from pimper_torch.silhouettes.opencv import shrunk, warped, window_means
 
 _FAINT = 0.03  # of white; ratios of darker colours tell noise
 _RATIO = 100.0  # grey levels for a ratio of e

@@ -8,15 +8,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, max_pool2d
 
+from pimper_torch.geometry.opencv import blind_holes, components_of, signed_distance
 from pimper_torch.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.visual_hull import box_round
 from pimper_torch.ledger import leave_out
 from pimper_torch.mapped import by_view, zeros
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, Silhouettes, Views
 from pimper_torch.silhouettes.cuts import Cuts, is_deep
-from pimper_torch.silhouettes.hull import box_round
-from pimper_torch.silhouettes.opencv import blind_holes, components_of, signed_distance
 from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
 
 # On rendered scenes, 99 in 100 pixels of a median view's cut lie less than 0.4 pixels of 640

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
+from pimper_torch.geometry.lens_models import undistort_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.geometry.supporting_plane import Plane, fixation, supporting_plane, well_tracked
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
-from pimper_torch.sfm.colmap import undistort_pixels
 from pimper_torch.size.given import Mark, Pointer, number_of, require_inside
 
 # Confidence of a surface below which a warning says that it may be elsewhere. A choice: a half is

@@ -21,6 +21,7 @@ from pimper_torch.coarse.remesh import Remesh as Remesh
 from pimper_torch.coarse.surface import CoarseSurface as CoarseSurface
 from pimper_torch.coarse.surface import facets_of as facets_of
 from pimper_torch.fusion.fuse import Fuse as Fuse
+from pimper_torch.geometry.contours import Contours as Contours
 from pimper_torch.meshing.extract import Extract as Extract
 from pimper_torch.meshing.repair import Repair as Repair
 from pimper_torch.paper.triangulate import Triangulate as Triangulate
@@ -34,9 +35,8 @@ from pimper_torch.photometry.fit_light import Illumination as Illumination
 from pimper_torch.photometry.gauge import FixGauge as FixGauge
 from pimper_torch.relighting.held_out import Relight as Relight
 from pimper_torch.sfm.reconstruct import Reconstruct as Reconstruct
-from pimper_torch.silhouettes.contours import Contours as Contours
-from pimper_torch.silhouettes.contours import TraceContours as TraceContours
 from pimper_torch.silhouettes.find import FindSilhouettes as FindSilhouettes
+from pimper_torch.silhouettes.trace import TraceContours as TraceContours
 from pimper_torch.stage import Given as Given
 from pimper_torch.stage import Stage as Stage
 from pimper_torch.stage import Then as Then

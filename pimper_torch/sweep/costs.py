@@ -15,16 +15,16 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.kernels.arrays import as_array, pulled_back
-from pimper_torch.kernels.switch import compiled_for
-from pimper_torch.patches.sources import (
+from pimper_torch.geometry.pyramids import (
     Sources,
     centers_in_patches,
     image_from_patch,
     kernel_geometry,
     look_up,
 )
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.kernels.arrays import as_array, pulled_back
+from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
 _Array = NDArray[Any]

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from pimper_torch.config import Range, require, require_ranges
 from pimper_torch.failures import over_patches, skipped_patches
+from pimper_torch.geometry.pyramids import Sources, prepare
+from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.ledger import leave_out
 from pimper_torch.parallel import side_by_side
-from pimper_torch.patches.sources import Sources, prepare
-from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -9,6 +9,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d
 
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.projection import project
 from pimper_torch.mapped import drop_pages
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
@@ -20,7 +21,6 @@ from pimper_torch.records import (
     SparseScene,
     Views,
 )
-from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.viz.render import bounding_box, crop, frame, rotation, shade
 from pimper_torch.viz.tiles import (

@@ -20,12 +20,12 @@ from pimper_torch.asset.make import textured
 from pimper_torch.asset.tangents import tangents
 from pimper_torch.asset.write import write_asset, write_asset_obj
 from pimper_torch.errors import PimperWarning
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import write_glb
 from pimper_torch.parallel import on_one_thread
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Mesh, Textured
-from pimper_torch.sfm.colmap_surfaces import reduced
 from pimper_torch.viz.maps import base_color
 
 

@@ -28,10 +28,10 @@ from pimper_torch.coarse.trim import (
     without_small_holes,
 )
 from pimper_torch.coarse.window_matching import Matcher, Windows, level_of, pair
+from pimper_torch.geometry.poisson import poisson_surface, reduced
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.topology import connected_to
 from pimper_torch.records import Mesh, Support
-from pimper_torch.sfm.colmap_surfaces import poisson_surface, reduced
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 

@@ -14,7 +14,7 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Support
-from pimper_torch.silhouettes.contours import TraceContours
+from pimper_torch.silhouettes.trace import TraceContours
 from tests.coarse.ball import SETTINGS, photographed, silhouettes_of
 
 SMALL_HOLES = FineSurfaceConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1

@@ -10,9 +10,9 @@ from pimper_torch.errors import InputError
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
+from pimper_torch.geometry.visual_hull import Hull
 from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
-from pimper_torch.silhouettes.hull import Hull
 
 SPACING = 0.02
 

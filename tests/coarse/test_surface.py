@@ -12,11 +12,11 @@ from pimper_torch.coarse.surface import (
     two_faces_an_edge,
 )
 from pimper_torch.errors import InputError, ReconstructionError
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Mesh, Silhouettes, Support
-from pimper_torch.silhouettes.contours import Contours
 from tests.coarse.ball import SETTINGS, photographed
 
 

@@ -13,11 +13,11 @@ from pimper_torch.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.fusion.equations import Equations
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights, Term, TouchedRays
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
 from pimper_torch.reporting import figures
-from pimper_torch.silhouettes.contours import Contours
 from pimper_torch.sweep.sweep import Sweep
 
 

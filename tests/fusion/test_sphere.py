@@ -11,10 +11,11 @@ from pimper_torch.fusion.estimate import fuse_terms
 from pimper_torch.fusion.fuse import Fuse, FuseConfig
 from pimper_torch.fusion.problem import pose
 from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.transfer import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -24,7 +25,6 @@ from pimper_torch.records import (
     Silhouettes,
     SweptPatches,
 )
-from pimper_torch.silhouettes.contours import Contours
 from tests.threads import on_threads
 
 # The sphere is of radius 1 about this point, and seen from -z.

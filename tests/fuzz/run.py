@@ -35,8 +35,8 @@ from mutations import mutated
 from seeds import Seed, make_seeds
 
 from pimper_torch.errors import PimperError
+from pimper_torch.geometry.colmap_library import loaded
 from pimper_torch.records import Record
-from pimper_torch.sfm.colmap import loaded
 from pimper_torch.sfm.model import SparseModel
 
 LIMIT_BYTES, LIMIT_SECONDS = 2 * 2**30, 20.0

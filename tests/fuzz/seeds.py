@@ -44,6 +44,7 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
 from pimper_torch.config import build, read_mapping, to_yaml
 from pimper_torch.exchange.alicevision import write_sfm
 from pimper_torch.exchange.openexr import write_exr
+from pimper_torch.geometry.lens_models import pinhole_lenses
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.decode import decode, write_deep_png
@@ -53,7 +54,7 @@ from pimper_torch.io.responses import read_curve
 from pimper_torch.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
-from pimper_torch.sfm.colmap import pinhole_lenses, read_model, reconstruction_of, write_binary
+from pimper_torch.sfm.colmap import read_model, reconstruction_of, write_binary
 from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.video.read import luma_frames

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
+from pimper_torch.geometry.pyramids import prepare
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.patches.sources import prepare
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.records import Mesh
 from pimper_torch.sweep.costs import Hypotheses, costs_of

@@ -3,9 +3,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.pyramids import look_up, pyramid_level
 from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.sources import look_up, pyramid_level
 from pimper_torch.patches.warp import Warp, WarpConfig
 from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.reporting import figures

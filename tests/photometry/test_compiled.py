@@ -10,11 +10,11 @@ from torch.testing import assert_close
 from twins import using
 
 from pimper_torch.errors import PimperWarning
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.bilinear import residual_deviation
 from pimper_torch.photometry.factorize import Factorize
 from pimper_torch.photometry.fit_light import FitLight
 from pimper_torch.photometry.lights import fit_light_field, thinned
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 
 

@@ -7,11 +7,11 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
 
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Squares
 from pimper_torch.photometry.bilinear import Bilinear
 from pimper_torch.photometry.cone import Cone
 from pimper_torch.photometry.factor_gradients import differentiable
 from pimper_torch.photometry.quadratics import outer
-from pimper_torch.photometry.robust import Cauchy, GemanMcClure, Huber, Squares
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import Free
 

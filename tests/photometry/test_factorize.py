@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from pimper_torch.chains.presets import load_config
 from pimper_torch.errors import ConfigError, PimperWarning
-from pimper_torch.patches.transfer import coarse_normals
+from pimper_torch.geometry.template_normals import coarse_normals
 from pimper_torch.photometry import factorize
 from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
 from pimper_torch.photometry.fit_light import FitLight, FitLightConfig

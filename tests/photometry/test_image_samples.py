@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.linalg.robust import CAUCHY_TUNING
 from pimper_torch.photometry.light_models import ImageSamples
-from pimper_torch.photometry.robust import CAUCHY_TUNING
 
 
 @pytest.fixture

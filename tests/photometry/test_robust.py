@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from torch.testing import assert_close
 
 from pimper_torch.errors import ConfigError
-from pimper_torch.photometry.robust import (
+from pimper_torch.linalg.robust import (
     Cauchy,
     GemanMcClure,
     Huber,

@@ -8,7 +8,7 @@ from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
-from pimper_torch.sfm.sparse_scene import with_views
+from pimper_torch.records.scene_parts import with_views
 
 
 def noisy(normals, degrees, seed=1):

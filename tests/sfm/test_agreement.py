@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from pimper_torch.geometry.lens_models import distort
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.sfm.colmap import distort
 from pimper_torch.sfm.doubt import agreement, judged
 from pimper_torch.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.sfm.model import select_views

@@ -4,9 +4,9 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.errors import ConfigError
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap_surfaces import reduced
 
 
 def ball(level: int = 5) -> Mesh:

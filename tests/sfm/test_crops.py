@@ -11,10 +11,11 @@ from torch.nn.functional import interpolate, pad
 from torch.testing import assert_close
 
 from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.geometry.lens_models import pinhole_of
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import pinhole_of, write_binary
+from pimper_torch.sfm.colmap import write_binary
 from pimper_torch.sfm.existing import existing_ways
 from pimper_torch.sfm.reconstruct import Reconstruct
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig

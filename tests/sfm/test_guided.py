@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.io.photographs import load_views
-from pimper_torch.sfm.colmap import loaded, quiet
 from pimper_torch.sfm.features import find_features, workspace
 from pimper_torch.sfm.matching import (
     Features,

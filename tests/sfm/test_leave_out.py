@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from pimper_torch.geometry.colmap_library import loaded
 from pimper_torch.sfm.camera_in_place import mapped
-from pimper_torch.sfm.colmap import loaded
 from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.sfm.static_background import leave_out_room
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable

@@ -10,15 +10,10 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.geometry.colmap_library import loaded
+from pimper_torch.geometry.lens_models import pinhole_lenses
 from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.colmap import (
-    loaded,
-    model_of,
-    pinhole_lenses,
-    read_model,
-    reconstruction_of,
-    write_binary,
-)
+from pimper_torch.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
 from pimper_torch.sfm.model import SparseModel
 from pimper_torch.sfm.model_files import CAMERA_MODELS
 

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.geometry.lens_models import undistort_pixels
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.geometry.rigid import transform
-from pimper_torch.sfm import colmap
 from pimper_torch.sfm.camera_in_place import mapped
 from pimper_torch.sfm.colmap import read_model
 from pimper_torch.sfm.reconstruct import Reconstruct
@@ -85,7 +85,7 @@ def test_maps_to_a_static_background_are_those_of_undistorted_pictures(scene, vi
     for view in range(4):
         lens, K = model.lenses[view], scene.cameras.intrinsics[view].double()
         ends = (seen, mapped(shift[view], seen))
-        pinhole = [mapped(K, colmap.undistort_pixels(lens, pixels)) for pixels in ends]
+        pinhole = [mapped(K, undistort_pixels(lens, pixels)) for pixels in ends]
         assert (mapped(found[view], pinhole[0]) - pinhole[1]).norm(dim=1).max() < 0.2
 
 

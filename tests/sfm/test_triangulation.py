@@ -9,11 +9,12 @@ import torch
 from torch.nn.functional import grid_sample
 
 from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.geometry.lens_models import pinhole_of, undistort_pixels
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import observation_errors, pinhole_of, undistort_pixels
+from pimper_torch.sfm.colmap import observation_errors
 from pimper_torch.sfm.conventions.resized_pictures import Ways
 from pimper_torch.sfm.epipolar import explained, pinholes_of
 from pimper_torch.sfm.existing import existing_ways

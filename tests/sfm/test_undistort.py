@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.geometry.lens_models import distort, is_pinhole, undistort_pixels
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import distort, is_pinhole, undistort_pixels
 from pimper_torch.sfm.undistort import photograph_pixels, pinhole_for, undistort
 
 

@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.errors import PimperWarning
-from pimper_torch.silhouettes.contours import TraceContours
-from pimper_torch.silhouettes.hull import box_round
+from pimper_torch.geometry.visual_hull import box_round
+from pimper_torch.silhouettes.trace import TraceContours
 from tests.silhouettes.shapes import PIXEL, ball, silhouettes_of, two_balls
 
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.geometry.opencv import signed_distance
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.supporting_plane import Plane, fixation
@@ -10,7 +11,6 @@ from pimper_torch.silhouettes import cuts, find
 from pimper_torch.silhouettes.cues import Cues, cues_of
 from pimper_torch.silhouettes.cuts import Cuts, cuts_of
 from pimper_torch.silhouettes.find import FindSilhouettes, masked
-from pimper_torch.silhouettes.opencv import signed_distance
 from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement, working_pictures
 from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.visual_hull import margins, visual_hull
 from pimper_torch.records import Cameras, Silhouettes
-from pimper_torch.silhouettes.hull import margins, visual_hull
 
 BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
 

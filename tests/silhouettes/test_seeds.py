@@ -3,6 +3,13 @@
 import pytest
 import torch
 
+from pimper_torch.geometry.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    signed_distance,
+)
 from pimper_torch.silhouettes.cuts import (
     exposed_fraction,
     filled,
@@ -13,13 +20,6 @@ from pimper_torch.silhouettes.cuts import (
     not_seen_through,
     off_level,
     off_plane,
-)
-from pimper_torch.silhouettes.opencv import (
-    BACKGROUND,
-    OBJECT,
-    PERHAPS_BACKGROUND,
-    PERHAPS_OBJECT,
-    signed_distance,
 )
 
 WIDTH, HEIGHT = 320, 240

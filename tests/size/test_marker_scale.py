@@ -11,8 +11,8 @@ from PIL import Image
 import pimper_torch as pt
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.cli.options import bundled_photographs
+from pimper_torch.geometry.opencv import shrunk, warped
 from pimper_torch.geometry.pixels import scale_intrinsics
-from pimper_torch.silhouettes.opencv import shrunk, warped
 from pimper_torch.size import marker_scale
 from pimper_torch.size.aruco import find_squares
 from pimper_torch.size.find_scale import find_scale

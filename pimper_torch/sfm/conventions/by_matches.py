@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.errors import InputError, caution
-from pimper_torch.sfm.colmap import pinhole_of
+from pimper_torch.geometry.lens_models import pinhole_of
 from pimper_torch.sfm.conventions import resized_pictures
 from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.sfm.epipolar import explained, match_errors, pinholes_of, undistorted_pairs

@@ -16,12 +16,11 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize, one_hot
 
 from pimper_torch.errors import InputError, caution, some
+from pimper_torch.geometry.lens_models import distort, pinhole_of
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.mapped import drop_pages
 from pimper_torch.records import Views
-from pimper_torch.sfm import colmap
-from pimper_torch.sfm.colmap import pinhole_of
 from pimper_torch.sfm.conventions.choice import surely_better
 from pimper_torch.sfm.lenses import QUARTERS, cropped_lens, turned_size
 from pimper_torch.sfm.model import SparseModel, longest_tracks
@@ -278,7 +277,7 @@ def _sides(model: SparseModel) -> Float[Tensor, "observation 2 2"]:
         points = model.observation_point[here]
         ends = torch.cat([model.points_world[points, None], axes[points]], dim=1)
         rays = transform(model.cam_from_world[view], ends.reshape(-1, 3))
-        pixels = colmap.distort(lens, rays).reshape(-1, 3, 2)
+        pixels = distort(lens, rays).reshape(-1, 3, 2)
         sides[here] = pixels[:, 1:] - pixels[:, :1]
     return sides
 
@@ -320,7 +319,7 @@ def _axes(model: SparseModel) -> Float[Tensor, "point 2 3"]:
     towards = normalize(points - centers, dim=1)
     count = len(model.points_world)
     mean = towards.new_zeros(count, 3).index_add(0, point, towards)
-    focal = torch.stack([colmap.pinhole_of(lens)[0, 0] for lens in model.lenses])
+    focal = torch.stack([pinhole_of(lens)[0, 0] for lens in model.lenses])
     length = towards.new_zeros(count).index_add(0, point, depth.abs() / focal[view])
     length = length / torch.bincount(point, minlength=count).clamp_min(1)
     mean = normalize(mean, dim=1)

@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.photometry.variable_projection import solve_variable_projection
 from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from pimper_torch.errors import InputError
-from pimper_torch.photometry.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 
 # Differences are taken over cells of 1/64 of the object's size, and equations averaged over blocks

@@ -21,10 +21,10 @@ from pimper_bench.datasets.posed import (
 from pimper_torch.camera_files.layout import DataSetPath
 from pimper_torch.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.errors import InputError
+from pimper_torch.geometry.lens_models import distort
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Lens
-from pimper_torch.sfm.colmap import distort
 
 LENS = Lens(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
 

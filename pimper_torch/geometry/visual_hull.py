@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
+from pimper_torch.geometry.opencv import signed_distance
 from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.geometry.projection import rays_through, triangulate_rays
 from pimper_torch.mapped import parts
 from pimper_torch.parallel import side_by_side
 from pimper_torch.records import Cameras, Record, Silhouettes
-from pimper_torch.silhouettes.opencv import signed_distance
 
 _STRIDE = 4  # pixels between rays; how deep they get is interpolated
 _UNSEEN = 1e9  # pixels; stands beyond the photograph's border, where a view abstains

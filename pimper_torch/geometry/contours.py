@@ -18,15 +18,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.config import Range, require_ranges
-from pimper_torch.errors import caution
 from pimper_torch.failures import solved_or
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.ledger import leave_out
+from pimper_torch.geometry.visual_hull import Everywhere, Hull
 from pimper_torch.parallel import num_workers, side_by_side
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
-from pimper_torch.silhouettes.hull import Everywhere, Hull, box_round, visual_hull
-from pimper_torch.stage import Stage
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
@@ -351,12 +348,6 @@ def ambiguous(
     return last > first
 
 
-# Fraction of the views whose silhouette may be wrong at a place. Those that are found lack parts in
-# shadow: with 0.05, where 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are
-# not covered, with 0.1 0.3 %. With 0.15 one of 8 views is outvoted: Chamfer 0.19 for 0.12.
-_DISAGREEING = {"masks": 0.03, "found": 0.1}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Contours(Record):
     """Rays that the surface is tangent to, and the hull that it lies in.
@@ -395,40 +386,3 @@ class Contours(Record):
                 ray=rays.view,
             )
         return contour_points(self.rays, self.cameras, self.hull, points_world, normals_world)
-
-
-class TraceContours(Stage):
-    """Turn silhouettes into constraints on the surface; a constant to autograd."""
-
-    def __init__(self, config: RayConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or RayConfig()
-
-    @torch.no_grad()
-    def forward(self, silhouettes: Silhouettes, cameras: Cameras) -> Contours:
-        """Cast rays through the silhouettes and build their visual hull.
-
-        Returns:
-            Contours that constrain nothing where silhouettes leave nothing out, and, with a
-            warning, where they have no place in common.
-        """
-        if silhouettes.source == "everything":
-            return Contours.none(silhouettes, cameras)
-        box = box_round(silhouettes, cameras)
-        hull = None
-        if box is not None:  # voxels need no more than single precision
-            fraction = _DISAGREEING[silhouettes.source]
-            hull = visual_hull(
-                silhouettes, cameras.to(torch.float32), box.float(), disagreeing=fraction
-            )
-        leave_out("contours.hull", hull is None)
-        if hull is None:
-            caution(
-                "contours: the silhouettes of the views have no place in common, so that they "
-                "say nothing about the surface. Look at the masks: do they show the same "
-                "object in all photographs?",
-                stacklevel=2,
-            )
-            return Contours.none(silhouettes, cameras)
-        rays = contour_rays(silhouettes, cameras, self.config)
-        return Contours(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)

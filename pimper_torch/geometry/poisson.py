@@ -16,11 +16,11 @@ from torch.nn.functional import normalize
 
 from pimper_torch.config import require
 from pimper_torch.errors import ReconstructionError
+from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import barycentric
 from pimper_torch.geometry.topology import half_edges
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap import loaded, quiet
 
 
 def write_cloud(
