@@ -19,9 +19,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from pimper_torch.geometry.rigid import invert_rigid, transform
+from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.paper.align import Align
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -20,7 +20,7 @@ from one_view import OneView, photograph, point_lights
 from reliefs import align_reliefs, ball, bumps, bumps_in_perspective, regions
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,

@@ -7,10 +7,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.surfaces import unit_face_normals
-from pimper_torch.geometry.topology import boundary_loops, face_components, face_edges, face_pairs
+from pimper_torch.ground.geometry.surfaces import unit_face_normals
+from pimper_torch.ground.geometry.topology import (
+    boundary_loops,
+    face_components,
+    face_edges,
+    face_pairs,
+)
 from pimper_torch.records import Mesh, Record
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

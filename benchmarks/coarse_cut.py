@@ -13,10 +13,10 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor
 
-from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.coarse.oriented import OrientedPoints
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.visual_hull import Hull
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.visual_hull import Hull
+from pimper_torch.method.coarse.densify import DepthMaps
+from pimper_torch.method.coarse.oriented import OrientedPoints
 from pimper_torch.records import ContourPoints
 
 # Capacities are integers there.

@@ -12,7 +12,7 @@ from pathlib import Path
 import scipy.io
 import torch
 
-from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import (
     low_rank_problem,
     random_left,

@@ -24,8 +24,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
-from pimper_torch.errors import PimperWarning
-from pimper_torch.memory import release_memory
+from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.runtime.memory import release_memory
 
 STAGES = ("warp", "factorize", "sweep", "fuse", "repair", "remesh", "decompose", "extract")
 

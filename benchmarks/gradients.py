@@ -15,7 +15,7 @@ import torch
 from probes import probes, rendered_scene, small_scene
 
 import pimper_torch as pt
-from pimper_torch.errors import PimperWarning
+from pimper_torch.runtime.errors import PimperWarning
 
 
 def main() -> None:

@@ -35,13 +35,13 @@ from pimper_bench.datasets import read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface, true_surface
-from pimper_torch.chains.presets import load_chain
-from pimper_torch.errors import PimperError
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.io.photographs import load_views
-from pimper_torch.ledger import GUARDS, listening
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.geometry.nearest import NearestSurface
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.chains.presets import load_chain
 from pimper_torch.records import Capture, Estimate, LeftOut, Reconstruction
+from pimper_torch.runtime.errors import PimperError
+from pimper_torch.runtime.ledger import GUARDS, listening
 
 # A place is right within this fraction of the object's diagonal: five times what accurate surfaces
 # are off. Cameras are good within these errors; all choices.
@@ -179,7 +179,7 @@ def run(place: Path, spoilt: list[str], one: Set, preset: str, without: str) -> 
     began = time.perf_counter()
     with ExitStack() as stack:
         for target, replacement in PATCHES.get(without, {}).items():
-            stack.enter_context(patch(f"pimper_torch.{target}", replacement))
+            stack.enter_context(patch(f"pimper_torch.method.{target}", replacement))
         stack.enter_context(listening(heard))
         try:
             result = chain(

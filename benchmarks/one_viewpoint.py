@@ -12,11 +12,11 @@ from torch import Tensor
 
 from pimper_bench.datasets.diligent import FLIP, decoded_normals, directed_lights
 from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
-from pimper_torch.camera_files.layout import DataSetPath, contents
-from pimper_torch.io.photographs import read_mask
-from pimper_torch.numpy_files import read_npz
-from pimper_torch.radiometry import LINEAR
+from pimper_torch.doors.camera_files.layout import DataSetPath, contents
+from pimper_torch.doors.io.photographs import read_mask
+from pimper_torch.ground.radiometry import LINEAR
 from pimper_torch.records import Capture, Record, Truth, Views
+from pimper_torch.runtime.numpy_files import read_npz
 
 _UW = "the UW photometric stereo set"
 _YALE = "the Yale face database B"

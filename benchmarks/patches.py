@@ -15,11 +15,11 @@ import time
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.linalg.robust import Cauchy, Squares
-from pimper_torch.photometry.bilinear import Bilinear, evaluate
-from pimper_torch.photometry.cone import Cone
-from pimper_torch.photometry.factorize import SOLVERS
-from pimper_torch.photometry.light_field import harmonics
+from pimper_torch.ground.linalg.robust import Cauchy, Squares
+from pimper_torch.method.photometry.bilinear import Bilinear, evaluate
+from pimper_torch.method.photometry.cone import Cone
+from pimper_torch.method.photometry.factorize import SOLVERS
+from pimper_torch.method.photometry.light_field import harmonics
 
 # How strongly lights are held to their start, as a fraction of what the data say, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))

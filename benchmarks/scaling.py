@@ -21,8 +21,8 @@ import sys
 import time
 from pathlib import Path
 
-from pimper_torch.cores import usable_cores
-from pimper_torch.doctor.cost import estimate
+from pimper_torch.cli.doctor.cost import estimate
+from pimper_torch.runtime.cores import usable_cores
 
 WORKERS = (1, 10, 100)
 PHOTOGRAPHS = (100, 1_000, 10_000, 100_000)

@@ -43,15 +43,15 @@ from PIL import Image
 from pimper_bench.bench.measure import peak_memory, this_machine
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.chains.presets import make_chain
 from pimper_torch.cli.options import Job, parse
-from pimper_torch.cores import usable_cores
-from pimper_torch.io.photographs import load_views
-from pimper_torch.io.results import write_result
-from pimper_torch.outputs.folders import held_output
-from pimper_torch.outputs.marker import STAGES
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.doors.io.results import write_result
+from pimper_torch.doors.outputs.folders import held_output
+from pimper_torch.doors.outputs.marker import STAGES
+from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.records import StageReport, Views
-from pimper_torch.reporting import ASIDE
+from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.runtime.reporting import ASIDE
 
 SCENES = ("mug", "jar", "balls", "potatoes", "pair")
 SIZES = (0.5, math.sqrt(0.5), 1.0)  # of photographs: 1, 2 and 4 times the samples
@@ -328,7 +328,7 @@ def with_floors(
 def watch_cycles(meter: Meter) -> None:
     """Time every multigrid cycle; where they are made otherwise, there is no floor."""
     try:
-        from pimper_torch.linalg.hierarchy import Hierarchy
+        from pimper_torch.ground.linalg.hierarchy import Hierarchy
 
         cycle: Callable[..., Any] = Hierarchy.cycle
     except (ImportError, AttributeError):
@@ -369,7 +369,7 @@ def colmap_seconds(views: Views) -> float:
     """Run structure from motion with COLMAP's own settings."""
     from sfm import COLMAP  # the script beside this one
 
-    from pimper_torch.sfm.reconstruct import Reconstruct
+    from pimper_torch.method.sfm.reconstruct import Reconstruct
 
     began = time.perf_counter()
     Reconstruct(COLMAP)(views)

@@ -20,10 +20,10 @@ from PIL import Image
 
 import pimper_torch as pt
 from pimper_torch.cli.options import bundled_photographs
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.records import Cameras, Mesh, Views
-from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, frame, shade
+from pimper_torch.result.viz.maps import normal_colors, view_maps
+from pimper_torch.result.viz.render import bounding_box, frame, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
@@ -46,8 +46,10 @@ STAGES = {
     "CoarseSurface.": "coarse_surface",
     "Decompose.": "decompose",
     "Warp.": "warp",
+    "FitLight.": "light",
     "Factorize.": "factorize",
     "Sweep.": "sweep",
+    "FixGauge.": "gauge",
     "Fuse.": "fuse",
     "Repair.": "repair",
     "Remesh.": "remesh",
@@ -171,12 +173,12 @@ def stage_of(code: CodeType) -> str | None:
 
 
 def room_of(code: CodeType) -> str | None:
-    """Return the room of the package that a function stands in."""
+    """Return the room of the package that a function stands in, or its floor."""
     try:
-        path = Path(code.co_filename).relative_to(PACKAGE)
+        folders = Path(code.co_filename).relative_to(PACKAGE).parts[:-1]
     except ValueError:
         return None
-    return path.parts[0] if len(path.parts) > 1 else "(modules beside the rooms)"
+    return folders[:2][-1] if folders else "(modules beside the rooms)"
 
 
 def largest(step: pt.Step) -> int:

@@ -19,11 +19,25 @@ Photographs and cameras at hand come in by ``scene_of``. The rest is in rooms, w
 What documents call ``pt.Mesh`` or ``pt.Warp`` is that of its room.
 """
 
+from importlib import import_module
+
 import lazy_loader
 
 # Public names stand in `__init__.pyi`, for type checkers, too. What needs torch is imported when it
 # is asked for, so that the command line answers at once.
 _public, _, _names = lazy_loader.attach_stub(__name__, __file__)
+
+# Rooms that users look into, and their floors; other modules stand where the tree shows them.
+_ROOMS = {
+    "batches": "cli",
+    "errors": "runtime",
+    "exchange": "doors",
+    "prior_files": "priors",
+    "radiometry": "ground",
+    "size": "doors",
+    "store": "runtime",
+    "viz": "result",
+}
 
 __all__ = [
     *("batches", "errors", "exchange", "prior_files", "priors", "radiometry", "records"),
@@ -35,9 +49,11 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        from pimper_torch.io.version import installed_version
+        from pimper_torch.doors.io.version import installed_version
 
         return installed_version()
+    if name in _ROOMS:
+        return import_module(f"{__name__}.{_ROOMS[name]}.{name}")
     return _public(name)
 
 

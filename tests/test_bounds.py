@@ -11,8 +11,8 @@ import yaml
 
 import pimper_bench
 import pimper_torch
-from pimper_torch.config import Range, build, require_ranges, to_yaml
-from pimper_torch.errors import ConfigError
+from pimper_torch.runtime.config import Range, build, require_ranges, to_yaml
+from pimper_torch.runtime.errors import ConfigError
 
 ABSURD = (10**11, -1, 0, math.nan, math.inf)
 # A whole number above this is no count: an array of as many numbers does not fit a machine.

@@ -25,11 +25,10 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.chains.coarse_to_fine import held_apart
-from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.method.chains.coarse_to_fine import held_apart
+from pimper_torch.method.coarse.surface import CoarseSurface
 from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
 from pimper_torch.records import (
     CoarseMesh,
@@ -39,7 +38,8 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
 )
-from pimper_torch.stage import Given
+from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.runtime.stage import Given
 from tests.coarse import ball
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures
@@ -229,7 +229,9 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene):
     )
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")  # lit in too few views
+@pytest.mark.filterwarnings(
+    "ignore::pimper_torch.runtime.errors.PimperWarning"
+)  # lit in too few views
 @pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     """With the coarse surface's own details for small photographs."""
@@ -253,7 +255,9 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     assert extracted.figures["openings"] == 0
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")  # lit in too few views
+@pytest.mark.filterwarnings(
+    "ignore::pimper_torch.runtime.errors.PimperWarning"
+)  # lit in too few views
 def test_fast_is_closed_all_round_in_one_pass():
     scene = ball.photographed(ball.all_round())
     views = scene.views.replace(masks=ball.silhouettes_of(scene.cameras).masks)
@@ -268,7 +272,9 @@ def test_fast_is_closed_all_round_in_one_pass():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")  # facets at the contour
+@pytest.mark.filterwarnings(
+    "default::pimper_torch.runtime.errors.PimperWarning"
+)  # facets at the contour
 def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     truth = potato_on_table(num_views=9, width=160, height=120)
     save_photographs(truth.views, tmp_path / "photos")
@@ -292,7 +298,7 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     assert surface.mean_angle_deg < 0.5 * facets.mean_angle_deg
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(preset):
     cameras = ball.all_round().take(torch.arange(24) // 2)

@@ -6,10 +6,10 @@ from typing import Literal
 import pytest
 import yaml
 
-from pimper_torch import config as config_module
-from pimper_torch.chains.presets import load_config
-from pimper_torch.chains.published import PublishedConfig
-from pimper_torch.config import (
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.chains.published import PublishedConfig
+from pimper_torch.runtime import config as config_module
+from pimper_torch.runtime.config import (
     build,
     find_config,
     overlay,
@@ -19,7 +19,7 @@ from pimper_torch.config import (
     to_mapping,
     to_yaml,
 )
-from pimper_torch.errors import ConfigError
+from pimper_torch.runtime.errors import ConfigError
 
 
 class Shade(Enum):

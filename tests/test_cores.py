@@ -5,8 +5,8 @@ import os
 import pytest
 
 from pimper_torch.cli.main import main
-from pimper_torch.cores import usable_cores
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.runtime.cores import usable_cores
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ from pimper_torch.sfm.reconstruct_config import ReconstructConfig
 def test_affinity_and_quota_limit_cores(files, cores, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    monkeypatch.setattr("pimper_torch.cores._CGROUP", tmp_path)
+    monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     (tmp_path / "cpu").mkdir()
     for name, text in files.items():
@@ -40,7 +40,7 @@ def test_affinity_and_quota_limit_cores(files, cores, monkeypatch, tmp_path):
 
 def test_a_system_without_affinity_has_all_its_cores(monkeypatch, tmp_path):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    monkeypatch.setattr("pimper_torch.cores._CGROUP", tmp_path)
+    monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     for count, cores in ((6, 6), (None, 1)):
         monkeypatch.setattr(os, "cpu_count", lambda count=count: count)
@@ -50,14 +50,14 @@ def test_a_system_without_affinity_has_all_its_cores(monkeypatch, tmp_path):
 @pytest.mark.parametrize(("told", "cores"), [("3", 3), ("99", 8), ("0", 1), ("4,2", 8), ("", 8)])
 def test_the_number_of_threads_limits_cores(told, cores, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    monkeypatch.setattr("pimper_torch.cores._CGROUP", tmp_path)
+    monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", told)
     assert usable_cores() == cores
 
 
 def test_a_quota_limits_the_threads_of_torch(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    monkeypatch.setattr("pimper_torch.cores._CGROUP", tmp_path)
+    monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
     (tmp_path / "cpu.max").write_text("100000 100000")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert main(["config"]) == 0

@@ -18,7 +18,7 @@ from pimper_torch.paper.refine import Refine
 from tests.coarse import ball
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 SLOW = pytest.mark.slow
 
 

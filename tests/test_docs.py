@@ -23,12 +23,12 @@ from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
-from pimper_torch.batches import task
-from pimper_torch.chains import presets
-from pimper_torch.chains.presets import load_config
-from pimper_torch.photometry.light_field import harmonics
+from pimper_torch.cli.batches import task
+from pimper_torch.method.chains import presets
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.photometry.light_field import harmonics
+from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.records import Silhouettes, SparseScene, Views
-from pimper_torch.sfm.reconstruct import Reconstruct
 from tests.relighting import ball
 
 PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
@@ -144,7 +144,7 @@ def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 
 @pytest.mark.usefixtures("small_pictures")
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("default::pimper_torch.runtime.errors.PimperWarning")
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (block,) = BLOCKS
@@ -270,7 +270,7 @@ def run_block(page: str, number: int, monkeypatch: pytest.MonkeyPatch) -> dict[s
 
 @pytest.mark.parametrize(("page", "number"), GIVEN_TO)
 @pytest.mark.usefixtures("small_pictures")
-@pytest.mark.filterwarnings("default::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("default::pimper_torch.runtime.errors.PimperWarning")
 def test_the_python_of_the_pages_runs(page, number, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_block(page, number, monkeypatch)

@@ -10,9 +10,22 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.chains.photometric import Photometric
-from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
-from pimper_torch.failures import (
+from pimper_torch.doors.io.reports import summary_report
+from pimper_torch.ground.linalg.prepared import SingularSystemError
+from pimper_torch.method.chains.photometric import Photometric
+from pimper_torch.method.fusion import estimate
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.photometry import factorize as factorization
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight
+from pimper_torch.method.sfm.sparse_scene import sound
+from pimper_torch.method.silhouettes.find import FindSilhouettes
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.method.sweep.sweep import Sweep
+from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
+from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.runtime.failures import (
     by_data,
     distinct,
     out_of_memory,
@@ -21,21 +34,8 @@ from pimper_torch.failures import (
     solved_or,
     warn_of,
 )
-from pimper_torch.failures import collecting as collecting_entries
-from pimper_torch.fusion import estimate
-from pimper_torch.io.reports import summary_report
-from pimper_torch.linalg.prepared import SingularSystemError
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.warp import Warp
-from pimper_torch.photometry import factorize as factorization
-from pimper_torch.photometry.factorize import Factorize
-from pimper_torch.photometry.fit_light import FitLight
-from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
-from pimper_torch.sfm.sparse_scene import sound
-from pimper_torch.silhouettes.find import FindSilhouettes
-from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.stage import Given
-from pimper_torch.sweep.sweep import Sweep
+from pimper_torch.runtime.failures import collecting as collecting_entries
+from pimper_torch.runtime.stage import Given
 
 # As torch words it on the CPU.
 NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."
@@ -412,7 +412,7 @@ def chain_of(scene, coarse, on_failure="skip"):
     return chain
 
 
-@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
 def test_a_run_with_a_bad_view_ends_with_a_warning_and_a_line_in_the_summary(recwarn):
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     name = scene.views.names[2]
@@ -431,7 +431,7 @@ def test_a_run_with_a_bad_view_ends_with_a_warning_and_a_line_in_the_summary(rec
         chain(bad.views)
 
 
-@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
 @pytest.mark.parametrize("broken", [1, 3])
 def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broken):
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
@@ -452,7 +452,7 @@ def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broke
         chain_of(scene, coarse, on_failure="fail")(scene.views)
 
 
-@pytest.mark.filterwarnings("always::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
 def test_a_facet_without_area_is_left_out_and_the_others_are_as_they_were(given):
     _, cameras, patches = given
     coarse = patches.coarse

@@ -2,8 +2,8 @@ import unicodedata
 
 import pytest
 
-from pimper_torch.errors import InputError
-from pimper_torch.file_names import match_files
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.file_names import match_files
 
 
 def matched(wanted, present, folder=""):

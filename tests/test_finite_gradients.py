@@ -12,7 +12,8 @@ from pimper_bench.scenes import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::pimper_torch.errors.PimperWarning", "ignore:Converting a tensor with requires_grad"
+    "ignore::pimper_torch.runtime.errors.PimperWarning",
+    "ignore:Converting a tensor with requires_grad",
 )
 
 # What no view lights is in the mug.

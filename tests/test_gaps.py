@@ -8,9 +8,9 @@ from probes import small_scene
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.stage import Given
+from pimper_torch.runtime.stage import Given
 
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 SETTINGS = {"default": {"scales": [0.5, 1.0]}, "paper": {}}
 GAPS = {

@@ -10,10 +10,10 @@ from torch.nn.functional import normalize
 import pimper_torch as pt
 from pimper_bench.scenes import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.photometry.factor_priors import FactorPrior, Known
-from pimper_torch.photometry.light_field import harmonics
+from pimper_torch.method.photometry.factor_priors import FactorPrior, Known
+from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes
-from pimper_torch.stage import Given
+from pimper_torch.runtime.stage import Given
 
 # What is promised of the chain whole; single stages do far better. Kinks that are too small to tell
 # from slopes, at borders of pixels, are left: more of them in a whole scene.
@@ -21,7 +21,7 @@ STAGE, SCENE, WHOLE = 0.002, 0.005, 0.02
 
 
 # Some of the few patches are not determined by light: their normals are those they started with.
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
 @pytest.fixture(scope="module")

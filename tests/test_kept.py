@@ -7,14 +7,14 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.errors import PimperWarning, caution
-from pimper_torch.meshing.extract import Extract
+from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.records import Mesh, Surface
-from pimper_torch.reporting import Silent
-from pimper_torch.stage import Given
-from pimper_torch.store import digest
+from pimper_torch.runtime.errors import PimperWarning, caution
+from pimper_torch.runtime.reporting import Silent
+from pimper_torch.runtime.stage import Given
+from pimper_torch.runtime.store import digest
 
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 # Of two passes over given facets, in order.
 STAGES = ["silhouettes", "light", "photometry", "fuse", "remesh"]

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 import pimper_torch
-from pimper_torch.failures import collecting, distinct, skipped
-from pimper_torch.journal import noted
-from pimper_torch.ledger import (
+from pimper_torch.records import Failure, LeftOut
+from pimper_torch.runtime.failures import collecting, distinct, skipped
+from pimper_torch.runtime.journal import noted
+from pimper_torch.runtime.ledger import (
     GUARDS,
     closing_line,
     leave_out,
     left_out_of,
     listening,
 )
-from pimper_torch.parallel import side_by_side
-from pimper_torch.records import Failure, LeftOut
+from pimper_torch.runtime.parallel import side_by_side
 
 FAILED = Failure(stage="warp", what="patch", name="3", reason="numbers", done="Left out")
 
@@ -49,7 +49,7 @@ def test_outside_of_a_run_nothing_is_noted():
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_what_threads_leave_out_is_added_up_for_each_guard_and_call(threads, monkeypatch):
-    monkeypatch.setattr("pimper_torch.parallel.num_workers", lambda: threads)
+    monkeypatch.setattr("pimper_torch.runtime.parallel.num_workers", lambda: threads)
 
     def work(number):
         leave_out("warp", number, total=10)

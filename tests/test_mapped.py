@@ -9,14 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch import mapped
-from pimper_torch.errors import OutputError
-from pimper_torch.geometry.pyramids import prepare
-from pimper_torch.io.photographs import load_views
-from pimper_torch.memory import resident_bytes
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.geometry.pyramids import prepare
+from pimper_torch.method.sfm.undistort import undistort
 from pimper_torch.records import Lens, Silhouettes
-from pimper_torch.sfm.undistort import undistort
-from pimper_torch.store import digest, settled
+from pimper_torch.runtime import mapped
+from pimper_torch.runtime.errors import OutputError
+from pimper_torch.runtime.memory import resident_bytes
+from pimper_torch.runtime.store import digest, settled
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
@@ -85,7 +85,7 @@ def test_nothing_is_left_of_a_file_and_its_space_comes_back(small, tmp_path):
 @LINUX
 def test_nothing_is_left_after_a_kill(tmp_path):
     code = (
-        "import os, signal; from pimper_torch import mapped; mapped.LARGE = 1;"
+        "import os, signal; from pimper_torch.runtime import mapped; mapped.LARGE = 1;"
         "mapped._in_memory = lambda folder: False; held = mapped.zeros((1000,)); held += 1;"
         "print(len(mapped._mapped), flush=True); os.kill(os.getpid(), signal.SIGKILL)"
     )

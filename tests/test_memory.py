@@ -5,9 +5,9 @@ import pytest
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.errors import ConfigError, ReconstructionError
-from pimper_torch.memory import bytes_of, largest_problem, resident_bytes
-from pimper_torch.patches.decompose import Decompose
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.runtime.errors import ConfigError, ReconstructionError
+from pimper_torch.runtime.memory import bytes_of, largest_problem, resident_bytes
 
 
 @pytest.mark.parametrize(("text", "size"), [("4GB", 4e9), ("800 mb", 8e8), ("", float("inf"))])
@@ -26,7 +26,7 @@ def test_a_surface_is_fused_whole_by_blocks_or_not_at_all(monkeypatch):
     patches = Decompose()(coarse, scene.cameras)
     assert largest_problem(float("inf"), patches, 0.5, 1.0) == float("inf")
     assert largest_problem(resident_bytes() + 1e9, patches, 0.5, 1.0) == float("inf")
-    monkeypatch.setattr("pimper_torch.memory.resident_bytes", lambda: 1e5)
+    monkeypatch.setattr("pimper_torch.runtime.memory.resident_bytes", lambda: 1e5)
     with pytest.raises(
         ReconstructionError, match=r"by blocks.*in all.*by a factor of 0\.\d+ a side"
     ):

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from pimper_torch.numpy_files import read_npy, read_npz
+from pimper_torch.runtime.numpy_files import read_npy, read_npz
 
 
 @pytest.mark.parametrize(

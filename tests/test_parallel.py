@@ -5,8 +5,8 @@ from contextvars import ContextVar
 import pytest
 import torch
 
-from pimper_torch.parallel import num_workers, over_rows, side_by_side
-from pimper_torch.progress import listening, track
+from pimper_torch.runtime.parallel import num_workers, over_rows, side_by_side
+from pimper_torch.runtime.progress import listening, track
 
 COLOUR: ContextVar[str] = ContextVar("colour", default="none")
 

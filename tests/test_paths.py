@@ -12,7 +12,7 @@ import pytest
 import pimper_torch
 
 # Rooms whose public functions people call; of the wings, what a room exports.
-ROOMS = ("chains", "config", "io", "records", "viz")
+ROOMS = ("method.chains", "runtime.config", "doors.io", "records", "result.viz")
 EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
@@ -22,7 +22,7 @@ def functions() -> Iterator[typing.Any]:
     for name in EXPORTING:
         room = importlib.import_module(f"pimper_bench.{name}")
         yield from (getattr(room, exported) for exported in room.__all__)
-    inner = (f"pimper_torch.{name}" for name in ("store.store", *modules()))
+    inner = (f"pimper_torch.{name}" for name in ("runtime.store.store", *modules()))
     for name in (*inner, "pimper_bench.bench.run_bench"):
         module = importlib.import_module(name)
         for found in vars(module).values():

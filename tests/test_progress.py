@@ -1,4 +1,4 @@
-from pimper_torch.progress import listening, part, report, track
+from pimper_torch.runtime.progress import listening, part, report, track
 
 
 def test_every_batch_is_reported_with_the_total():

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from pimper_torch import journal, reporting
-from pimper_torch.journal import aside, current
-from pimper_torch.progress import report
 from pimper_torch.records import Mesh, StageReport
-from pimper_torch.reporting import (
+from pimper_torch.runtime import journal, reporting
+from pimper_torch.runtime.journal import aside, current
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.reporting import (
     Silent,
     accounted,
     called,
@@ -127,7 +127,7 @@ def test_peak_memory_rises_by_what_is_allocated_and_does_not_fall():
     """In a process of its own: pages of a long one may be reclaimed or used again meanwhile."""
     source = """
 import mmap, pathlib, torch
-from pimper_torch.reporting import peak_memory_mb
+from pimper_torch.runtime.reporting import peak_memory_mb
 before = peak_memory_mb()
 pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
 held = torch.ones(int(before - pages * mmap.PAGESIZE / 2**20 + 64) * 2**20 // 4)

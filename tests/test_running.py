@@ -3,8 +3,8 @@
 import pytest
 from torch import nn
 
-from pimper_torch.chains.running import Running
-from pimper_torch.errors import PimperWarning, caution
+from pimper_torch.method.chains.running import Running
+from pimper_torch.runtime.errors import PimperWarning, caution
 
 
 class Noting(nn.Module):

@@ -47,7 +47,7 @@ def test_nothing_is_unpickled():
 
 def test_no_network_connection_is_opened():
     found = {path for path, name in imports() if name in NETWORK}
-    assert found == {"viewer/server.py"}  # which looks whether an address is this machine's
+    assert found == {"result/viewer/server.py"}  # which looks whether an address is this machine's
 
 
 def test_no_text_is_evaluated_but_the_package_itself():
@@ -55,13 +55,13 @@ def test_no_text_is_evaluated_but_the_package_itself():
     assert {path for path, _ in found} <= {"cli/light.py"}  # its own sources
     assert not [path for path, name, _ in calls() if name in ("os.system", "yaml.unsafe_load")]
     loaders = {path for path, name, _ in calls() if name == "yaml.load"}
-    assert loaders == {"config.py"}  # by a subclass of SafeLoader
+    assert loaders == {"runtime/config.py"}  # by a subclass of SafeLoader
 
 
 def test_only_baselines_and_python_itself_are_run():
     assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
-        "asset/atlas.py",  # Python, which calls xatlas
-        "batches/task.py",  # Python, which is `pimper reconstruct`
+        "result/asset/atlas.py",  # Python, which calls xatlas
+        "cli/batches/task.py",  # Python, which is `pimper reconstruct`
         "baselines/openmvs.py",
-        "kernels/compile.py",  # Python, which compiles its kernels
+        "ground/kernels/compile.py",  # Python, which compiles its kernels
     }

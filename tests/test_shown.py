@@ -16,8 +16,8 @@ from shown import Shown, commands_in, in_markdown, roles_in, shown_in
 
 import pimper_bench
 import pimper_torch
-from pimper_torch.errors import PimperError
-from pimper_torch.ledger import GUARDS
+from pimper_torch.runtime.errors import PimperError
+from pimper_torch.runtime.ledger import GUARDS
 
 PACKAGE, BENCH = (Path(package.__file__).parent for package in (pimper_torch, pimper_bench))
 PACKAGES = {package.name: package for package in (PACKAGE, BENCH)}
@@ -223,8 +223,8 @@ def test_what_docstrings_and_messages_show_is_there(path, monkeypatch):
         "`--preset nothing`",
         '`pip install ".[gpu]"`',
         "`sweep.window`",
-        "`pimper_torch.photometry.nothing`",
-        "`sfm/binding.py`",
+        "`pimper_torch.method.photometry.nothing`",
+        "`method/sfm/binding.py`",
         "`pt.load_view`",
         '`pt.load_views("photos/", max_size=800)`',
         '`pt.load_chain("default", {"sweep": {"window": 7}})`',
@@ -233,7 +233,7 @@ def test_what_docstrings_and_messages_show_is_there(path, monkeypatch):
         "`Factorize(prior=[])`",
         "`chain.stepps(views)`",
         "```yaml\nsweep:\n  window: 7\n```",
-        "```python\nfrom pimper_torch.sweep import Swoop\n```",
+        "```python\nfrom pimper_torch.method.sweep import Swoop\n```",
         "```python\nimport pimper_torch as p\nviews = p.load_views('a')\nviews.imagez\n```",
     ],
 )

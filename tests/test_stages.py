@@ -7,10 +7,10 @@ from solved import solved
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.stage import Given
+from pimper_torch.runtime.stage import Given
 
 # Some of the few patches are not lit in enough views.
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
 @pytest.fixture(scope="module")

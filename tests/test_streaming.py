@@ -5,20 +5,20 @@ from torch.testing import assert_close
 from twins import using
 
 import pimper_torch as pt
-from pimper_torch.chains.photometric import Photometric
-from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pyramids import prepare
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.warp import Warp
-from pimper_torch.photometry.factorize import Factorize
-from pimper_torch.photometry.fit_light import FitLight
-from pimper_torch.photometry.lights import thinned
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.pyramids import prepare
+from pimper_torch.method.chains.photometric import Photometric
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight
+from pimper_torch.method.photometry.lights import thinned
+from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Silhouettes, SparseScene, StageReport
-from pimper_torch.reporting import Silent
-from pimper_torch.stage import Given
-from pimper_torch.sweep.sweep import Sweep
+from pimper_torch.runtime.reporting import Silent
+from pimper_torch.runtime.stage import Given
 
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ import trimesh
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.geometry.local_frame import from_local
-from pimper_torch.geometry.projection import project
+from pimper_torch.ground.geometry.local_frame import from_local
+from pimper_torch.ground.geometry.projection import project
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
 SCRIPT = Path(__file__).parent / "scripts" / "look_inside.py"
@@ -105,7 +105,7 @@ def test_cameras_of_another_convention_are_recognised(given):
 
 
 @pytest.mark.usefixtures("small_pictures")
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_from_tensors_to_a_saved_result(given, tmp_path):
     scene, coarse = given
     chain = pt.load_chain("default", {"scales": [1.0], "silhouettes": {"object": "everything"}})
@@ -119,7 +119,7 @@ def test_from_tensors_to_a_saved_result(given, tmp_path):
         chain(scene_of(scene), tmp_path)
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_a_researcher_looks_into_a_run(given, tmp_path, caplog):
     scene, coarse = given
     main = runpy.run_path(str(SCRIPT))["main"]
@@ -164,7 +164,7 @@ def placed(scene):
     return chain.placed(chain.running(), scene, None)
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_a_chain_triangulates_points_for_poses_that_come_without():
     cameras = cameras_on_an_arc()
     views = photographs(cameras, lit=False)

@@ -15,7 +15,7 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective, switch_source_input
 
-from pimper_torch.config import to_mapping
+from pimper_torch.runtime.config import to_mapping
 
 HEAD = "setting", "default", "effect"
 

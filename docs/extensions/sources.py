@@ -27,7 +27,7 @@ class Source:
     """What one docstring says of where its method is from.
 
     Attributes:
-        module: Whose docstring, such as ``pimper_torch.photometry.cone``.
+        module: Whose docstring, such as ``pimper_torch.method.photometry.cone``.
         name: Of the function or class; empty for the module itself.
         text: The citation, reStructuredText.
     """

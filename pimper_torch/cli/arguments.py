@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import tyro
 
-from pimper_torch.errors import ConfigError
+from pimper_torch.runtime.errors import ConfigError
 
 REQUIRED = inspect.Parameter.empty
 _SWITCH = get_args(tyro.conf.FlagCreatePairsOff[bool])[1]
@@ -134,7 +134,7 @@ def summary(documented: object) -> str:
 def plain(text: str) -> str:
     """Take reStructuredText's marks out of a text.
 
-    >>> plain("What :func:`~pimper_torch.io.photographs.load_views` takes as ``encoding``.")
+    >>> plain("What :func:`~pimper_torch.doors.io.photographs.load_views` takes as ``encoding``.")
     'What `load_views` takes as `encoding`.'
     """
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")

@@ -13,8 +13,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from pimper_torch.doctor.cost import minutes
-from pimper_torch.doctor.forecast import Forecast
+from pimper_torch.cli.doctor.cost import minutes
+from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 
 

@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pimper_torch.cli.output import Output
-from pimper_torch.io.version import versions
-from pimper_torch.outputs.stages import kept, resumption
+from pimper_torch.doors.io.version import versions
+from pimper_torch.doors.outputs.stages import kept, resumption
 
 _CRASHES = ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGTRAP", "SIGSYS")
 _LESS = (

@@ -9,13 +9,13 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.config import require
-from pimper_torch.errors import InputError
-from pimper_torch.exchange.layouts import Format, write_formats
-from pimper_torch.exchange.result import read_result
-from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.doors.exchange.layouts import Format, write_formats
+from pimper_torch.doors.exchange.result import read_result
+from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.records.priors import Axes
-from pimper_torch.reporting import stage
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,13 +10,13 @@ from PIL import Image
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.config import require
-from pimper_torch.errors import caution
-from pimper_torch.outputs.folders import prepare_output, require_apart, written_whole
-from pimper_torch.progress import report
-from pimper_torch.reporting import stage
-from pimper_torch.video.choose import chosen, scanned
-from pimper_torch.video.read import frame_pictures, luma_frames
+from pimper_torch.cli.video.choose import chosen, scanned
+from pimper_torch.cli.video.read import frame_pictures, luma_frames
+from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import caution
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

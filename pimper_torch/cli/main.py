@@ -28,9 +28,9 @@ from pimper_torch.cli.deaths import limit, write_report
 from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.supervise import exit_code, stoppable
-from pimper_torch.cores import usable_cores
-from pimper_torch.errors import InputError, PimperError, PimperWarning
-from pimper_torch.outputs.files import require_name
+from pimper_torch.doors.outputs.files import require_name
+from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.runtime.errors import InputError, PimperError, PimperWarning
 
 _HELP = """\
 usage: pimper COMMAND [options]
@@ -65,8 +65,8 @@ Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpect
 # written.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.run",
-    "batch": "pimper_torch.batches.cli",
-    "doctor": "pimper_torch.cli.doctor",
+    "batch": "pimper_torch.cli.batches.cli",
+    "doctor": "pimper_torch.cli.doctor_command",
     "demo": "pimper_torch.cli.run",
     "config": "pimper_torch.cli.settings",
     "export": "pimper_torch.cli.export",
@@ -126,7 +126,7 @@ def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
         sys.stdout.write(listed(_HELP, brought()))
         return 0 if given else _BAD_INPUT
     if given[0] == "--version":
-        from pimper_torch.io.version import versions
+        from pimper_torch.doors.io.version import versions
 
         sys.stdout.writelines(f"{name} {version}\n" for name, version in versions().items())
         return 0
@@ -184,7 +184,7 @@ def _run(command: str, home: str, arguments: list[str], output: Output, supervis
         if command not in _LIGHT:
             _refuse_at_once(_READERS.get(home, home), command, arguments)
         if output.as_json:
-            from pimper_torch.io.version import versions
+            from pimper_torch.doors.io.version import versions
 
             output.event(
                 "start", command=command, arguments=arguments, versions=versions(), format=1

@@ -9,10 +9,10 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.config import require
-from pimper_torch.outputs.files import file_written_whole, prepare_file
-from pimper_torch.size.sheet import SIDE_MM, Paper, layout
-from pimper_torch.viz.marker_sheet import TITLE, write_sheet
+from pimper_torch.doors.outputs.files import file_written_whole, prepare_file
+from pimper_torch.doors.size.sheet import SIDE_MM, Paper, layout
+from pimper_torch.result.viz.marker_sheet import TITLE, write_sheet
+from pimper_torch.runtime.config import require
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,20 +9,27 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from pimper_torch.asset.finish import MeshFiles
-from pimper_torch.chains.presets import Config, load_config
-from pimper_torch.chains.published import PublishedConfig
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
-from pimper_torch.coarse.reference import view_named
-from pimper_torch.config import presets, require
-from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.io.photographs import image_name, list_images
-from pimper_torch.memory import bytes_of
-from pimper_torch.outputs.files import require_name
-from pimper_torch.outputs.folders import prepare_output, require_apart
+from pimper_torch.doors.io.photographs import image_name, list_images
+from pimper_torch.doors.outputs.files import require_name
+from pimper_torch.doors.outputs.folders import prepare_output, require_apart
+from pimper_torch.doors.size.given import (
+    CameraDistance,
+    Mark,
+    ScaleBar,
+    Unit,
+    measured_in,
+    number_of,
+)
+from pimper_torch.method.chains.presets import Config, load_config
+from pimper_torch.method.chains.published import PublishedConfig
+from pimper_torch.method.coarse.reference import view_named
 from pimper_torch.priors.from_maps import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
-from pimper_torch.size.given import CameraDistance, Mark, ScaleBar, Unit, measured_in, number_of
-from pimper_torch.viewer.server import require_viser
+from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.viewer.server import require_viser
+from pimper_torch.runtime.config import presets, require
+from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.runtime.memory import bytes_of
 
 
 def _number(word: str, option: str) -> float:

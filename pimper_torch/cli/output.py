@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-from pimper_torch.errors import ConfigError
+from pimper_torch.runtime.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pimper_torch.doctor.forecast import Forecast
-    from pimper_torch.reporting import Observer
+    from pimper_torch.cli.doctor.forecast import Forecast
+    from pimper_torch.runtime.reporting import Observer
 
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
@@ -103,8 +103,8 @@ class Output:
         from rich.console import Console
 
         from pimper_torch.cli.bars import Bars, Events
-        from pimper_torch.doctor.forecast import Forecast
-        from pimper_torch.reporting import Silent, recorded
+        from pimper_torch.cli.doctor.forecast import Forecast
+        from pimper_torch.runtime.reporting import Silent, recorded
 
         forecast = forecast or Forecast()
         shown: AbstractContextManager[Observer] = nullcontext(Silent())

@@ -10,36 +10,43 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.chains.presets import make_chain
+from pimper_torch.cli.doctor.checks import examine_views
+from pimper_torch.cli.doctor.cost import planned
+from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.cli.options import Job, checked
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import tell_place
-from pimper_torch.doctor.checks import examine_views
-from pimper_torch.doctor.cost import planned
-from pimper_torch.doctor.forecast import Forecast
-from pimper_torch.errors import ConfigError, caution, cautioned
-from pimper_torch.io.decode import read_header
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import image_name, list_images, load_views
-from pimper_torch.io.results import RESULT_NAMES, write_result
-from pimper_torch.ledger import closing_line
-from pimper_torch.memory import bytes_of
-from pimper_torch.outputs.folders import held_output
-from pimper_torch.outputs.marker import STAGES
-from pimper_torch.outputs.stages import PREVIEW
-from pimper_torch.prior_files.read_maps import read_depth, read_normals
-from pimper_torch.prior_files.read_silhouettes import object_at, read_silhouettes
+from pimper_torch.doors.io.decode import read_header
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.photographs import image_name, list_images, load_views
+from pimper_torch.doors.io.results import RESULT_NAMES, write_result
+from pimper_torch.doors.outputs.folders import held_output
+from pimper_torch.doors.outputs.marker import STAGES
+from pimper_torch.doors.outputs.stages import PREVIEW
+from pimper_torch.doors.size.find_scale import find_scale
+from pimper_torch.doors.size.given import (
+    Mark,
+    Pointer,
+    ScaleBar,
+    measured_in,
+    number_of,
+    require_inside,
+)
+from pimper_torch.doors.size.scale import Scale
+from pimper_torch.doors.size.scaled import scaled
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.presets import make_chain
+from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
+from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
-from pimper_torch.reporting import accounted, reported, stage
-from pimper_torch.size.find_scale import find_scale
-from pimper_torch.size.given import Mark, Pointer, ScaleBar, measured_in, number_of, require_inside
-from pimper_torch.size.scale import Scale
-from pimper_torch.size.scaled import scaled
-from pimper_torch.store import Store
-from pimper_torch.viewer.show import COARSE, RESULT, add_found
-from pimper_torch.viewer.viewer import Viewer, opened
-from pimper_torch.viz.overview import draw_preview, headline
+from pimper_torch.result.viewer.show import COARSE, RESULT, add_found
+from pimper_torch.result.viewer.viewer import Viewer, opened
+from pimper_torch.result.viz.overview import draw_preview, headline
+from pimper_torch.runtime.errors import ConfigError, caution, cautioned
+from pimper_torch.runtime.ledger import closing_line
+from pimper_torch.runtime.memory import bytes_of
+from pimper_torch.runtime.reporting import accounted, reported, stage
+from pimper_torch.runtime.store import Store
 
 
 def run(command: str, arguments: Sequence[str], output: Output) -> None:

@@ -11,11 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from pimper_torch.chains.presets import Config, load_config
 from pimper_torch.cli.arguments import meanings, read_arguments, summary, value_of
 from pimper_torch.cli.output import Output
-from pimper_torch.config import presets, to_mapping, written
-from pimper_torch.errors import ConfigError
+from pimper_torch.method.chains.presets import Config, load_config
+from pimper_torch.runtime.config import presets, to_mapping, written
+from pimper_torch.runtime.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

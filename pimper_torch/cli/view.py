@@ -10,11 +10,11 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.config import require
-from pimper_torch.errors import InputError
-from pimper_torch.viewer.server import HOST, PORT, require_viser
-from pimper_torch.viewer.show import add_folder
-from pimper_torch.viewer.viewer import Viewer, opened
+from pimper_torch.result.viewer.server import HOST, PORT, require_viser
+from pimper_torch.result.viewer.show import add_folder
+from pimper_torch.result.viewer.viewer import Viewer, opened
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

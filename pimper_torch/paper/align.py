@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.config import Range, require_ranges
-from pimper_torch.geometry.height_fields import sample_raster
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.linalg.sums import average
+from pimper_torch.ground.geometry.height_fields import sample_raster
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.linalg.sums import average
 from pimper_torch.paper.seams import (
     Pulls,
     Seams,
@@ -22,9 +21,10 @@ from pimper_torch.paper.seams import (
     solve_transforms,
     transformed,
 )
-from pimper_torch.progress import report
 from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
-from pimper_torch.stage import Stage
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.stage import Stage
 
 
 def patch_status(

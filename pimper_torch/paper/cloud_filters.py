@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 from torch import Tensor
 
-from pimper_torch.coarse.surface import point_covariances
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import barycentric_2d
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.surfaces import barycentric_2d
+from pimper_torch.method.coarse.surface import point_covariances
 from pimper_torch.records import Cameras, CoarseMesh, FacetPoints, Mesh, SparseScene
 
 

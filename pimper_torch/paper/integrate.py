@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from pimper_torch.geometry.height_fields import sample_raster
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.geometry.surfaces import slopes_from_normals
-from pimper_torch.progress import track
+from pimper_torch.ground.geometry.height_fields import sample_raster
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.geometry.surfaces import slopes_from_normals
 from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
 from pimper_torch.records.patches import Templates
-from pimper_torch.stage import Stage
+from pimper_torch.runtime.progress import track
+from pimper_torch.runtime.stage import Stage
 
 
 def fill_smoothly(

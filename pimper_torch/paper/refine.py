@@ -15,17 +15,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import Range, require_ranges
-from pimper_torch.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
-from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
-from pimper_torch.geometry.subdivision import Subdivision, subdivide
-from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.topology import face_edges
-from pimper_torch.linalg.continuation import about_mean
-from pimper_torch.linalg.sums import average
-from pimper_torch.linalg.systems import solutions
+from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
+from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.ground.linalg.continuation import about_mean
+from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.linalg.systems import solutions
+from pimper_torch.method.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
-from pimper_torch.stage import Stage
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.stage import Stage
 
 
 def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -85,8 +85,8 @@ class Refine(Stage):
     """Join the patches and smooth their seams, keeping the centre of every facet.
 
     One sparse factorization of the energy over the subdivided mesh, three right-hand sides.
-    :mod:`~pimper_torch.fusion.blend` is the union. Vertices that no patch supports are filled by
-    the smoothness term and have information 0.
+    :mod:`~pimper_torch.method.fusion.blend` is the union. Vertices that no patch supports are
+    filled by the smoothness term and have information 0.
 
     Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
     the templates are constants.

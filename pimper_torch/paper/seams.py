@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.height_fields import intersect_height_field
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.topology import face_pairs
-from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.ground.geometry.height_fields import intersect_height_field
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.topology import face_pairs
+from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
 

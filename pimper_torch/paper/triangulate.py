@@ -8,19 +8,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from pimper_torch.coarse.reference import reference_view
-from pimper_torch.coarse.surface import smoothed_normals
-from pimper_torch.config import Range, require_ranges
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.pixels import grid_from_pixels
-from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.geometry.surfaces import side_lengths, unit_face_normals
-from pimper_torch.geometry.topology import face_components, face_edges
-from pimper_torch.ledger import leave_out
+from pimper_torch.ground.geometry.pixels import grid_from_pixels
+from pimper_torch.ground.geometry.projection import project, rays_through, triangulation_angles
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals
+from pimper_torch.ground.geometry.topology import face_components, face_edges
+from pimper_torch.method.coarse.reference import reference_view
+from pimper_torch.method.coarse.surface import smoothed_normals
 from pimper_torch.paper import cloud_filters
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
-from pimper_torch.stage import Stage
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.stage import Stage
 
 # All constants are choices, the same for all photographs. A point of the cloud is reliable if a
 # view within this angle of the reference sees it, and by its number of views, its mean

@@ -10,10 +10,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.config import require
-from pimper_torch.errors import InputError, some
 from pimper_torch.records import DepthPrior, NormalPrior, SilhouettePrior
 from pimper_torch.records.priors import AXES, Axes
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import InputError, some
 
 # Root mean squares that published estimators are off indoors. DSINE (CVPR 2024) has a mean of 16
 # degrees on NYUv2; Marigold (CVPR 2024) one of 5.5 % of depth once factor and offset are fitted.

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.config import require
-from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.parallel import side_by_side
+from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.priors import from_maps
-from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import AlbedoPrior, InlierPrior, Prior, SparseScene, Views
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.runtime.parallel import side_by_side
 
 Picture = Float[Tensor, "1 channel height width"]
 Network = Callable[[Picture], Any]
@@ -50,9 +50,9 @@ def priors_of(
         std: That pictures are divided by then.
         meaning: What else the prior has to state: of normals ``axes`` and ``error_deg``, of depth
             ``inverse``, ``along``, ``gauge`` and ``error``, as
-            :func:`~pimper_torch.prior_files.read_maps.read_normals` and
-            :func:`~pimper_torch.prior_files.read_maps.read_depth` take them; of albedo ``error``,
-            in its own units.
+            :func:`~pimper_torch.priors.prior_files.read_maps.read_normals` and
+            :func:`~pimper_torch.priors.prior_files.read_maps.read_depth` take them; of albedo
+            ``error``, in its own units.
 
     Raises:
         InputError: The file is of another kind, or the network returns something else.

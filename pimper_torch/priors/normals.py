@@ -13,12 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.errors import InputError, caution, some
-from pimper_torch.geometry.contours import RayConfig, contour_rays
+from pimper_torch.ground.geometry.contours import RayConfig, contour_rays
+from pimper_torch.method.sfm.conventions.choice import surely_better
 from pimper_torch.priors.at_points import at_points, means_by, places
 from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
-from pimper_torch.sfm.conventions.choice import surely_better
+from pimper_torch.runtime.errors import InputError, caution, some
 
 _NAMED: list[tuple[int, ...]] = [signs for signs, _ in AXES.values()]
 _WORLD = len(_NAMED)

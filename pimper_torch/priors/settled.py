@@ -1,9 +1,9 @@
 """Priors whose meaning is decided, and agrees with the scene."""
 
+from pimper_torch.method.sfm.undistort import with_undistorted_priors
 from pimper_torch.priors.depth import settled_depth
 from pimper_torch.priors.normals import settled_normals
 from pimper_torch.records import DepthPrior, NormalPrior, Prior, Silhouettes, SparseScene
-from pimper_torch.sfm.undistort import with_undistorted_priors
 
 
 def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> SparseScene:

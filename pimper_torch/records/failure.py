@@ -27,7 +27,7 @@ class Failure(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut(Record):
-    """Items that a guard left out or doubted; see :mod:`pimper_torch.ledger`.
+    """Items that a guard left out or doubted; see :mod:`pimper_torch.runtime.ledger`.
 
     Attributes:
         guard: Room and name, such as ``extract.borders``.

@@ -47,7 +47,7 @@ class Finished(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ViewLights(Record):
-    """The light of every view, for base colours of :func:`~pimper_torch.viz.maps.base_color`.
+    """The light of every view, for base colours as the files have them.
 
     Attributes:
         direction_world: Unit, from the surface's centre towards the light.

@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from pimper_torch.errors import InputError
 from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
 from pimper_torch.records.value_checks import (
@@ -28,6 +27,7 @@ from pimper_torch.records.value_checks import (
     outside,
     turned_away,
 )
+from pimper_torch.runtime.errors import InputError
 
 AnyPatches = TypeVar("AnyPatches", bound="OverPatches")
 

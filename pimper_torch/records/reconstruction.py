@@ -42,7 +42,7 @@ class Reconstruction(Record):
         held_out: Photographs that took no part but in finding cameras, to judge the surface by;
             None without any.
         finished: The surface as it is written; it, lights and materials, and the textured surface
-            are there once :meth:`~pimper_torch.chains.chain.Chain.finish` made them.
+            are there once :meth:`~pimper_torch.method.chains.chain.Chain.finish` made them.
     """
 
     mesh: Mesh

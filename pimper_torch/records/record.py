@@ -12,8 +12,8 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from pimper_torch.errors import InputError
-from pimper_torch.mapped import taken
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.mapped import taken
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Index = Sequence[int] | slice | Tensor

@@ -62,7 +62,7 @@ class SparseScene(Record):
             too little of it. Empty without such a background.
         offset_world: Added to this scene's coordinates, gives those of the model it was read from.
             Scenes far from that model's origin have one of their own, see
-            :func:`~pimper_torch.geometry.local_frame.local_origin`.
+            :func:`~pimper_torch.ground.geometry.local_frame.local_origin`.
         series: Number of each view's series, where the object was moved on what it stands on
             between several: in each its surroundings are elsewhere. Empty where it was not.
     """

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.mapped import by_view
 from pimper_torch.records.record import Record
 from pimper_torch.records.views import Views
+from pimper_torch.runtime.mapped import by_view
 
 
 def no_planes() -> Float[Tensor, "0 4"]:

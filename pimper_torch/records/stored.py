@@ -25,8 +25,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pimper_torch.errors import InputError, OutputError
 from pimper_torch.records.record import Record
+from pimper_torch.runtime.errors import InputError, OutputError
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 

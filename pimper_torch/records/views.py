@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.mapped import by_view
 from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
 from pimper_torch.records.value_checks import no_pinhole, not_rigid, once
+from pimper_torch.runtime.mapped import by_view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -13,20 +13,20 @@ from torch.nn.functional import grid_sample, normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.asset import atlas as atlases
-from pimper_torch.asset.atlas import MAX_SIDE, by_triangles, unwrapped
-from pimper_torch.asset.bake import baked
-from pimper_torch.asset.make import textured
-from pimper_torch.asset.tangents import tangents
-from pimper_torch.asset.write import write_asset, write_asset_obj
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.poisson import reduced
-from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.io.meshes import write_glb
-from pimper_torch.parallel import on_one_thread
-from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
+from pimper_torch.doors.io.meshes import write_glb
+from pimper_torch.ground.geometry.poisson import reduced
+from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Mesh, Textured
-from pimper_torch.viz.maps import base_color
+from pimper_torch.result.asset import atlas as atlases
+from pimper_torch.result.asset.atlas import MAX_SIDE, by_triangles, unwrapped
+from pimper_torch.result.asset.bake import baked
+from pimper_torch.result.asset.make import textured
+from pimper_torch.result.asset.tangents import tangents
+from pimper_torch.result.asset.write import write_asset, write_asset_obj
+from pimper_torch.result.viz.maps import base_color
+from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.runtime.parallel import on_one_thread
 
 
 def ball(level: int) -> Mesh:

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from stand_ins import CHILD
 
-from pimper_torch.batches import task
-from pimper_torch.batches.many_objects import batch
+from pimper_torch.cli.batches import task
+from pimper_torch.cli.batches.many_objects import batch
 
 
 @dataclass

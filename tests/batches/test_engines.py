@@ -8,11 +8,11 @@ from platform import node
 import pytest
 from stand_ins import children_stand_in, write_slurm
 
-from pimper_torch.batches import engines
-from pimper_torch.batches.engines import SlurmExecutor, dask_workers
-from pimper_torch.batches.objects import read_objects
-from pimper_torch.batches.plan import planned_batch
-from pimper_torch.batches.task import carry_out
+from pimper_torch.cli.batches import engines
+from pimper_torch.cli.batches.engines import SlurmExecutor, dask_workers
+from pimper_torch.cli.batches.objects import read_objects
+from pimper_torch.cli.batches.plan import planned_batch
+from pimper_torch.cli.batches.task import carry_out
 from pimper_torch.cli.main import main
 
 

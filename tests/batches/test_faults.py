@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pimper_torch.batches.engines import dask_workers
-from pimper_torch.batches.many_objects import batch
+from pimper_torch.cli.batches.engines import dask_workers
+from pimper_torch.cli.batches.many_objects import batch
 from pimper_torch.cli.main import main
 
 SMALL = "--num-views 6 --width 80 --height 60 --processes 1 --supersample 1"

@@ -7,16 +7,16 @@ import json
 import pytest
 from rich.console import Console
 
-from pimper_torch.batches.cli import Lines
-from pimper_torch.batches.table import rows_of, write_table
-from pimper_torch.batches.task import Outcome
+from pimper_torch.cli.batches.cli import Lines
+from pimper_torch.cli.batches.table import rows_of, write_table
+from pimper_torch.cli.batches.task import Outcome
 from pimper_torch.cli.main import main
 
 
 def test_a_line_tells_where_an_object_is_and_how_it_ended(monkeypatch):
     shown = io.StringIO()
     console = Console(file=shown, force_terminal=True, width=120)
-    monkeypatch.setattr("pimper_torch.batches.cli.Console", lambda **_: console)
+    monkeypatch.setattr("pimper_torch.cli.batches.cli.Console", lambda **_: console)
     lines = Lines(True)
     name = "cup [/]"
     with lines:

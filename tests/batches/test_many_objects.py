@@ -14,9 +14,9 @@ from platform import node
 
 import pytest
 
-from pimper_torch.batches import many_objects, task
-from pimper_torch.batches.task import carry_out, is_whole
-from pimper_torch.errors import ConfigError, OutputError
+from pimper_torch.cli.batches import many_objects, task
+from pimper_torch.cli.batches.task import carry_out, is_whole
+from pimper_torch.runtime.errors import ConfigError, OutputError
 
 
 class Inline(Executor):

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pimper_torch.batches.objects import Object, read_objects
-from pimper_torch.batches.plan import planned_batch
-from pimper_torch.errors import ConfigError, InputError
+from pimper_torch.cli.batches.objects import Object, read_objects
+from pimper_torch.cli.batches.plan import planned_batch
+from pimper_torch.runtime.errors import ConfigError, InputError
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from closedness import closedness
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.errors import InputError
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import InputError
 
 
 def mesh_of(vertices, faces):

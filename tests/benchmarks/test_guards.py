@@ -7,10 +7,10 @@ import torch
 from guard_sets import SETS
 from guards import CHANGES, PATCHES, Heard, Judge, table
 
-from pimper_torch.chains.presets import load_config
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.ledger import GUARDS, leave_out, listening
+from pimper_torch.ground.geometry.nearest import NearestSurface
+from pimper_torch.method.chains.presets import load_config
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.ledger import GUARDS, leave_out, listening
 
 SQUARE = Mesh(
     vertices_world=torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
@@ -64,7 +64,7 @@ def test_every_guard_and_what_stands_in_for_it_exists():
     assert names <= set(GUARDS)
     for patches in PATCHES.values():
         for target in patches:
-            assert pkgutil.resolve_name(f"pimper_torch.{target}") is not None
+            assert pkgutil.resolve_name(f"pimper_torch.method.{target}") is not None
     for changes in CHANGES.values():
         load_config("default", changes)
     assert sum(not one.guards for one in SETS.values()) >= 20

@@ -6,9 +6,9 @@ from planarity import dihedrals, planar_faces
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import InputError
 
 SIZE = (1.0, 1.5, 3.0)
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.errors import InputError
-from pimper_torch.numpy_files import read_npy, read_npz
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.numpy_files import read_npy, read_npz
 
 
 def test_a_refusal_tells_where_what_was_needed_and_what_there_is(tmp_path):

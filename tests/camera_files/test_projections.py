@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.camera_files.posed_camera import decompose_projections
+from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 
 
 @pytest.mark.parametrize("factor", [1.0, -1.0, 3e-4, -250.0])

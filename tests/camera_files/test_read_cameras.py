@@ -10,13 +10,14 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses
+from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.method.sfm import colmap
+from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Views
-from pimper_torch.sfm import colmap
-from pimper_torch.sfm.existing import existing_ways
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.undistort import pinholes_for
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 90.0
 NAMES = ("10.png", "2.png", "a b.png")
@@ -50,7 +51,7 @@ def of_colmap(
 ) -> Path:
     model = SparseModel(
         names=names,
-        lenses=colmap.pinhole_lenses(rig),
+        lenses=pinhole_lenses(rig),
         cam_from_world=rig.cam_from_world,
         points_world=torch.zeros(0, 3, dtype=torch.float64),
         observation_point=torch.zeros(0, dtype=torch.long),

@@ -3,9 +3,9 @@ import io
 from rich.console import Console
 
 from pimper_torch.cli.bars import Bars
-from pimper_torch.doctor.forecast import Forecast
+from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
-from pimper_torch.reporting import Observer
+from pimper_torch.runtime.reporting import Observer
 
 
 def show(terminal, plan=()):

@@ -8,7 +8,7 @@ import pytest
 
 from pimper_torch.cli.main import commands, main
 from pimper_torch.cli.options import parse
-from pimper_torch.config import to_mapping
+from pimper_torch.runtime.config import to_mapping
 
 
 def answers(code: str, folder: Path) -> str:
@@ -85,7 +85,7 @@ def test_settings_are_read_as_the_command_reads_them(tmp_path):
         from pimper_torch.cli.light import absent
         with absent():
             from pimper_torch.cli.options import parse
-            from pimper_torch.config import to_mapping
+            from pimper_torch.runtime.config import to_mapping
             print(to_mapping(parse("reconstruct", {line}).config))
         assert "torch" not in sys.modules and "pimper_torch.cli.options" not in sys.modules
         import pimper_torch.cli
@@ -99,8 +99,8 @@ def test_what_takes_long_to_load_is_absent_and_stands_any_use(tmp_path):
         from pimper_torch.cli.light import ABSENT, absent
         with absent():
             import torch.nn.functional as F
-            from pimper_torch.coarse.surface import CoarseSurface, CoarseSurfaceConfig
-            from pimper_torch.errors import ConfigError
+            from pimper_torch.method.coarse.surface import CoarseSurface, CoarseSurfaceConfig
+            from pimper_torch.runtime.errors import ConfigError
             assert F.some.thing(3)[4] | int is ABSENT
             assert issubclass(CoarseSurface, ABSENT)
             try:

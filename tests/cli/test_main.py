@@ -16,18 +16,18 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
 from pimper_torch.cli.output import Output
-from pimper_torch.errors import PimperWarning, ReconstructionError
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.io.results import RESULT_NAMES, write_result
-from pimper_torch.io.version import installed_version
-from pimper_torch.outputs.marker import MARKER
-from pimper_torch.radiometry import Encoding, linear_from_srgb
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.doors.io.results import RESULT_NAMES, write_result
+from pimper_torch.doors.io.version import installed_version
+from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.ground.radiometry import Encoding, linear_from_srgb
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.records import LeftOut, Mesh, Silhouettes
-from pimper_torch.silhouettes.find import FindSilhouettes
+from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
 
 
 def run(*arguments):
@@ -440,7 +440,7 @@ def test_a_run_that_is_looked_at_stays_until_ctrl_c(
 def test_a_run_is_refused_before_it_begins_where_there_is_no_viewer(
     photos, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("pimper_torch.viewer.server.find_spec", lambda _: None)
+    monkeypatch.setattr("pimper_torch.result.viewer.server.find_spec", lambda _: None)
     assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 2
     assert "pip install 'pimper_torch[view]'" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()

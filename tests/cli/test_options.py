@@ -12,16 +12,16 @@ import pytest
 from stand_ins import CHILD, children_stand_in, write_slurm
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.batches import task
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.chains.presets import load_config
-from pimper_torch.chains.published import PublishedConfig
+from pimper_torch.cli.batches import task
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
-from pimper_torch.errors import ConfigError
-from pimper_torch.io.meshes import read_mesh, write_ply
+from pimper_torch.doors.io.meshes import read_mesh, write_ply
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.chains.published import PublishedConfig
 from pimper_torch.records import Mesh
-from pimper_torch.store import Store
+from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.runtime.store import Store
 from tests.video.clips import written
 
 # What each option is given; {names} are places in the folder of `world`.

@@ -5,9 +5,9 @@ from itertools import pairwise
 import pytest
 import yaml
 
-from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.main import main
-from pimper_torch.config import presets, to_mapping
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.runtime.config import presets, to_mapping
 
 
 @pytest.mark.parametrize("preset", presets())

@@ -11,15 +11,15 @@ from PIL import Image
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.cli.run import bars_in_files, told_size
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import load_views
-from pimper_torch.sfm.colmap import read_model
-from pimper_torch.size.given import Mark
-from pimper_torch.size.marks import place_of
-from pimper_torch.size.scale import Scale
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.doors.size.given import Mark
+from pimper_torch.doors.size.marks import place_of
+from pimper_torch.doors.size.scale import Scale
+from pimper_torch.method.sfm.colmap import read_model
 
 # The surface of the small result has a random confidence.
-UNSURE = "ignore:.*hardly determine the surface:pimper_torch.errors.PimperWarning"
+UNSURE = "ignore:.*hardly determine the surface:pimper_torch.runtime.errors.PimperWarning"
 TURNED = {1: lambda picture: picture, 6: lambda picture: np.rot90(picture), 3: np.flip}
 
 

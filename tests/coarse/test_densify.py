@@ -6,31 +6,31 @@ from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.coarse.densify import (
+from pimper_torch.ground.geometry.poisson import poisson_surface, reduced
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.topology import connected_to
+from pimper_torch.method.coarse.densify import (
     agreeing,
     choose_sources,
     push_pull,
     step_for_one_pixel,
     sweep,
 )
-from pimper_torch.coarse.oriented import (
+from pimper_torch.method.coarse.oriented import (
     OrientedPoints,
     no_points,
     sparse_oriented,
     thinned,
     with_common_normals,
 )
-from pimper_torch.coarse.trim import (
+from pimper_torch.method.coarse.trim import (
     ViewCounts,
     fringes,
     near_points,
     supported_components,
     without_small_holes,
 )
-from pimper_torch.coarse.window_matching import Matcher, Windows, level_of, pair
-from pimper_torch.geometry.poisson import poisson_surface, reduced
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.topology import connected_to
+from pimper_torch.method.coarse.window_matching import Matcher, Windows, level_of, pair
 from pimper_torch.records import Mesh, Support
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)

@@ -5,16 +5,16 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.coarse.fine_surface import closed_surface, cropped
-from pimper_torch.coarse.oriented import no_points
-from pimper_torch.coarse.surface import CoarseSurface
-from pimper_torch.coarse.trim import FineSurfaceConfig, ViewCounts, seen_surface
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.topology import face_components, face_pairs
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.topology import face_components, face_pairs
+from pimper_torch.method.coarse.fine_surface import closed_surface, cropped
+from pimper_torch.method.coarse.oriented import no_points
+from pimper_torch.method.coarse.surface import CoarseSurface
+from pimper_torch.method.coarse.trim import FineSurfaceConfig, ViewCounts, seen_surface
+from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.records import Support
-from pimper_torch.silhouettes.trace import TraceContours
+from pimper_torch.runtime.errors import ReconstructionError
 from tests.coarse.ball import SETTINGS, photographed, silhouettes_of
 
 SMALL_HOLES = FineSurfaceConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1

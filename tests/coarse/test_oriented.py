@@ -2,10 +2,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.coarse.densify import DepthMaps
-from pimper_torch.coarse.oriented import denied, fitted_planes
-from pimper_torch.coarse.window_matching import MatchingLevel
-from pimper_torch.geometry.projection import project
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.coarse.densify import DepthMaps
+from pimper_torch.method.coarse.oriented import denied, fitted_planes
+from pimper_torch.method.coarse.window_matching import MatchingLevel
 
 
 def plane_round(depth, valid, row, column, step):

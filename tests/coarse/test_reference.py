@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.coarse.reference import reference_view
-from pimper_torch.errors import InputError
+from pimper_torch.method.coarse.reference import reference_view
+from pimper_torch.runtime.errors import InputError
 
 
 def test_the_frontal_view_is_the_centre_of_the_arc(dome_cloud):

@@ -5,14 +5,14 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.coarse.remesh import RemeshConfig, remesh, within
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
-from pimper_torch.geometry.topology import boundary_vertices, half_edges
-from pimper_torch.geometry.visual_hull import Hull
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
+from pimper_torch.ground.geometry.topology import boundary_vertices, half_edges
+from pimper_torch.ground.geometry.visual_hull import Hull
+from pimper_torch.method.coarse.remesh import RemeshConfig, remesh, within
 from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
+from pimper_torch.runtime.errors import InputError
 
 SPACING = 0.02
 

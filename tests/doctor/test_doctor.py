@@ -8,8 +8,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.cli.main import main
-from pimper_torch.doctor.checks import (
+from pimper_torch.cli.doctor.checks import (
     blur,
     examine_folder,
     examine_views,
@@ -18,14 +17,15 @@ from pimper_torch.doctor.checks import (
     number,
     saturation,
 )
-from pimper_torch.doctor.cost import cost, estimate
-from pimper_torch.doctor.machine import available_gb, machine, total_gb
-from pimper_torch.doctor.pairs import match_copies, overlap
-from pimper_torch.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.io.photographs import load_views
+from pimper_torch.cli.doctor.cost import cost, estimate
+from pimper_torch.cli.doctor.machine import available_gb, machine, total_gb
+from pimper_torch.cli.doctor.pairs import match_copies, overlap
+from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
+from pimper_torch.cli.main import main
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.method.sfm.matching import VerifiedPair
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.matching import VerifiedPair
 
 
 @pytest.fixture

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pimper_torch.doctor import forecast as module
-from pimper_torch.doctor.cost import planned
-from pimper_torch.doctor.forecast import Forecast
+from pimper_torch.cli.doctor import forecast as module
+from pimper_torch.cli.doctor.cost import planned
+from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 
 PLAN = [("find", 10.0), ("pass", 2.0), ("end", 1.0), ("pass", 8.0), ("end", 4.0)]

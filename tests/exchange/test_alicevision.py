@@ -4,10 +4,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_meshroom
-from pimper_torch.camera_files.meshroom_sfm import read_meshroom_cameras
-from pimper_torch.exchange.alicevision import write_alicevision, write_sfm
-from pimper_torch.geometry.lens_models import pinhole_of
-from pimper_torch.viz.maps import view_maps
+from pimper_torch.doors.camera_files.meshroom_sfm import read_meshroom_cameras
+from pimper_torch.doors.exchange.alicevision import write_alicevision, write_sfm
+from pimper_torch.ground.geometry.lens_models import pinhole_of
+from pimper_torch.result.viz.maps import view_maps
 
 
 def parsed(path):

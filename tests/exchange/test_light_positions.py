@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
-from pimper_torch.exchange.layouts import write_lights
+from pimper_torch.doors.exchange.layouts import write_lights
+from pimper_torch.runtime.errors import InputError
 
 
 def read_lp(path):

@@ -4,8 +4,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.exchange.nerfstudio import thinned, write_nerfstudio
-from pimper_torch.io.meshes import read_mesh
+from pimper_torch.doors.exchange.nerfstudio import thinned, write_nerfstudio
+from pimper_torch.doors.io.meshes import read_mesh
 
 
 def test_what_is_written_is_read_back(result, tmp_path, same_cameras):

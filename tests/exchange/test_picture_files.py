@@ -1,7 +1,7 @@
 import pytest
 
-from pimper_torch.errors import InputError
-from pimper_torch.exchange.picture_files import file_names, refuse_skew
+from pimper_torch.doors.exchange.picture_files import file_names, refuse_skew
+from pimper_torch.runtime.errors import InputError
 
 
 def test_no_two_photographs_get_one_file_and_none_leaves_the_folder():

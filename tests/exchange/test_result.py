@@ -7,16 +7,16 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.asset.finish import MeshFiles
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.errors import InputError
-from pimper_torch.exchange import read_result
-from pimper_torch.exchange.nerfstudio import write_nerfstudio
-from pimper_torch.geometry.projection import project
-from pimper_torch.io import results
-from pimper_torch.io.estimates import estimate_of
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.radiometry import Encoding
+from pimper_torch.doors.exchange import read_result
+from pimper_torch.doors.exchange.nerfstudio import write_nerfstudio
+from pimper_torch.doors.io import results
+from pimper_torch.doors.io.estimates import estimate_of
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.runtime.errors import InputError
 
 
 def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):

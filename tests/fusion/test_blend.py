@@ -7,9 +7,9 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.fusion.problem import transferred_height_fields
-from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
+from pimper_torch.method.fusion.problem import transferred_height_fields
 from pimper_torch.records import Heights, SweptPatches
 
 FIRST, SECOND = 400.0, 100.0  # inverse variances

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.normal_bias import CoarsePart
-from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.method.fusion.normal_bias import CoarsePart
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
 

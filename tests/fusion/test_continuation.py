@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.topology import face_edges
-from pimper_torch.linalg.continuation import about_mean, continued, enclosed
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.ground.linalg.continuation import about_mean, continued, enclosed
 
 WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
 

@@ -4,7 +4,10 @@ from derivatives import check_derivatives
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.equations import (
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.method.fusion.equations import (
     BaseSurface,
     Common,
     cloud_points,
@@ -16,9 +19,6 @@ from pimper_torch.fusion.equations import (
     swept_heights,
     upright,
 )
-from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.topology import face_edges
-from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -4,11 +4,11 @@ from derivatives import check_derivatives
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.fusion.equations import Equations
-from pimper_torch.fusion.estimate import fuse_like, fuse_terms, noise_factor
-from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.prepared import SingularSystemError
+from pimper_torch.ground.linalg.multigrid import Multigrid
+from pimper_torch.ground.linalg.prepared import SingularSystemError
+from pimper_torch.method.fusion.equations import Equations
+from pimper_torch.method.fusion.estimate import fuse_like, fuse_terms, noise_factor
+from pimper_torch.runtime.errors import PimperWarning
 
 COUNT = 900
 
@@ -144,10 +144,10 @@ def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kern
         stuck.append(told)
         raise SingularSystemError("no convergence")
 
-    monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
-    monkeypatch.setattr("pimper_torch.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
+    monkeypatch.setattr("pimper_torch.ground.linalg.systems._CHOLESKY_UNKNOWNS", 100)
+    monkeypatch.setattr("pimper_torch.ground.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr(Multigrid, "solve", refusing)
-    monkeypatch.setattr("pimper_torch.linalg.systems.solve_by_cycles", refusing)
+    monkeypatch.setattr("pimper_torch.ground.linalg.systems.solve_by_cycles", refusing)
     with using(kernels), pytest.warns(PimperWarning, match="solved by a Cholesky factor"):
         found = fused(kinds)
     assert stuck

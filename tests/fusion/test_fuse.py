@@ -8,17 +8,17 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.chains.photometric import warn_of_priors
-from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.fusion.equations import Equations
-from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights, Term, TouchedRays
-from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.rigid import rotate
-from pimper_torch.geometry.topology import face_edges
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.rigid import rotate
+from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.method.chains.photometric import warn_of_priors
+from pimper_torch.method.fusion.equations import Equations
+from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights, Term, TouchedRays
+from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
-from pimper_torch.reporting import figures
-from pimper_torch.sweep.sweep import Sweep
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.runtime.reporting import figures
 
 
 def without(*names: str) -> tuple[str, ...]:

@@ -3,9 +3,9 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.fusion.equations import swept_heights
-from pimper_torch.fusion.normal_bias import common, common_variance, normal_bias
-from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.method.fusion.equations import swept_heights
+from pimper_torch.method.fusion.normal_bias import common, common_variance, normal_bias
 
 FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
 

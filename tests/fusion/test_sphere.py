@@ -7,15 +7,15 @@ import torch
 from scipy.spatial import Delaunay
 from torch.nn.functional import normalize
 
-from pimper_torch.fusion.estimate import fuse_terms
-from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.fusion.problem import pose
-from pimper_torch.fusion.terms import KeptSlopes, Normals, SweptHeights
-from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.geometry.template_normals import transferred_normals
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.ground.geometry.template_normals import transferred_normals
+from pimper_torch.method.fusion.estimate import fuse_terms
+from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.fusion.problem import pose
+from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -3,10 +3,10 @@
 ``python tests/fuzz/run.py --count 20000 --seed 0 --report fuzz.jsonl``
 
 Every file is read in a forked worker that may take 2 GB more than it began with and 20 s. What is
-accepted: a :class:`~pimper_torch.errors.PimperError` in words of the package, or a result whose
-values are finite and whose indices exist. What is not: any other exception, an ended or hanging
-process, more memory, files opened outside of the folder, pickles, and text of a library's source
-in a message. The report has a line a failure, and the file that made it is kept beside it.
+accepted: a :class:`~pimper_torch.runtime.errors.PimperError` in words of the package, or a result
+whose values are finite and whose indices exist. What is not: any other exception, an ended or
+hanging process, more memory, files opened outside of the folder, pickles, and text of a library's
+source in a message. The report has a line a failure, and the file that made it is kept beside it.
 """
 
 import argparse
@@ -34,10 +34,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from mutations import mutated
 from seeds import Seed, make_seeds
 
-from pimper_torch.errors import PimperError
-from pimper_torch.geometry.colmap_library import loaded
+from pimper_torch.ground.geometry.colmap_library import loaded
+from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.records import Record
-from pimper_torch.sfm.model import SparseModel
+from pimper_torch.runtime.errors import PimperError
 
 LIMIT_BYTES, LIMIT_SECONDS = 2 * 2**30, 20.0
 # Of libraries' sources and memory, which say nothing to a reader.

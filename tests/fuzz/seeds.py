@@ -38,26 +38,26 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.camera_files.read_cameras import read_cameras
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.config import build, read_mapping, to_yaml
-from pimper_torch.exchange.alicevision import write_sfm
-from pimper_torch.exchange.openexr import write_exr
-from pimper_torch.geometry.lens_models import pinhole_lenses
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.rigid import invert_rigid
-from pimper_torch.io.decode import decode, write_deep_png
-from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
-from pimper_torch.io.photographs import load_views
-from pimper_torch.io.responses import read_curve
-from pimper_torch.prior_files.read_maps import read_depth, read_normals
+from pimper_torch.cli.video.read import luma_frames
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.read_cameras import read_cameras
+from pimper_torch.doors.exchange.alicevision import write_sfm
+from pimper_torch.doors.exchange.openexr import write_exr
+from pimper_torch.doors.io.decode import decode, write_deep_png
+from pimper_torch.doors.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.doors.io.responses import read_curve
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.sfm.colmap import read_model, reconstruction_of, write_binary
+from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
-from pimper_torch.sfm.colmap import read_model, reconstruction_of, write_binary
-from pimper_torch.sfm.existing import existing_ways
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.video.read import luma_frames
+from pimper_torch.runtime.config import build, read_mapping, to_yaml
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from slopes import normals_from_slopes
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
-from pimper_torch.geometry.pixels import (
+from pimper_torch.ground.geometry.pixels import (
     crop_intrinsics,
     grid_from_pixels,
     indices_from_pixels,
@@ -14,8 +14,8 @@ from pimper_torch.geometry.pixels import (
     pixels_from_indices,
     scale_intrinsics,
 )
-from pimper_torch.geometry.projection import project, rays_through
-from pimper_torch.geometry.surfaces import slopes_from_normals
+from pimper_torch.ground.geometry.projection import project, rays_through
+from pimper_torch.ground.geometry.surfaces import slopes_from_normals
 
 WIDTH, HEIGHT = 7, 5
 

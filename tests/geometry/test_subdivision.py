@@ -3,9 +3,9 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.topology import half_edges
+from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide, transferred
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.topology import half_edges
 
 
 def icosphere(subdivisions=1):

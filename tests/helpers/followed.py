@@ -10,7 +10,7 @@ from collections.abc import Callable
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.chains.presets import load_config, make_chain
+from pimper_torch.method.chains.presets import load_config, make_chain
 
 
 def _own(kind: object) -> bool:

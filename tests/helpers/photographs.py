@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pimper_torch.exchange.picture_files import write_picture
+from pimper_torch.doors.exchange.picture_files import write_picture
 
 
 def save_photographs(views, folder):

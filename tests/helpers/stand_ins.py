@@ -17,7 +17,7 @@ def event(event, **about):
 def end():
     (out / ".stages").mkdir(parents=True, exist_ok=True)
     (out / "summary.json").write_text(json.dumps({"views": 8, "faces": 99, "seconds": 1.5}))
-    from pimper_torch.outputs.marker import seal
+    from pimper_torch.doors.outputs.marker import seal
     seal(out, "result")
 def fail(kind, code, message="it is so."):
     event("error", kind=kind, message=message, exit_code=code)
@@ -54,7 +54,7 @@ def children_stand_in(folder: Path) -> str:
     import pimper_torch
 
     (folder / "sitecustomize.py").write_text(
-        f"from pimper_torch.batches import task\ntask._CHILD = {CHILD!r}\n"
+        f"from pimper_torch.cli.batches import task\ntask._CHILD = {CHILD!r}\n"
     )
     return f"{folder}:{Path(pimper_torch.__file__).parents[1]}"
 

@@ -19,5 +19,7 @@ def using(kernels: Literal["numba", "torch"]) -> Iterator[None]:
     """Choose inside the ``with`` block whether kernels stand in for torch."""
     with ExitStack() as stack:
         for module in _MODULES if kernels == "torch" else ():
-            stack.enter_context(patch(f"pimper_torch.{module}.compiled_for", lambda *_: False))
+            stack.enter_context(
+                patch(f"pimper_torch.method.{module}.compiled_for", lambda *_: False)
+            )
         yield

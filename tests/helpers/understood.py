@@ -11,11 +11,11 @@ from unittest import mock
 
 import tyro
 
-from pimper_torch.chains.presets import load_config
 from pimper_torch.cli.arguments import REQUIRED, Option, options_of
 from pimper_torch.cli.main import _READERS, commands
 from pimper_torch.cli.output import split
-from pimper_torch.errors import ConfigError, PimperError
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.runtime.errors import ConfigError, PimperError
 
 COMMANDS = commands()
 

@@ -7,9 +7,9 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
-from pimper_torch.io.decode import decode, read_header, rotated
-from pimper_torch.io.header import focal_from_exif
+from pimper_torch.doors.io.decode import decode, read_header, rotated
+from pimper_torch.doors.io.header import focal_from_exif
+from pimper_torch.runtime.errors import InputError
 
 
 @pytest.fixture

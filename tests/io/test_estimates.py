@@ -5,12 +5,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.asset.finish import MeshFiles
-from pimper_torch.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.errors import InputError
-from pimper_torch.io import results
-from pimper_torch.io.estimates import estimate_of, read_estimate
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.doors.io import results
+from pimper_torch.doors.io.estimates import estimate_of, read_estimate
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.runtime.errors import InputError
 
 
 @pytest.fixture

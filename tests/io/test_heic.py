@@ -7,10 +7,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.decode import decode, read_header
-from pimper_torch.io.photographs import load_views
-from pimper_torch.radiometry import Srgb, linear_from_srgb
+from pimper_torch.doors.io.decode import decode, read_header
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.radiometry import Srgb, linear_from_srgb
+from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.heic_files import DEEP, UPRIGHT
 
 # Of a lossy format: a level or three of 255.
@@ -79,7 +79,7 @@ def test_without_its_package_heic_is_refused_with_what_to_install(tmp_path, monk
         write(tmp_path / f"{index}.heic", DEEP)
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "pimper_torch.io.extras.find_spec",
+        "pimper_torch.doors.io.extras.find_spec",
         lambda name: None if name.endswith("heif") else find(name),
     )
     told = r'0\.heic: is a HEIC image, which needs one more package: .*"pimper_torch\[heic\]"'
@@ -102,7 +102,7 @@ def test_heic_is_read_whatever_it_is_called(tmp_path, suffix):
 def test_other_images_are_read_whatever_they_are_called(
     tmp_path, stored, monkeypatch, suffix, name, lossy
 ):
-    monkeypatch.setattr("pimper_torch.io.extras.find_spec", lambda _: None)  # none is needed
+    monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # none is needed
     for index in range(3):
         Image.fromarray(stored).save(tmp_path / f"{index}{suffix}", format=name)
     decoded = decode(tmp_path / f"0{suffix}")
@@ -136,7 +136,7 @@ def test_damaged_and_huge_heic_is_refused_by_name(tmp_path, monkeypatch):
         (tmp_path / "cut.heic").write_bytes(whole[: int(fraction * len(whole))])
         with pytest.raises(InputError, match=r"cut\.heic"):
             decode(tmp_path / "cut.heic")
-    monkeypatch.setattr("pimper_torch.io.decode.MAX_PIXELS", 1000)
+    monkeypatch.setattr("pimper_torch.doors.io.decode.MAX_PIXELS", 1000)
     with pytest.raises(InputError, match=r"a\.heic: has 48 x 64 pixels"):
         decode(path)
     with pytest.raises(InputError, match=r"b\.heic: cannot be read \(No such file"):

@@ -7,9 +7,9 @@ import torch
 from PIL import Image, ImageCms
 from torch.testing import assert_close
 
-from pimper_torch.io.profiles import read_profile
-from pimper_torch.radiometry import Curve, Gamma, Linear, Srgb, linear_from_srgb
-from pimper_torch.radiometry.primaries import in_srgb_primaries
+from pimper_torch.doors.io.profiles import read_profile
+from pimper_torch.ground.radiometry import Curve, Gamma, Linear, Srgb, linear_from_srgb
+from pimper_torch.ground.radiometry.primaries import in_srgb_primaries
 
 # Of Apple's Display P3, adapted to D50.
 P3 = ((0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06657, 0.78407))

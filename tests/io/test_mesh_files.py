@@ -7,13 +7,13 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.asset.finish import MeshFiles
-from pimper_torch.errors import ConfigError
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.results import write_result
-from pimper_torch.radiometry import Encoding
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.results import write_result
+from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.records import Mesh
-from pimper_torch.viz.maps import albedo_scale
+from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.viz.maps import albedo_scale
+from pimper_torch.runtime.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 

@@ -9,12 +9,12 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.io.decode import decode, read_header
-from pimper_torch.io.photographs import load_views
-from pimper_torch.io.profiles import colour_of_codes
-from pimper_torch.radiometry import Encoding, Gamma, Linear, Srgb, linear_from_srgb
-from pimper_torch.radiometry.primaries import ADOBE_RGB, DISPLAY_P3, REC_709, primaries_of
+from pimper_torch.doors.io.decode import decode, read_header
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.doors.io.profiles import colour_of_codes
+from pimper_torch.ground.radiometry import Encoding, Gamma, Linear, Srgb, linear_from_srgb
+from pimper_torch.ground.radiometry.primaries import ADOBE_RGB, DISPLAY_P3, REC_709, primaries_of
+from pimper_torch.runtime.errors import PimperWarning
 
 LINEAR_CURVE = b"curv" + bytes(8)
 

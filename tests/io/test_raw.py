@@ -7,10 +7,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.decode import decode, read_header, rotated
-from pimper_torch.io.photographs import list_images, load_views
-from pimper_torch.radiometry import Encoding, Linear, srgb_from_linear
+from pimper_torch.doors.io.decode import decode, read_header, rotated
+from pimper_torch.doors.io.photographs import list_images, load_views
+from pimper_torch.ground.radiometry import Encoding, Linear, srgb_from_linear
+from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import XYZ_TO_CAMERA, write_dng
 
 SRGB_TO_XYZ = torch.tensor(
@@ -90,7 +90,7 @@ def test_samples_are_what_the_sensor_saw_between_black_and_saturation(folder, co
 
 
 def test_a_level_of_saturation_below_full_scale_is_counted_from_black(folder, monkeypatch, colours):
-    monkeypatch.setattr("pimper_torch.io.raw._white", lambda _: 3000)
+    monkeypatch.setattr("pimper_torch.doors.io.raw._white", lambda _: 3000)
     inner = (slice(None), slice(3, -3), slice(3, -3))
     found = decode(folder / "0.dng").samples
     wanted = sensor_of(colours).float() * (WHITE - BLACK) / (3000 - BLACK)
@@ -206,7 +206,8 @@ def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
 def test_without_its_package_raw_is_refused_with_what_to_install(folder, monkeypatch, pixels):
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "pimper_torch.io.extras.find_spec", lambda name: None if name == "rawpy" else find(name)
+        "pimper_torch.doors.io.extras.find_spec",
+        lambda name: None if name == "rawpy" else find(name),
     )
     with pytest.raises(InputError, match=r'0\.dng: is camera raw.*pip install "pimper_torch\[raw'):
         load_views(folder)
@@ -230,7 +231,7 @@ def test_damaged_and_huge_raw_is_refused_by_name(tmp_path, colours, monkeypatch)
     write_dng(tmp_path / "huge.dng", mosaic, size=(30000, 20000))
     with pytest.raises(InputError, match=r"huge\.dng: cannot be read as camera raw"):
         decode(tmp_path / "huge.dng")  # more than its bytes hold
-    monkeypatch.setattr("pimper_torch.io.decode.MAX_PIXELS", 1000)
+    monkeypatch.setattr("pimper_torch.doors.io.decode.MAX_PIXELS", 1000)
     with pytest.raises(InputError, match=r"a\.dng: has 60 x 40 pixels"):
         decode(tmp_path / "a.dng")
     with pytest.raises(InputError, match=r"gone\.dng: cannot be read \(No such file"):

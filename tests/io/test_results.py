@@ -13,23 +13,23 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.asset.finish import MeshFiles, written_channels
-from pimper_torch.errors import OutputError
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.projection import rays_through
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.io import results
-from pimper_torch.io.estimates import estimate_of, read_estimate
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.reports import common_lights, lights_report, summary_report, world_lights
-from pimper_torch.io.results import RESULT_NAMES, write_result
-from pimper_torch.outputs.folders import prepare_output
-from pimper_torch.outputs.marker import MARKER
-from pimper_torch.progress import listening
-from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.doors.io import results
+from pimper_torch.doors.io.estimates import estimate_of, read_estimate
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.reports import common_lights, lights_report, summary_report, world_lights
+from pimper_torch.doors.io.results import RESULT_NAMES, write_result
+from pimper_torch.doors.outputs.folders import prepare_output
+from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.ground.geometry.nearest import NearestSurface
+from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Mesh, Silhouettes
-from pimper_torch.sfm.colmap import read_model
-from pimper_torch.viz.maps import albedo_scale
+from pimper_torch.result.asset.finish import MeshFiles, written_channels
+from pimper_torch.result.viz.maps import albedo_scale
+from pimper_torch.runtime.errors import OutputError
+from pimper_torch.runtime.progress import listening
 
 
 @dataclass(frozen=True)

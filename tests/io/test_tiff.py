@@ -8,10 +8,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.io.decode import decode, read_header
-from pimper_torch.io.photographs import load_views
-from pimper_torch.radiometry import LINEAR, Encoding
+from pimper_torch.doors.io.decode import decode, read_header
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.radiometry import LINEAR, Encoding
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
 @pytest.fixture

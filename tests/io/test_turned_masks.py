@@ -5,9 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.errors import InputError
-from pimper_torch.io.decode import rotated
-from pimper_torch.io.photographs import load_views
+from pimper_torch.doors.io.decode import rotated
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.runtime.errors import InputError
 
 
 def disc(width, height):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-import pimper_torch.kernels
-from pimper_torch.kernels.compile import (
+import pimper_torch.ground.kernels
+from pimper_torch.ground.kernels.compile import (
     COARSE,
     GRADIENTS,
     PHOTOMETRY,
@@ -21,7 +21,7 @@ from pimper_torch.kernels.compile import (
     load,
 )
 
-AHEAD = "from pimper_torch.kernels.compile import *; child = compile_ahead(); "
+AHEAD = "from pimper_torch.ground.kernels.compile import *; child = compile_ahead(); "
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_compiled_functions_answer_as_python_does():
 def test_compile_all_leaves_torchs_threads_alone_and_compile_ahead_nothing_to_do():
     code = (
         "import torch; torch.set_num_threads(2)\n"
-        "from pimper_torch.kernels.compile import compile_ahead, compile_all\n"
+        "from pimper_torch.ground.kernels.compile import compile_ahead, compile_all\n"
         "compile_all(); assert torch.get_num_threads() == 2; assert compile_ahead() is None"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -54,7 +54,7 @@ def test_compile_all_leaves_torchs_threads_alone_and_compile_ahead_nothing_to_do
 
 def test_every_kernel_of_a_run_is_compiled():
     listed = {*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE}
-    sources = Path(pimper_torch.kernels.__path__[0]).glob("*.py")
+    sources = Path(pimper_torch.ground.kernels.__path__[0]).glob("*.py")
     with_types = {
         path.stem
         for path in sources
@@ -66,8 +66,8 @@ def test_every_kernel_of_a_run_is_compiled():
 def test_no_kernel_is_compiled_twice_at_once(fresh):
     """What another process compiles comes last, and is waited for."""
     code = (
-        "from pimper_torch.kernels.compile import cache_folder, load\n"
-        "from pimper_torch.progress import listening\n"
+        "from pimper_torch.ground.kernels.compile import cache_folder, load\n"
+        "from pimper_torch.runtime.progress import listening\n"
         "print(cache_folder(), flush=True); input()\n"
         "with listening(lambda done, total: print(done, flush=True)):\n"
         "    load(('line_matches', 'lookup'))"
@@ -105,7 +105,7 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
 def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
     code = (
         f"{AHEAD} child.kill(); child.wait(); load(('line_matches',))\n"
-        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
+        "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
         "print(dict(kernel.stats.cache_misses))"
     )
     with started(code) as parent:
@@ -118,7 +118,7 @@ def test_a_kernel_gives_the_same_bits_compiled_and_from_disk(fresh):
     """The kernel calls many functions: its machine code has their copies, optimized again."""
     code = (
         "import numpy as np\n"
-        "from pimper_torch.kernels import lights_and_albedo as lights\n"
+        "from pimper_torch.ground.kernels import lights_and_albedo as lights\n"
         "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
         "normals = random.normal(size=(3, samples))\n"
         "normals /= np.linalg.norm(normals, axis=0)\n"
@@ -143,7 +143,7 @@ def test_an_unknown_kernel_is_an_error():
 
 
 def test_kernels_are_compiled_anew_when_any_of_their_sources_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path)])
+    monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path)])
     kept = tmp_path / "__pycache__" / "one.py311.nbi"
     kept.parent.mkdir()
     for source in ("one.py", "two.py"):

@@ -3,12 +3,12 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.geometry.pyramids import prepare
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.patches.warp import Warp, WarpConfig
+from pimper_torch.ground.geometry.pyramids import prepare
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.method.patches.warp import Warp, WarpConfig
+from pimper_torch.method.sweep.costs import Hypotheses, costs_of
+from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Mesh
-from pimper_torch.sweep.costs import Hypotheses, costs_of
-from pimper_torch.sweep.sweep import Sweep
 
 
 def height_field(templates):

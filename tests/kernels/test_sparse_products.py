@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pimper_torch.kernels import sparse_products
-from pimper_torch.linalg.aggregation import parts_of
+from pimper_torch.ground.kernels import sparse_products
+from pimper_torch.ground.linalg.aggregation import parts_of
 from tests.linalg.laplacians import triangles
 
 FIRST, LAST = 5, 1590  # of 1600 rows: the others are left alone

@@ -5,9 +5,9 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
 from torch.testing import assert_close
 
-from pimper_torch.kernels import vector_updates as kernels
-from pimper_torch.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
-from pimper_torch.linalg.hierarchy import Hierarchy
+from pimper_torch.ground.kernels import vector_updates as kernels
+from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
+from pimper_torch.ground.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles
 
 CPU = torch.device("cpu")

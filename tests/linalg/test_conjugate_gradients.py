@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.linalg.conjugate_gradients import conjugate_gradients
+from pimper_torch.ground.linalg.conjugate_gradients import conjugate_gradients
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.meshing import borders
+from pimper_torch.method.meshing import borders
 from tests.meshing.sheets import sheet_of
 
 LENGTH = 3.0

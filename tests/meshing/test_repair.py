@@ -7,16 +7,22 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.topology import (
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.topology import (
     boundary_loops,
     boundary_vertices,
     face_edges,
     vertex_components,
 )
-from pimper_torch.meshing.extract import Extract, ExtractConfig
-from pimper_torch.meshing.faults import faults
-from pimper_torch.meshing.repair import Repair, RepairConfig, least_bent, repair, surroundings
+from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.meshing.faults import faults
+from pimper_torch.method.meshing.repair import (
+    Repair,
+    RepairConfig,
+    least_bent,
+    repair,
+    surroundings,
+)
 from pimper_torch.records import Mesh
 
 OLD = ExtractConfig(overturned="all")

@@ -4,9 +4,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
-from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.meshing.simplify import Bounds, simplify
+from pimper_torch.ground.geometry.nearest import NearestSurface, closest_on_triangles
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.method.meshing.simplify import Bounds, simplify
 from pimper_torch.records import Mesh
 
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from pimper_torch.errors import InputError, OutputError
-from pimper_torch.outputs.folders import (
+from pimper_torch.doors.outputs.folders import (
     clean_output,
     held_output,
     prepare_output,
     require_apart,
     written_whole,
 )
-from pimper_torch.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
+from pimper_torch.doors.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
+from pimper_torch.runtime.errors import InputError, OutputError
 
 
 def held(folder: Path) -> list[str]:
@@ -231,7 +231,7 @@ def test_a_disk_that_is_full_while_the_list_is_written_changes_nothing(out, monk
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("pimper_torch.outputs.folders.seal", full)
+    monkeypatch.setattr("pimper_torch.doors.outputs.folders.seal", full)
     with pytest.raises(OutputError, match="No space left"):
         write(out, result("second"), overwrite=True)
     assert contents(out) == result("first", "masks/a.png")
@@ -241,7 +241,7 @@ def test_a_disk_that_is_full_while_the_list_is_written_changes_nothing(out, monk
 KILLED_AT_EVERY_STEP = """
 import os, shutil, signal, sys
 from pathlib import Path
-from pimper_torch.outputs.folders import held_output, written_whole
+from pimper_torch.doors.outputs.folders import held_output, written_whole
 folder = Path(sys.argv[1])
 first = {"mesh.ply": "first", "masks/a.png": "the same", "masks/b.png": "first"}
 second = {"mesh.ply": "second", "masks/a.png": "the same", "lights/all/c.json": "second"}
@@ -319,7 +319,7 @@ def test_the_folder_where_one_is_stays_the_folder_where_one_is(out, monkeypatch)
 HOLDS = """
 import sys, time
 from pathlib import Path
-from pimper_torch.outputs.folders import held_output, written_whole
+from pimper_torch.doors.outputs.folders import held_output, written_whole
 folder, mode = Path(sys.argv[1]), sys.argv[2]
 with held_output(folder, "result", overwrite=True):
     (folder / ".stages" / "mesh.pt").write_text("kept")

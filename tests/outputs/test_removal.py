@@ -6,14 +6,14 @@ import sys
 import pytest
 
 from pimper_torch.cli.main import main
-from pimper_torch.errors import OutputError
-from pimper_torch.outputs.folders import clean_output, held_output, written_whole
-from pimper_torch.outputs.marker import MARKER, STAGES
+from pimper_torch.doors.outputs.folders import clean_output, held_output, written_whole
+from pimper_torch.doors.outputs.marker import MARKER, STAGES
+from pimper_torch.runtime.errors import OutputError
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from pimper_torch.outputs.folders import held_output, written_whole
+from pimper_torch.doors.outputs.folders import held_output, written_whole
 folder = Path(sys.argv[1])
 with held_output(folder, "result", overwrite=True):
     (folder / ".stages" / "mesh.pt").write_bytes(bytes(3_000_000))

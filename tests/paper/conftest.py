@@ -2,7 +2,7 @@ import pytest
 import torch
 from slopes import normals_from_slopes
 
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -2,10 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.topology import half_edges
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.topology import half_edges
 from pimper_torch.paper.cloud_filters import delaunay, fill_pixels, interpolate_inverse_depth
 from pimper_torch.paper.triangulate import (
     Triangulate,
@@ -13,6 +12,7 @@ from pimper_torch.paper.triangulate import (
     largest_component,
     peel,
 )
+from pimper_torch.runtime.errors import ReconstructionError
 
 
 def test_the_mesh_of_a_ball_faces_out_is_connected_and_lies_on_the_ball(dome_cloud):

@@ -2,16 +2,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ReconstructionError
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.patches.decompose import (
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.patches.decompose import (
     Decompose,
     DecomposeConfig,
     enlarge,
     group_by_size,
     views_facing,
 )
+from pimper_torch.runtime.errors import ReconstructionError
 
 
 def test_the_facet_lies_in_the_plane_z_0_and_the_camera_sees_its_front(plane_scene, plane_mesh):

@@ -7,11 +7,11 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import turntable_directions
-from pimper_torch.geometry.pinholes import look_at, pinholes
-from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig, views_facing
-from pimper_torch.patches.view_choice import best_views, view_blocks, view_weights
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig, views_facing
+from pimper_torch.method.patches.view_choice import best_views, view_blocks, view_weights
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
 
 FOCAL, DISTANCE, SPACING = 100.0, 4.0, 0.02

@@ -2,13 +2,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.pyramids import look_up, pyramid_level
-from pimper_torch.geometry.rigid import invert_rigid, transform
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.patches.warp import Warp, WarpConfig
+from pimper_torch.ground.geometry.pyramids import look_up, pyramid_level
+from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.warp import Warp, WarpConfig
 from pimper_torch.records import CoarseMesh, Mesh
-from pimper_torch.reporting import figures
+from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.runtime.reporting import figures
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
-from pimper_torch.photometry.bilinear import residual_deviation
-from pimper_torch.photometry.factorize import Factorize
-from pimper_torch.photometry.fit_light import FitLight
-from pimper_torch.photometry.lights import fit_light_field, thinned
-from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
+from pimper_torch.method.photometry.bilinear import residual_deviation
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight
+from pimper_torch.method.photometry.lights import fit_light_field, thinned
+from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.runtime.errors import PimperWarning
 
 
 def solve(given, how, iterations=60, tolerance=1e-4, **settings):
@@ -118,7 +118,7 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
 
 def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
     true = scene(bumps=0.0)
-    monkeypatch.setattr("pimper_torch.photometry.lights.LIGHT_SAMPLES", 30)
+    monkeypatch.setattr("pimper_torch.method.photometry.lights.LIGHT_SAMPLES", 30)
     thin = thinned(true.seen.patches)
     registered = []
     for few, templates, each in zip(

@@ -8,8 +8,7 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
-from pimper_torch.photometry.factor_priors import (
+from pimper_torch.method.photometry.factor_priors import (
     FactorPrior,
     FieldLights,
     Guesses,
@@ -17,9 +16,10 @@ from pimper_torch.photometry.factor_priors import (
     SurfaceNormals,
     views_worth,
 )
-from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.fit_light import FitLight
+from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.records import PatchPriors
+from pimper_torch.runtime.errors import ConfigError
 from tests.photometry.test_factorize import median_error
 
 

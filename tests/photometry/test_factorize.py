@@ -7,14 +7,14 @@ from solved import solved
 from torch.nn.functional import pad
 from torch.testing import assert_close
 
-from pimper_torch.chains.presets import load_config
-from pimper_torch.errors import ConfigError, PimperWarning
-from pimper_torch.geometry.template_normals import coarse_normals
-from pimper_torch.photometry import factorize
-from pimper_torch.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.photometry.fit_light import FitLight, FitLightConfig
-from pimper_torch.photometry.light_field import LightField, harmonics
+from pimper_torch.ground.geometry.template_normals import coarse_normals
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.photometry import factorize
+from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig
+from pimper_torch.method.photometry.light_field import LightField, harmonics
 from pimper_torch.records import PatchStatus, PatchViews
+from pimper_torch.runtime.errors import ConfigError, PimperWarning
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 

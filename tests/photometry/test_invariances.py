@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from solved import solved
 from torch.testing import assert_close
 
-from pimper_torch.photometry.factorize import Factorize
+from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.records import PatchViews
 
 SEEDS = st.integers(0, 2**31 - 1)

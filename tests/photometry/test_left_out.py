@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.photometry.light_models import left_out, predicts_better
+from pimper_torch.method.photometry.light_models import left_out, predicts_better
 
 
 def test_a_fifth_of_every_sample_and_of_every_view_is_left_out_of_what_is_seen(generator):

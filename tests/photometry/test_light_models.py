@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.photometry.light_field import LightField, harmonics, second_harmonics
-from pimper_torch.photometry.light_models import MIN_DISTANCE, LightModel
+from pimper_torch.method.photometry.light_field import LightField, harmonics, second_harmonics
+from pimper_torch.method.photometry.light_models import MIN_DISTANCE, LightModel
 
 
 def basis(normals):
@@ -84,7 +84,7 @@ def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(sam
 
 
 def test_the_initial_soft_light_has_the_brightness_of_every_view(samples, generator):
-    from pimper_torch.photometry.light_models import ImageSamples
+    from pimper_torch.method.photometry.light_models import ImageSamples
 
     normals = normalize(samples[0] + torch.tensor([0.0, 0, -3]).double(), dim=1)
     gain = torch.tensor([0.5, 1.0, 3.0]).double()

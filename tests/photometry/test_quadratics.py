@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.photometry.quadratics import (
+from pimper_torch.method.photometry.quadratics import (
     apply_packed,
     congruence,
     outer,

@@ -5,8 +5,7 @@ import torch
 from scipy.optimize import least_squares
 from torch.testing import assert_close
 
-from pimper_torch.errors import ConfigError
-from pimper_torch.linalg.robust import (
+from pimper_torch.ground.linalg.robust import (
     Cauchy,
     GemanMcClure,
     Huber,
@@ -14,6 +13,7 @@ from pimper_torch.linalg.robust import (
     median_deviation,
     robust_deviation,
 )
+from pimper_torch.runtime.errors import ConfigError
 
 
 def drawn(generator, *shape):

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.photometry.bilinear import Factors, equations_of_samples, update_shading
-from pimper_torch.photometry.sample_estimates import fit_albedo, refine_on_manifold
+from pimper_torch.method.photometry.bilinear import Factors, equations_of_samples, update_shading
+from pimper_torch.method.photometry.sample_estimates import fit_albedo, refine_on_manifold
 from pimper_torch.records import Convergence
 
 

@@ -5,9 +5,9 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
-from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.photometry.light_field import LightField
-from pimper_torch.photometry.shadows import cast_shadows, cast_shadows_on_rasters
+from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.method.photometry.light_field import LightField
+from pimper_torch.method.photometry.shadows import cast_shadows, cast_shadows_on_rasters
 from pimper_torch.records import Mesh
 
 RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.photometry.status import light_varies, patch_status
+from pimper_torch.method.photometry.status import light_varies, patch_status
 from pimper_torch.records import PatchStatus
 
 

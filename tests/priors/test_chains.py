@@ -4,7 +4,7 @@ from torch import nn
 from torch.testing import assert_close
 
 import pimper_torch as pt
-from pimper_torch.errors import PimperWarning
+from pimper_torch.runtime.errors import PimperWarning
 
 
 class Caught(Exception):  # noqa: N818 - no error: it ends the chain where it has been seen enough

@@ -3,12 +3,12 @@ import torch
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
 from pimper_torch.records.scene_parts import with_views
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
 def noisy(normals, degrees, seed=1):

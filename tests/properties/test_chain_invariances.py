@@ -8,8 +8,8 @@ import torch
 
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.errors import PimperWarning
 from pimper_torch.records import Mesh, SparseScene
+from pimper_torch.runtime.errors import PimperWarning
 from tests.test_chain import photographed, small_chain
 
 # Of the diagonal of a cap that is 1.1 across, sampled 0.013 apart. Rounding of a shifted world, or

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.linalg.robust import robust_variance
-from pimper_torch.linalg.sums import total
-from pimper_torch.meshing.closing import closed
-from pimper_torch.meshing.simplify import simplify
-from pimper_torch.photometry.cone import project_to_cone
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.linalg.robust import robust_variance
+from pimper_torch.ground.linalg.sums import total
+from pimper_torch.method.meshing.closing import closed
+from pimper_torch.method.meshing.simplify import simplify
+from pimper_torch.method.photometry.cone import project_to_cone
 from pimper_torch.records import Mesh
 
 SEEDS = st.integers(0, 2**31 - 1)

@@ -7,9 +7,9 @@ from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError
 from pimper_torch.records import Cameras, Convergence, Photometry, Record, SparseScene, Views
 from pimper_torch.records.patches import Templates
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -16,10 +16,10 @@ from torch import Tensor
 
 import pimper_torch as pt
 from pimper_torch import records
-from pimper_torch.chains.chain import Step
-from pimper_torch.errors import InputError, OutputError
+from pimper_torch.method.chains.chain import Step
 from pimper_torch.records import Record, stored
 from pimper_torch.records.stored import load_record, save_record
+from pimper_torch.runtime.errors import InputError, OutputError
 
 # Lengths of the axes that several fields share; they differ, so that no axis passes for another.
 AXES = {"patch": 2, "view": 3, "height": 4, "width": 5, "channel": 1, "vertex": 6, "face": 7}

@@ -5,12 +5,12 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
-from pimper_torch.geometry.pinholes import look_at, pinholes
-from pimper_torch.io.tensors import scene_of
+from pimper_torch.doors.io.tensors import scene_of
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh, ViewLights
-from pimper_torch.relighting.fit_lights import fit_lights, observe
-from pimper_torch.relighting.held_out import predict, psnr, shaded
-from pimper_torch.relighting.lit_surface import LitSurface
+from pimper_torch.result.relighting.fit_lights import fit_lights, observe
+from pimper_torch.result.relighting.held_out import predict, psnr, shaded
+from pimper_torch.result.relighting.lit_surface import LitSurface
 from tests.relighting.ball import ball_mesh, photographed
 from tests.threads import on_threads
 

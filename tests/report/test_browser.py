@@ -9,15 +9,15 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.asset.make import textured
-from pimper_torch.asset.write import write_asset
-from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Judged, Materials, Relighting, Silhouettes
-from pimper_torch.relighting.held_out import predict
-from pimper_torch.report.page import write_page
-from pimper_torch.report.predictions import predictions
-from pimper_torch.report.vertex_layers import surface_layers
-from pimper_torch.viz.maps import base_color, view_maps
+from pimper_torch.result.asset.make import textured
+from pimper_torch.result.asset.write import write_asset
+from pimper_torch.result.relighting.held_out import predict
+from pimper_torch.result.report.page import write_page
+from pimper_torch.result.report.predictions import predictions
+from pimper_torch.result.report.vertex_layers import surface_layers
+from pimper_torch.result.viz.maps import base_color, view_maps
 from tests.relighting.ball import SIDE, ball_mesh, photographed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Judged, Materials, Relighting, ViewLights
-from pimper_torch.report.page import section_entries, write_page
-from pimper_torch.report.predictions import (
+from pimper_torch.result.report.page import section_entries, write_page
+from pimper_torch.result.report.predictions import (
     Prediction,
     jpeg,
     longest_px,
@@ -22,7 +22,7 @@ from pimper_torch.report.predictions import (
     shrunk,
     view_entries,
 )
-from pimper_torch.report.vertex_layers import VertexLayer
+from pimper_torch.result.report.vertex_layers import VertexLayer
 
 MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
 SUMMARY = {

@@ -6,7 +6,7 @@ from typing import assert_type
 
 import pimper_torch as pt
 from pimper_torch.cli.options import bundled_photographs
-from pimper_torch.config import presets
+from pimper_torch.runtime.config import presets
 
 
 def main(site_packages: str) -> None:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes pimper_torch/report/three.js anew: what the page of a run uses of three.js, in one file.
+# Makes pimper_torch/result/report/three.js anew: what the page of a run uses of three.js, in one file.
 set -euo pipefail
 page="$(cd "$(dirname "$0")/../../pimper_torch/report" && pwd)"
 work="$(mktemp -d)"

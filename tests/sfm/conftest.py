@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.rigid import rigid
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.sparse_scene import assemble_scene
 from pimper_torch.records import Lens, SparseScene, Views
-from pimper_torch.sfm import colmap
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.sparse_scene import assemble_scene
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def model(generator: torch.Generator, lens: Lens) -> SparseModel:
     seen[:, :2] = True
     point, view = torch.nonzero(seen, as_tuple=True)
     points_cam = torch.einsum("vij,pj->vpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    pixels = torch.stack([colmap.distort(lenses[v], points_cam[v]) for v in range(5)])
+    pixels = torch.stack([distort(lenses[v], points_cam[v]) for v in range(5)])
     noise = 0.3 * torch.randn(len(point), 2, generator=generator, dtype=torch.float64)
     return SparseModel(
         names=("b.jpg", "a.jpg", "c 1.png", "d.jpg", "ü.tif"),

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.lens_models import distort
-from pimper_torch.geometry.rigid import rigid
-from pimper_torch.sfm.doubt import agreement, judged
-from pimper_torch.sfm.matching import VerifiedPair, all_pairs
-from pimper_torch.sfm.model import select_views
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.method.sfm.doubt import agreement, judged
+from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs
+from pimper_torch.method.sfm.model import select_views
 from tests.sfm import ball
 
 

@@ -10,7 +10,7 @@ pixels = np.random.default_rng(0).integers(0, 255, (400, 400, 3), dtype=np.uint8
 Image.fromarray(pixels).save({path!r})
 print("written")
 """
-COLMAP_FIRST = "from pimper_torch.sfm.colmap import loaded\nloaded()\n"
+COLMAP_FIRST = "from pimper_torch.method.sfm.colmap import loaded\nloaded()\n"
 
 
 def test_a_png_is_written_after_colmap_was_loaded(tmp_path):
@@ -21,7 +21,11 @@ def test_a_png_is_written_after_colmap_was_loaded(tmp_path):
 
 def test_a_script_that_loads_pycolmap_before_pillow_is_warned():
     ran = subprocess.run(
-        [sys.executable, "-c", f"import pycolmap\nimport pimper_torch.io.decode\n{COLMAP_FIRST}"],
+        [
+            sys.executable,
+            "-c",
+            f"import pycolmap\nimport pimper_torch.doors.io.decode\n{COLMAP_FIRST}",
+        ],
         capture_output=True,
         text=True,
         timeout=60,

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.camera_in_place import (
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.camera_in_place import (
     fit_map,
     least_squares_map,
     mapped,

@@ -3,7 +3,7 @@ import sys
 
 SCRIPT = """
 import os, signal
-from pimper_torch.sfm.colmap import quiet
+from pimper_torch.method.sfm.colmap import quiet
 
 def interrupt(number, frame):
     raise KeyboardInterrupt

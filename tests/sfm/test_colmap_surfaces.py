@@ -3,10 +3,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.poisson import reduced
-from pimper_torch.geometry.topology import boundary_vertices, half_edges
+from pimper_torch.ground.geometry.poisson import reduced
+from pimper_torch.ground.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import ConfigError
 
 
 def ball(level: int = 5) -> Mesh:

@@ -10,15 +10,15 @@ from PIL import Image
 from torch.nn.functional import interpolate, pad
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.geometry.lens_models import pinhole_of
-from pimper_torch.io.photographs import load_views
-from pimper_torch.radiometry import to_bytes
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.geometry.lens_models import pinhole_of
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.method.sfm.colmap import write_binary
+from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import write_binary
-from pimper_torch.sfm.existing import existing_ways
-from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.sfm.ball import (
     FOCAL,
     HEIGHT,

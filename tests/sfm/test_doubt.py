@@ -1,13 +1,13 @@
 import pytest
 import torch
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.projection import project
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.doubt import count_views_with_depth, doubt, following_fraction
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.sparse_scene import assemble_scene, write_model
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.doubt import count_views_with_depth, doubt, following_fraction
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.sparse_scene import assemble_scene, write_model
+from pimper_torch.runtime.errors import PimperWarning
 from tests.sfm.captured import FOCAL, HEIGHT, UP, WIDTH, orbit, seen_of_ball
 
 LENS = Lens(

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from pimper_torch.geometry.colmap_library import loaded, quiet
-from pimper_torch.io.photographs import load_views
-from pimper_torch.sfm.features import find_features, workspace
-from pimper_torch.sfm.matching import (
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.method.sfm.features import find_features, workspace
+from pimper_torch.method.sfm.matching import (
     Features,
     Near,
     guided_matches,
@@ -18,7 +18,7 @@ from pimper_torch.sfm.matching import (
     match_guided,
     match_pairs,
 )
-from pimper_torch.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
+from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
 CONFIG = ReconstructConfig(threads=1)
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pimper_torch.errors import PimperWarning, caution
-from pimper_torch.failures import collecting
-from pimper_torch.ledger import leave_out, left_out_of
-from pimper_torch.sfm import reconstruct
-from pimper_torch.sfm.reconstruct import Reconstruct, find_model
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.store import Store, digest
+from pimper_torch.method.sfm import reconstruct
+from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.runtime.errors import PimperWarning, caution
+from pimper_torch.runtime.failures import collecting
+from pimper_torch.runtime.ledger import leave_out, left_out_of
+from pimper_torch.runtime.store import Store, digest
 
-pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
 @pytest.fixture

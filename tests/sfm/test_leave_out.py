@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.geometry.colmap_library import loaded
-from pimper_torch.sfm.camera_in_place import mapped
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.static_background import leave_out_room
+from pimper_torch.ground.geometry.colmap_library import loaded
+from pimper_torch.method.sfm.camera_in_place import mapped
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.static_background import leave_out_room
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
 SETTINGS = ReconstructConfig(threads=1)

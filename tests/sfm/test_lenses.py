@@ -5,15 +5,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.records import Views
-from pimper_torch.sfm.colmap import bundle
-from pimper_torch.sfm.doubt import doubt_one_lens
-from pimper_torch.sfm.lenses import (
+from pimper_torch.method.sfm.colmap import bundle
+from pimper_torch.method.sfm.doubt import doubt_one_lens
+from pimper_torch.method.sfm.lenses import (
     choose_lenses,
     group_lenses,
 )
-from pimper_torch.sfm.reconstruct import structure_from_motion
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.reconstruct import structure_from_motion
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.records import Views
 from tests.sfm.ball import (
     HEIGHT,
     WIDTH,

@@ -9,13 +9,13 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError, PimperWarning
-from pimper_torch.geometry.colmap_library import loaded
-from pimper_torch.geometry.lens_models import pinhole_lenses
-from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.model_files import CAMERA_MODELS
+from pimper_torch.ground.geometry.colmap_library import loaded
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.model_files import CAMERA_MODELS
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 POINTS, VIEWS = 20, 4
 COLORS = torch.zeros(POINTS, 3, dtype=torch.uint8)

@@ -2,7 +2,12 @@ from itertools import combinations
 
 import torch
 
-from pimper_torch.sfm.moved_object import clusters, find_moved_object, object_votes, series_of
+from pimper_torch.method.sfm.moved_object import (
+    clusters,
+    find_moved_object,
+    object_votes,
+    series_of,
+)
 from tests.sfm.moved import photographed
 
 SIZE = torch.tensor([320.0, 240.0])

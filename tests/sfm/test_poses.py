@@ -5,16 +5,16 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError
-from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.poses import (
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.poses import (
     equal_poses,
     of_photographs,
     one_view_a_pose,
     pictures_of_poses,
     with_poses,
 )
+from pimper_torch.records import Lens, Views
+from pimper_torch.runtime.errors import InputError
 
 POSES = (0, 1, 0, 2, 1, 0)
 

@@ -2,11 +2,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lens_models import distort
-from pimper_torch.geometry.rigid import transform
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.sfm.lenses import turned_lens, turned_pixels, turned_pose
+from pimper_torch.method.sfm.model_files import CAMERA_MODELS
 from pimper_torch.records import Lens
-from pimper_torch.sfm.lenses import turned_lens, turned_pixels, turned_pose
-from pimper_torch.sfm.model_files import CAMERA_MODELS
 
 NO_PARAMETERS = ("EQUIRECTANGULAR",)
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from pimper_bench.scenes.whole_scene import upside_down
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.rigid import transform
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.sfm.matching import VerifiedPair
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.moved_object import series_in, with_series
 from pimper_torch.records import Lens
-from pimper_torch.sfm.matching import VerifiedPair
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.moved_object import series_in, with_series
+from pimper_torch.runtime.errors import PimperWarning
 from tests.sfm.moved import K, bodies, poses
 
 LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)

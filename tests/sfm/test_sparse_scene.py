@@ -2,20 +2,20 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lens_models import undistort_pixels
-from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.sfm.camera_in_place import mapped
-from pimper_torch.sfm.colmap import read_model
-from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.sparse_scene import (
+from pimper_torch.ground.geometry.lens_models import undistort_pixels
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.sfm.camera_in_place import mapped
+from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.sparse_scene import (
     assemble_scene,
     point_colors,
     reprojection_errors,
     write_model,
 )
-from pimper_torch.silhouettes.cues import cues_of
-from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.method.silhouettes.cues import cues_of
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):

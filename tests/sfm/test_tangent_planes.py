@@ -1,7 +1,12 @@
 import torch
 
-from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.track_observations import evenly, plane_homographies, plane_normals, tangents
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.track_observations import (
+    evenly,
+    plane_homographies,
+    plane_normals,
+    tangents,
+)
 from tests.sfm import ball
 
 

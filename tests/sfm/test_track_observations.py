@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.geometry.projection import project
-from pimper_torch.sfm.track_observations import log_pictures, sight, tangents
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.track_observations import log_pictures, sight, tangents
 from tests.sfm import ball
 
 

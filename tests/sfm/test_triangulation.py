@@ -8,20 +8,20 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from pimper_torch.errors import InputError, PimperWarning, ReconstructionError
-from pimper_torch.geometry.lens_models import pinhole_of, undistort_pixels
-from pimper_torch.geometry.local_frame import from_local
-from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.ground.geometry.lens_models import pinhole_of, undistort_pixels
+from pimper_torch.ground.geometry.local_frame import from_local
+from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.method.sfm.colmap import observation_errors
+from pimper_torch.method.sfm.conventions.resized_pictures import Ways
+from pimper_torch.method.sfm.epipolar import explained, pinholes_of
+from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.matching import VerifiedPair
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.triangulation import lacks_points, triangulate
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.colmap import observation_errors
-from pimper_torch.sfm.conventions.resized_pictures import Ways
-from pimper_torch.sfm.epipolar import explained, pinholes_of
-from pimper_torch.sfm.existing import existing_ways
-from pimper_torch.sfm.matching import VerifiedPair
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.sfm.triangulation import lacks_points, triangulate
+from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
 
 SETTINGS = ReconstructConfig(threads=1)

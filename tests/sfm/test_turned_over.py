@@ -5,9 +5,9 @@ import torch
 
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.errors import PimperWarning
-from pimper_torch.sfm.reconstruct import Reconstruct
-from pimper_torch.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.runtime.errors import PimperWarning
 from tests.sfm.test_turntable import center_errors, photographs
 
 

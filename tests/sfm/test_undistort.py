@@ -2,11 +2,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.lens_models import distort, is_pinhole, undistort_pixels
-from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.radiometry import SATURATED
+from pimper_torch.ground.geometry.lens_models import distort, is_pinhole, undistort_pixels
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.method.sfm.undistort import photograph_pixels, pinhole_for, undistort
 from pimper_torch.records import Lens, Views
-from pimper_torch.sfm.undistort import photograph_pixels, pinhole_for, undistort
 
 
 def bent(width: int, height: int, strength: float) -> Lens:

@@ -3,7 +3,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.method.sfm.undistort import photograph_pixels, with_undistorted_priors
 from pimper_torch.records import (
     AlbedoPrior,
     DepthPrior,
@@ -13,7 +14,6 @@ from pimper_torch.records import (
     NormalPrior,
     SilhouettePrior,
 )
-from pimper_torch.sfm.undistort import photograph_pixels, with_undistorted_priors
 
 SIZE = 60, 40
 BARREL = Lens(camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40)

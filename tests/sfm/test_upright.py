@@ -5,11 +5,11 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.lens_models import pinhole_lenses
-from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
-from pimper_torch.sfm.lenses import turned_pose
-from pimper_torch.sfm.model import SparseModel
-from pimper_torch.sfm.upright import level_up, upright
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses
+from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
+from pimper_torch.method.sfm.lenses import turned_pose
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.upright import level_up, upright
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.records import Cameras, Lens, SparseScene, Views
 from tests.silhouettes.shapes import all_round
 

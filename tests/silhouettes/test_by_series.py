@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from pimper_torch.method.silhouettes.find import by_series
 from pimper_torch.records import Silhouettes
-from pimper_torch.silhouettes.find import by_series
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.visual_hull import box_round
-from pimper_torch.silhouettes.trace import TraceContours
+from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.runtime.errors import PimperWarning
 from tests.silhouettes.shapes import PIXEL, ball, silhouettes_of, two_balls
 
 

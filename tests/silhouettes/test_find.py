@@ -1,18 +1,22 @@
 import pytest
 import torch
 
-from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.geometry.opencv import signed_distance
-from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.supporting_plane import Plane, fixation
+from pimper_torch.ground.geometry.opencv import signed_distance
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.supporting_plane import Plane, fixation
+from pimper_torch.method.silhouettes import cuts, find
+from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cuts import Cuts, cuts_of
+from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.method.silhouettes.parallax import (
+    plane_agreement,
+    room_agreement,
+    working_pictures,
+)
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.records import Silhouettes, Views
-from pimper_torch.silhouettes import cuts, find
-from pimper_torch.silhouettes.cues import Cues, cues_of
-from pimper_torch.silhouettes.cuts import Cuts, cuts_of
-from pimper_torch.silhouettes.find import FindSilhouettes, masked
-from pimper_torch.silhouettes.parallax import plane_agreement, room_agreement, working_pictures
-from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
 

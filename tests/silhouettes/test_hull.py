@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.pinholes import look_at, pinholes
-from pimper_torch.geometry.visual_hull import margins, visual_hull
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
 from pimper_torch.records import Cameras, Silhouettes
 
 BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
@@ -22,8 +22,8 @@ def all_round(num_views: int = 24, width: int = 160, height: int = 120) -> Camer
 
 def ball_silhouettes(cameras: Cameras, radius: float = 1.0) -> Silhouettes:
     """Draw the silhouettes of a ball about the origin: the rays that pass it within its radius."""
-    from pimper_torch.geometry.pixels import pixel_centers
-    from pimper_torch.geometry.projection import rays_through
+    from pimper_torch.ground.geometry.pixels import pixel_centers
+    from pimper_torch.ground.geometry.projection import rays_through
 
     width, height = cameras.sizes_px[0].tolist()
     pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)

@@ -2,14 +2,14 @@
 
 import torch
 
-from pimper_torch.geometry.opencv import (
+from pimper_torch.ground.geometry.opencv import (
     BACKGROUND,
     OBJECT,
     PERHAPS_BACKGROUND,
     grab_cut_halved,
     signed_distance,
 )
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import pixel_centers
 
 
 def test_a_cut_of_every_other_pixel_is_right_to_two_pixels(generator):

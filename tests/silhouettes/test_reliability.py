@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.silhouettes.cuts import Cuts
-from pimper_torch.silhouettes.reliability import agreement_of, repaired
-from pimper_torch.silhouettes.silhouette_config import SilhouetteDetails
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.method.silhouettes.cuts import Cuts
+from pimper_torch.method.silhouettes.reliability import agreement_of, repaired
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteDetails
 
 VIEWS = 8
 

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from pimper_torch.geometry.opencv import signed_distance
+from pimper_torch.ground.geometry.opencv import signed_distance
 
 
 def test_a_distance_is_exact_wherever_in_memory_the_mask_lies():

@@ -2,13 +2,13 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from pimper_torch.errors import PimperWarning
-from pimper_torch.geometry.visual_hull import margins, visual_hull
+from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
+from pimper_torch.method.silhouettes.cues import pointed_at, soft_masks_of
+from pimper_torch.method.silhouettes.find import FindSilhouettes
+from pimper_torch.method.silhouettes.parallax import working_pictures
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
 from pimper_torch.records import SilhouettePrior
-from pimper_torch.silhouettes.cues import pointed_at, soft_masks_of
-from pimper_torch.silhouettes.find import FindSilhouettes
-from pimper_torch.silhouettes.parallax import working_pictures
-from pimper_torch.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.runtime.errors import PimperWarning
 from tests.silhouettes.shapes import HEIGHT, WIDTH, all_round, silhouettes_of
 
 SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)

@@ -3,8 +3,8 @@ import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_torch.method.sfm.undistort import pinhole_for
 from pimper_torch.records import Lens, Mesh, Silhouettes
-from pimper_torch.sfm.undistort import pinhole_for
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from pimper_torch.errors import ConfigError, InputError
-from pimper_torch.geometry.lens_models import distort
-from pimper_torch.geometry.rigid import transform
+from pimper_torch.doors.size.find_scale import scale_of_bars, scale_of_cameras
+from pimper_torch.doors.size.given import CameraDistance, Mark, Pointer, ScaleBar
+from pimper_torch.doors.size.marks import place_of
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.records import Silhouettes
-from pimper_torch.size.find_scale import scale_of_bars, scale_of_cameras
-from pimper_torch.size.given import CameraDistance, Mark, Pointer, ScaleBar
-from pimper_torch.size.marks import place_of
+from pimper_torch.runtime.errors import ConfigError, InputError
 
 
 def direction(*values):

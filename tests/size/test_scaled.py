@@ -10,8 +10,8 @@ from probes import small_scene
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
-from pimper_torch.errors import ConfigError
-from pimper_torch.geometry.projection import project
+from pimper_torch.doors.size.scaled import LAST, POSES, POWERS, scaled
+from pimper_torch.ground.geometry.projection import project
 from pimper_torch.records import (
     AlbedoPrior,
     Cameras,
@@ -39,7 +39,7 @@ from pimper_torch.records import (
     ViewLights,
     Views,
 )
-from pimper_torch.size.scaled import LAST, POSES, POWERS, scaled
+from pimper_torch.runtime.errors import ConfigError
 
 # What has no unit of length, or another one: pixels, angles, radiance, fractions.
 WITHOUT = {
@@ -107,7 +107,7 @@ def alike(first, second, tolerance):
             torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance, equal_nan=True)
 
 
-@pytest.mark.filterwarnings("ignore::pimper_torch.errors.PimperWarning")
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_a_scene_of_another_unit_gives_the_result_in_that_unit():
     """A length that was left out, or a setting in scene units, would be off by a factor."""
     scene, coarse = (record.to(torch.float32) for record in small_scene(num_views=6, width=64))

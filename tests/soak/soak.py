@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pimper_torch.cli.main import main as pimper
-from pimper_torch.memory import release_memory, resident_bytes
+from pimper_torch.runtime.memory import release_memory, resident_bytes
 
 _SCENE = "--num-views 8 --width 240 --height 180 --processes 1 --supersample 1 -q"
 # Of memory, after the first two runs, which load modules and kernels and fill pools.

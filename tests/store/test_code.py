@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from pimper_torch.store.digest import code, is_known
+from pimper_torch.runtime.store.digest import code, is_known
 
 # The package's name for the module is its function.
 module = sys.modules[code.__module__]
@@ -38,5 +38,5 @@ def test_versions_count(monkeypatch):
 
 
 def test_other_code_is_not_known():
-    assert is_known("pimper_torch.fusion.fuse")
+    assert is_known("pimper_torch.method.fusion.fuse")
     assert not any(map(is_known, ["torch.nn", "pimper_torch_extra.fuse", "__main__"]))

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from pimper_torch.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.meshing.extract import Extract
-from pimper_torch.store import digest, opened
+from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.meshing.extract import Extract
+from pimper_torch.runtime.store import digest, opened
 
 
 class Color(Enum):

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from pimper_torch.errors import PimperWarning, caution
-from pimper_torch.failures import collecting, skipped
-from pimper_torch.ledger import leave_out
 from pimper_torch.records import Cameras, Failure, StageReport
-from pimper_torch.reporting import Silent, called, recorded
-from pimper_torch.store import Store, digest, kept
+from pimper_torch.runtime.errors import PimperWarning, caution
+from pimper_torch.runtime.failures import collecting, skipped
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.reporting import Silent, called, recorded
+from pimper_torch.runtime.store import Store, digest, kept
 
 
 def cameras():

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.patches.warp import Warp
+from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.sweep.sweep import Sweep, SweepConfig
 from pimper_torch.records import SweptPatches
-from pimper_torch.sweep.sweep import Sweep, SweepConfig
 
 
 def sweep(lifted, config: SweepConfig | None = None) -> SweptPatches:

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.errors import InputError
-from pimper_torch.video.choose import Scan, chosen
+from pimper_torch.cli.video.choose import Scan, chosen
+from pimper_torch.runtime.errors import InputError
 
 
 def scan(way, sharpness=None):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Mesh
-from pimper_torch.viewer.show import add_found
+from pimper_torch.result.viewer.show import add_found
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRAWN_IN_SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -4,8 +4,8 @@ import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.viewer.frame import frame_of_cameras, frame_of_mesh, stand_of
-from pimper_torch.viewer.layers import LAYERS, painted
+from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh, stand_of
+from pimper_torch.result.viewer.layers import LAYERS, painted
 
 
 @pytest.fixture

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.exchange.result import Result
-from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.doors.exchange.result import Result
+from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.records import Mesh
-from pimper_torch.viewer import server as server_module
-from pimper_torch.viewer.server import open_server, require_viser
-from pimper_torch.viewer.show import add_found, show
-from pimper_torch.viewer.viewer import NO_PHOTOGRAPH, opened
+from pimper_torch.result.viewer import server as server_module
+from pimper_torch.result.viewer.server import open_server, require_viser
+from pimper_torch.result.viewer.show import add_found, show
+from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, opened
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 
 pytest.importorskip("viser")
 
@@ -152,7 +152,7 @@ def test_a_result_that_was_read_begins_in_its_reference(reconstruction):
 
 
 def test_show_closes_what_it_cannot_fill(tmp_path, monkeypatch):
-    from pimper_torch.viewer import show as module
+    from pimper_torch.result.viewer import show as module
 
     opened_servers = []
 

@@ -6,10 +6,9 @@ import torch
 from matplotlib import colormaps
 from PIL import Image
 
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh
-from pimper_torch.viz.heatmap import (
+from pimper_torch.result.viz.heatmap import (
     MISSED,
     ErrorScale,
     MethodPanels,
@@ -22,6 +21,7 @@ from pimper_torch.viz.heatmap import (
     shading_in_view,
     surface_picture,
 )
+from pimper_torch.runtime.errors import InputError
 
 SCALE = ErrorScale(clip=2.0, unit="% of the diagonal")
 

@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh
-from pimper_torch.viz.maps import albedo_scale, normal_colors, view_maps
+from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 
 
 @pytest.fixture

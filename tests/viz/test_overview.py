@@ -7,9 +7,9 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
-from pimper_torch.geometry.projection import project
+from pimper_torch.ground.geometry.projection import project
 from pimper_torch.records import Silhouettes
-from pimper_torch.viz.overview import _selected, draw_overview, headline, tiles
+from pimper_torch.result.viz.overview import _selected, draw_overview, headline, tiles
 
 
 def drawn(path):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pimper_torch.viz.overview import draw_preview
-from pimper_torch.viz.render import frame, shade
+from pimper_torch.result.viz.overview import draw_preview
+from pimper_torch.result.viz.render import frame, shade
 
 
 def test_the_photograph_and_the_surface_from_three_sides_stand_side_by_side(

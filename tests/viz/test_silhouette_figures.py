@@ -1,9 +1,9 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
-from pimper_torch.viz.overview import DOUBTED, RELIABLE, border, thumbnails
+from pimper_torch.result.viz.overview import DOUBTED, RELIABLE, border, thumbnails
 
 
 def test_the_border_of_a_square_is_its_outermost_pixels():

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.cores import usable_cores
-from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
-from pimper_torch.exchange.colmap_workspace import write_pinholes
-from pimper_torch.exchange.picture_files import write_picture
-from pimper_torch.geometry.local_frame import NO_OFFSET
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.progress import report
+from pimper_torch.doors.exchange.colmap_workspace import write_pinholes
+from pimper_torch.doors.exchange.picture_files import write_picture
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
-from pimper_torch.stage import Stage
+from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.runtime.errors import InputError, MissingProgramError, ReconstructionError
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.stage import Stage
 
 # Environment variable that may name a program, or the folder it lies in, and folders of installers.
 _VARIABLE, _FOLDERS = "PIMPER_OPENMVS", ("/usr/local/bin/OpenMVS", "/usr/bin/OpenMVS")

@@ -16,8 +16,8 @@ from rich.text import Text
 
 from pimper_bench.bench.measure import Machine
 from pimper_bench.metrics.figure_rows import plain
-from pimper_torch.errors import MissingProgramError
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import MissingProgramError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.cores import usable_cores
-from pimper_torch.doctor.machine import total_gb
+from pimper_torch.cli.doctor.machine import total_gb
 from pimper_torch.records import Record
+from pimper_torch.runtime.cores import usable_cores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

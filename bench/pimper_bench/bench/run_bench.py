@@ -36,13 +36,10 @@ from pimper_bench.metrics.evaluation import Evaluation, evaluate
 from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
 from pimper_bench.metrics.similarity import transfer
 from pimper_bench.metrics.surface_distances import bounding_diagonal
-from pimper_torch.errors import PimperError, PimperWarning
-from pimper_torch.io.meshes import read_mesh, write_ply
-from pimper_torch.outputs.folders import written_whole
-from pimper_torch.progress import listening
+from pimper_torch.doors.io.meshes import read_mesh, write_ply
+from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.records import Capture, Mesh, StageReport
-from pimper_torch.reporting import Observer, Silent, peak_memory_mb
-from pimper_torch.viz.heatmap import (
+from pimper_torch.result.viz.heatmap import (
     ErrorScale,
     MethodPanels,
     SceneRow,
@@ -54,7 +51,10 @@ from pimper_torch.viz.heatmap import (
     shading_in_view,
     surface_picture,
 )
-from pimper_torch.viz.tiles import encoded
+from pimper_torch.result.viz.tiles import encoded
+from pimper_torch.runtime.errors import PimperError, PimperWarning
+from pimper_torch.runtime.progress import listening
+from pimper_torch.runtime.reporting import Observer, Silent, peak_memory_mb
 
 Covered = Bool[Tensor, "height width"]
 

@@ -11,7 +11,7 @@ from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.reporting import stage
+from pimper_torch.runtime.reporting import stage
 
 _DEFAULT = SceneConfig()
 # Left to --help-all.

@@ -1,7 +1,7 @@
 """Readers of public data sets, and their layouts as formats to write.
 
 Where a folder is laid out otherwise, or a file is missing or damaged, a reader raises
-:class:`~pimper_torch.errors.InputError`, which says what was expected and what was found.
+:class:`~pimper_torch.runtime.errors.InputError`, which says what was expected and what was found.
 """
 
 from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
@@ -17,8 +17,8 @@ from pimper_bench.datasets.formats import (
 from pimper_bench.datasets.idr import write_idr
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.datasets.sampling import one_light_per_position
-from pimper_torch.exchange.colmap_workspace import write_colmap
-from pimper_torch.exchange.nerfstudio import write_transforms
+from pimper_torch.doors.exchange.colmap_workspace import write_colmap
+from pimper_torch.doors.exchange.nerfstudio import write_transforms
 
 __all__ = [
     "one_light_per_position",

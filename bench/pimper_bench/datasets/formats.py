@@ -17,16 +17,16 @@ from pimper_bench.datasets.posed import (
     image_files,
     mask_finder,
 )
-from pimper_torch.camera_files import meshroom_sfm, metashape_xml, transforms_json
-from pimper_torch.camera_files.camera_arrays import read_camera_arrays
-from pimper_torch.camera_files.layout import DataSetPath, file_in, first_of
-from pimper_torch.camera_files.posed_camera import PosedCamera, rigid_or_refuse
-from pimper_torch.errors import some
-from pimper_torch.geometry.rigid import invert_rigid
-from pimper_torch.io.decode import SUFFIXES, read_header
-from pimper_torch.numpy_files import read_npy
+from pimper_torch.doors.camera_files import meshroom_sfm, metashape_xml, transforms_json
+from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
+from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.doors.io.decode import SUFFIXES, read_header
+from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Capture, Lens
-from pimper_torch.sfm.colmap import read_model
+from pimper_torch.runtime.errors import some
+from pimper_torch.runtime.numpy_files import read_npy
 
 _COLMAP = "a COLMAP model with its photographs"
 _MODELS = (".", "sparse/0", "sparse", "model", "0")
@@ -162,10 +162,10 @@ def read_idr(
 ) -> Capture:
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
 
-    Their meaning is that of :func:`~pimper_torch.camera_files.camera_arrays.read_camera_arrays`.
-    ``scale_mat_i``, from the unit sphere round the object to the world, is left out: cameras and
-    truth are in the world's units. Arrays and masks belong to the images in plain order of their
-    names.
+    Their meaning is that of
+    :func:`~pimper_torch.doors.camera_files.camera_arrays.read_camera_arrays`. ``scale_mat_i``, from
+    the unit sphere round the object to the world, is left out: cameras and truth are in the world's
+    units. Arrays and masks belong to the images in plain order of their names.
 
     Args:
         camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
@@ -202,7 +202,7 @@ def read_meshroom(
     """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.
 
     Their meaning is that of
-    :func:`~pimper_torch.camera_files.meshroom_sfm.read_meshroom_cameras`.
+    :func:`~pimper_torch.doors.camera_files.meshroom_sfm.read_meshroom_cameras`.
 
     Args:
         folder: With ``cameras.sfm`` or ``sfm.json``; or the file itself.
@@ -230,7 +230,7 @@ def read_metashape(
     """Read the cameras that Metashape exported as XML, and their photographs.
 
     Their meaning is that of
-    :func:`~pimper_torch.camera_files.metashape_xml.read_metashape_cameras`.
+    :func:`~pimper_torch.doors.camera_files.metashape_xml.read_metashape_cameras`.
 
     Args:
         folder: With one ``.xml`` file; or the file itself.
@@ -257,7 +257,7 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
     Their meaning is that of
-    :func:`~pimper_torch.camera_files.transforms_json.read_transforms_cameras`. Lenses are
+    :func:`~pimper_torch.doors.camera_files.transforms_json.read_transforms_cameras`. Lenses are
     undistorted. The mask is ``mask_path`` where a frame has one, else the image's alpha channel.
     Photographs are called as their files, or by whole paths in the file where these are not unique.
 

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.errors import some
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.runtime.errors import some
 
 # Numbers by their type in the file, and classes of arrays that hold numbers.
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
@@ -153,7 +153,7 @@ def read_toolbox_projections(
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         taken as it stands: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.camera_files.posed_camera.decompose_projections` settles.
+        :func:`~pimper_torch.doors.camera_files.posed_camera.decompose_projections` settles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]

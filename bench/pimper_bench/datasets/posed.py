@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_bench.datasets.raster import read_photographs
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.camera_files.posed_camera import PosedCamera
-from pimper_torch.errors import InputError, some
-from pimper_torch.geometry.lens_models import is_pinhole, rescale_lens
-from pimper_torch.io.decode import SUFFIXES
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.radiometry import FROM_FILES, Encoding
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera
+from pimper_torch.doors.io.decode import SUFFIXES
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
+from pimper_torch.ground.radiometry import FROM_FILES, Encoding
+from pimper_torch.method.sfm.conventions.resized_pictures import resize_fits
+from pimper_torch.method.sfm.undistort import pinhole_for, undistort
 from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
-from pimper_torch.sfm.conventions.resized_pictures import resize_fits
-from pimper_torch.sfm.undistort import pinhole_for, undistort
+from pimper_torch.runtime.errors import InputError, some
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -32,7 +32,7 @@ from pimper_bench.metrics.surface_distances import (
     TrueSurface,
     sample_surface,
 )
-from pimper_torch.geometry.nearest import Nearest, NearestSurface
+from pimper_torch.ground.geometry.nearest import Nearest, NearestSurface
 
 __all__ = [
     "AlbedoFigures",

@@ -10,17 +10,17 @@ from torch.nn.functional import normalize
 
 from pimper_bench.metrics.in_view import angles_deg
 from pimper_bench.metrics.similarity import transfer
-from pimper_torch.asset.finish import MeshFiles, Simplify
-from pimper_torch.asset.make import Texture
-from pimper_torch.asset.write import write_asset
-from pimper_torch.exchange.result import read_result
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.doors.exchange.result import read_result
+from pimper_torch.ground.geometry.nearest import NearestSurface
+from pimper_torch.ground.geometry.surfaces import unit_face_normals
 from pimper_torch.records import Mesh
-from pimper_torch.relighting.held_out import Relight
-from pimper_torch.report.page import write_page
-from pimper_torch.report.predictions import predictions
-from pimper_torch.report.vertex_layers import length_layer, surface_layers
+from pimper_torch.result.asset.finish import MeshFiles, Simplify
+from pimper_torch.result.asset.make import Texture
+from pimper_torch.result.asset.write import write_asset
+from pimper_torch.result.relighting.held_out import Relight
+from pimper_torch.result.report.page import write_page
+from pimper_torch.result.report.predictions import predictions
+from pimper_torch.result.report.vertex_layers import length_layer, surface_layers
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
 

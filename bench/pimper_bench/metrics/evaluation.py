@@ -16,9 +16,9 @@ from pimper_bench.metrics.surface_distances import (
     TrueSurface,
     true_surface,
 )
-from pimper_torch.config import Range, require, require_ranges
-from pimper_torch.errors import InputError
 from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
+from pimper_torch.runtime.config import Range, require, require_ranges
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Similarities that put a result in the frame of the truth.
 
 They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
-:func:`pimper_torch.geometry.rigid.transform` applies them.
+:func:`pimper_torch.ground.geometry.rigid.transform` applies them.
 """
 
 from collections import Counter
@@ -15,11 +15,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_bench.metrics.surface_distances import joined, sample_surface, true_surface
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.nearest import NearestSurface
-from pimper_torch.geometry.rigid import rigid, transform
-from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.nearest import NearestSurface
+from pimper_torch.ground.geometry.rigid import rigid, transform
+from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
+from pimper_torch.runtime.errors import InputError
 
 
 def pair_views(

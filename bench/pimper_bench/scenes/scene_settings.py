@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.config import Range, require, require_ranges
+from pimper_torch.runtime.config import Range, require, require_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

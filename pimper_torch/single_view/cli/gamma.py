@@ -9,11 +9,11 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.errors import InputError, caution, held
-from pimper_torch.io.photographs import list_images, load_views, read_mask
-from pimper_torch.io.responses import CONTRADICTED
-from pimper_torch.radiometry import LINEAR
-from pimper_torch.reporting import stage
+from pimper_torch.doors.io.photographs import list_images, load_views, read_mask
+from pimper_torch.doors.io.responses import CONTRADICTED
+from pimper_torch.ground.radiometry import LINEAR
+from pimper_torch.runtime.errors import InputError, caution, held
+from pimper_torch.runtime.reporting import stage
 from pimper_torch.single_view.factorization.estimate_gamma import (
     GammaEstimate,
     gamma_of_photographs,

@@ -1,6 +1,6 @@
 """Factorization beyond the chain's: any low-rank matrix, other orders of light.
 
-Problems and solvers are those of :mod:`pimper_torch.photometry`.
+Problems and solvers are those of :mod:`pimper_torch.method.photometry`.
 """
 
 from pimper_torch.single_view.factorization.ambiguity import Ambiguity

@@ -20,8 +20,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from pimper_torch.errors import InputError
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

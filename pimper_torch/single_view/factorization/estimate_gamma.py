@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
-from pimper_torch.photometry.variable_projection import solve_variable_projection
-from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
+from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record, Views
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import low_rank
 
 
@@ -239,8 +239,8 @@ def gamma_of_photographs(
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
-        views: Read with :data:`~pimper_torch.radiometry.LINEAR`; pixels that any of their masks
-            leaves out are left out.
+        views: Read with :data:`~pimper_torch.ground.radiometry.LINEAR`; pixels that any of their
+            masks leaves out are left out.
         mask: True on the object, for all photographs.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:

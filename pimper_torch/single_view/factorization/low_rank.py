@@ -11,7 +11,7 @@ a distant point light  3     :math:`\rho n`: any vector     an invertible 3 x 3
 first order            4     :math:`\rho (1, n)`            scaled Lorentz
 =====================  ====  =============================  =====================
 
-First order is :class:`pimper_torch.photometry.cone.Cone`.
+First order is :class:`pimper_torch.method.photometry.cone.Cone`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """
@@ -23,10 +23,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.photometry.bilinear import Bilinear, Factors
-from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.method.photometry.bilinear import Bilinear, Factors
+from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)

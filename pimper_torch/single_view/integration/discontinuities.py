@@ -26,8 +26,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.paper.integrate import differences, differences_transposed
-from pimper_torch.progress import report
 from pimper_torch.records import Convergence, Record, StopCause
+from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps
 

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.pixels import crop_intrinsics
+from pimper_torch.ground.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps

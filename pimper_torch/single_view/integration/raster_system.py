@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.geometry.topology import graph_components
-from pimper_torch.linalg.multigrid import Multigrid
-from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
-from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.ground.geometry.topology import graph_components
+from pimper_torch.ground.linalg.multigrid import Multigrid
+from pimper_torch.ground.linalg.prepared import DEFAULT_TOLERANCE
+from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.paper.integrate import differences_transposed
 
 # A factor takes twice as long to make as a hierarchy (0.17 s against 0.08 s) and a third as long

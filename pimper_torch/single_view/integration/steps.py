@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 

@@ -23,9 +23,9 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
-from pimper_torch.errors import InputError
-from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 
 # Differences are taken over cells of 1/64 of the object's size, and equations averaged over blocks
 # of 1/16: averages lose no signal, as the unknowns are constant, and reduce the noise of the

@@ -21,8 +21,8 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
 # Minimum ratio of the second smallest residual to the smallest: a choice; on a ball it is about 1.

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.errors import InputError
-from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
-from pimper_torch.photometry.quadratics import PackedCholesky, outer, unpacked
-from pimper_torch.photometry.variable_projection import solve_variable_projection
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
+from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
 

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.errors import InputError
 from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import bas_relief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,

@@ -6,7 +6,7 @@ import pytest
 
 from pimper_bench.baselines import openmvs
 from pimper_bench.baselines.openmvs import find_program, run_program
-from pimper_torch.errors import MissingProgramError, ReconstructionError
+from pimper_torch.runtime.errors import MissingProgramError, ReconstructionError
 
 
 @pytest.fixture(autouse=True)

@@ -5,13 +5,13 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.baselines.openmvs import OpenMvs
-from pimper_torch.errors import InputError, MissingProgramError, ReconstructionError
-from pimper_torch.geometry.lens_models import distort
-from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap import read_model
+from pimper_torch.runtime.errors import InputError, MissingProgramError, ReconstructionError
 
 # Every program refuses options it does not know, checks its input, and leaves what OpenMVS
 # leaves. `points` says whether this is a version that wants the dense points named.

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_bench.baselines.smoothed import Smoothed
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.errors import ReconstructionError
+from pimper_torch.runtime.errors import ReconstructionError
 
 
 @pytest.fixture(autouse=True)

@@ -8,10 +8,10 @@ from pimper_bench.bench.bench_inputs import BenchConfig, prepare
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.method.sfm import reconstruct
+from pimper_torch.method.sfm.existing import existing_ways
 from pimper_torch.records import Mesh
-from pimper_torch.sfm import reconstruct
-from pimper_torch.sfm.existing import existing_ways
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,16 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
-from pimper_torch.errors import (
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
+from pimper_torch.runtime.errors import (
     ConfigError,
     MissingProgramError,
     PimperWarning,
     ReconstructionError,
 )
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.outputs.marker import MARKER
-from pimper_torch.records import Capture, CoarseMesh, Estimate, Mesh, Truth
 
 RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
 

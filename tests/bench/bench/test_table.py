@@ -23,9 +23,9 @@ from pimper_bench.bench.bench_table import (
     write_json,
 )
 from pimper_bench.bench.measure import Machine, this_machine
-from pimper_torch.config import build
-from pimper_torch.cores import usable_cores
-from pimper_torch.errors import MissingProgramError, ReconstructionError
+from pimper_torch.runtime.config import build
+from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.runtime.errors import MissingProgramError, ReconstructionError
 
 MACHINE = Machine(
     cpu="Abacus 12",

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.records import Mesh
 
 

@@ -3,9 +3,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_colmap
-from pimper_torch.errors import InputError
-from pimper_torch.exchange.colmap_workspace import write_colmap
-from pimper_torch.sfm.colmap import read_model
+from pimper_torch.doors.exchange.colmap_workspace import write_colmap
+from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.runtime.errors import InputError
 
 # `hand_camera` as a quaternion: a third of a turn about (-1, -1, -1), w = 0.5.
 POSE = "0.5 -0.5 -0.5 -0.5 -2 -3 4"

@@ -8,8 +8,8 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.projection import project
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.runtime.errors import InputError
 
 WIDTH, HEIGHT = 20, 16
 # In the sets' axes (x right, y up, z to the viewer): from the right, from above, head on.

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets.dtu_sets import ALL_LIGHTS, read_dtu_mvs, read_dtu_protocol
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 
 POINTS = """ply
 format ascii 1.0

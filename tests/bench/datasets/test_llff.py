@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pimper_bench.datasets import read_llff
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 
 # World directions of a camera that looks along x with its right along y and its down along z
 # (`hand_camera`), in the file's order: down, right, back, place, (height, width, focal length).

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_bench.datasets import read_meshroom
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 
 # `hand_camera`, as the file has it: R column by column, and the camera's place.
 ROTATION = ["0", "0", "1", "1", "0", "0", "0", "1", "0"]

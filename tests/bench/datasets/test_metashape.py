@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_bench.datasets import read_metashape
-from pimper_torch.errors import InputError, PimperWarning
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 # `hand_camera` from camera to chunk, row by row: columns are its right, down, forward, place.
 TRANSFORM = "0 0 1 -4 1 0 0 2 0 1 0 3 0 0 0 1"

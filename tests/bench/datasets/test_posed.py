@@ -18,13 +18,13 @@ from pimper_bench.datasets.posed import (
     image_files,
     mask_finder,
 )
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.camera_files.posed_camera import rigid_or_refuse
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.lens_models import distort
-from pimper_torch.geometry.projection import project
-from pimper_torch.radiometry import LINEAR
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.posed_camera import rigid_or_refuse
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.radiometry import LINEAR
 from pimper_torch.records import Lens
+from pimper_torch.runtime.errors import InputError
 
 LENS = Lens(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
 

@@ -11,9 +11,9 @@ from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.errors import InputError
-from pimper_torch.io.meshes import write_ply
+from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import InputError
 
 CONFIG = SceneConfig(num_views=3, width=50, height=36, supersample=1, specular=0.05)
 

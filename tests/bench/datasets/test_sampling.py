@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pimper_bench.datasets.sampling import choose_photographs, one_light_per_position
-from pimper_torch.camera_files.layout import DataSetPath
-from pimper_torch.errors import InputError
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.runtime.errors import InputError
 
 
 def grid(num_positions: int, num_lights: int) -> tuple[torch.Tensor, torch.Tensor]:

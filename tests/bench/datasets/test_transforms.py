@@ -8,9 +8,9 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.errors import InputError
-from pimper_torch.exchange.nerfstudio import write_transforms
-from pimper_torch.io.meshes import read_mesh
+from pimper_torch.doors.exchange.nerfstudio import write_transforms
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.runtime.errors import InputError
 
 # `hand_camera`: columns are the camera's right, up (its down is the world's z), back, place.
 MATRIX = [[0, 0, -1, -4], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]

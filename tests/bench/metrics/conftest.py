@@ -5,7 +5,7 @@ import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from pimper_bench.metrics import TrueSurface
-from pimper_torch.errors import InputError
 from pimper_torch.records import Truth
+from pimper_torch.runtime.errors import InputError
 
 
 def compared(mesh, capture, *, samples=8_000, seen_from=3, **more):

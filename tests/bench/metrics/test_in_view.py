@@ -6,9 +6,9 @@ from pimper_bench.metrics import (
     compare_along_rays,
 )
 from pimper_bench.metrics.surface_distances import joined
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.ground.geometry.visibility import cast_view
 from pimper_torch.records import Truth
+from pimper_torch.runtime.errors import InputError
 
 
 def with_maps(make, truth, cameras):

@@ -8,9 +8,9 @@ from pimper_bench.metrics.in_view import angles_deg
 from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import EndlessPlane, Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import InputError
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
 

@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.metrics import sample_surface, thin
-from pimper_torch.errors import InputError
 from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import InputError
 
 
 def test_samples_are_even_by_area_not_by_face(generator, make):

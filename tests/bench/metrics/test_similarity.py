@@ -8,10 +8,10 @@ from pimper_bench.metrics import (
     similarity_between_points,
 )
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.errors import InputError
-from pimper_torch.geometry.pinholes import look_at, pinholes
-from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras
+from pimper_torch.runtime.errors import InputError
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.rendered_folder import render_scene, unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.errors import ConfigError, OutputError, PimperWarning
-from pimper_torch.geometry.projection import project
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.io.photographs import load_views
-from pimper_torch.radiometry import LINEAR
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.radiometry import LINEAR
+from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Mesh
-from pimper_torch.sfm.colmap import read_model
+from pimper_torch.runtime.errors import ConfigError, OutputError, PimperWarning
 
 SMALL = SceneConfig(num_views=3, width=48, height=36, supersample=1)
 

@@ -2,8 +2,8 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from pimper_torch.geometry.rigid import transform
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.rigid import invert_rigid, rigid
+from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.paper.align import Align, AlignConfig
 from pimper_torch.records import AlignStatus, Mesh
 from tests.paper.alignment.caps import (

@@ -2,7 +2,7 @@ import torch
 
 from pimper_torch.paper.align import Align, patch_status
 from pimper_torch.records import AlignStatus
-from pimper_torch.reporting import figures
+from pimper_torch.runtime.reporting import figures
 from tests.paper.alignment.caps import CENTER, RADIUS, cap
 
 ALIGNED, ALONE = (int(status) for status in AlignStatus)

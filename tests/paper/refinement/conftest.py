@@ -8,9 +8,9 @@ import torch
 from scipy.spatial import Delaunay
 from torch import Tensor
 
-from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

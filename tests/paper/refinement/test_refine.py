@@ -1,10 +1,10 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.geometry.surfaces import unit_face_normals
-from pimper_torch.geometry.topology import half_edges
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.surfaces import unit_face_normals
+from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.paper.refine import Refine, RefineConfig
 
 SPACING = 0.02

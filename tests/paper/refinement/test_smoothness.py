@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.geometry.subdivision import subdivide
-from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.paper.refine import (
     assemble,
     seam_weight,

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration import raster_system
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem

@@ -3,7 +3,7 @@ import torch
 from reliefs import ball, bumps, regions
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     albedo_entropy,

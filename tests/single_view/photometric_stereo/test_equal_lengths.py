@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import (
     BasRelief,
     relief_from_strength,

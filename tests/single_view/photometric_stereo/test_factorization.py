@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.regress_lights import evenly, factorize_photographs
 
 

@@ -3,7 +3,7 @@ import torch
 from reliefs import align_reliefs
 from torch.testing import assert_close
 
-from pimper_torch.errors import InputError
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.integrability import (
     curls,
     integrable,

@@ -1,0 +1,5 @@
+"""Many objects: whole reconstructions over any ``concurrent.futures.Executor``."""
+
+from pimper_torch.cli.batches.many_objects import batch as batch
+from pimper_torch.cli.batches.objects import Object as Object
+from pimper_torch.cli.batches.task import Outcome as Outcome

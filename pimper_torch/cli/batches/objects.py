@@ -1,0 +1,166 @@
+"""The objects of a batch: a folder of folders, a pattern of folders, or a table."""
+
+import csv
+import glob
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pimper_torch.cli.light import absent
+from pimper_torch.doors.outputs.files import require_name
+from pimper_torch.runtime.errors import ConfigError, InputError, some
+
+# Files of the batch itself in OUT, beside the objects' folders.
+CSV, HTML = "batch.csv", "batch.html"
+
+_PATHS = ("DIR", "FILE", "PATH")
+_WILD = re.compile(r"[*?[]")
+_YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Object:
+    """Photographs of one object, and how to reconstruct it.
+
+    Attributes:
+        name: Of its folder in the folder of the batch.
+        settings: Options of ``pimper reconstruct`` with their values, as on its command line.
+        where: Place in a list, for messages.
+    """
+
+    name: str
+    photos: Path | str
+    settings: tuple[str, ...] = ()
+    where: str = ""
+
+    def __post_init__(self) -> None:
+        where = f"{self.where or self.photos}: the name"
+        require_name(self.name, InputError)
+        sound = self.name.isprintable() and not re.search(r"^[.\s]|[/\\]|\s$", self.name)
+        if not sound or self.name in ("", CSV, HTML):
+            raise InputError(
+                f"{where} is {self.name!r}; needed: one of a folder in OUT, without / or \\, that "
+                f"does not begin with a dot and is not {CSV} or {HTML}."
+            )
+
+
+def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Object]:
+    """List the objects of a folder, a pattern, a table, or of folders in turn.
+
+    Args:
+        given: A folder of folders, each with photographs or with a folder ``photos``; a pattern
+            such as ``scans/*/photos``; a CSV file whose columns are ``photos``, ``name`` and
+            options of ``pimper reconstruct`` without dashes; or several objects or folders.
+    """
+    if not isinstance(given, Path | str):
+        found = [one if isinstance(one, Object) else _in_folder(Path(one)) for one in given]
+        return _distinct(found, "the list")
+    path = Path(given)
+    if path.is_dir():
+        folders = (one for one in sorted(path.iterdir()) if not one.name.startswith("."))
+        found = [_in_folder(one) for one in folders if one.is_dir()]
+    elif path.suffix.lower() == ".csv":
+        found = _in_table(path)
+    else:
+        found = _by_pattern(str(given))
+    if not found:
+        raise InputError(
+            f"{given}: no objects; needed: a folder of folders of photographs, a pattern of such "
+            "folders in quotes ('scans/*/photos'), or a CSV file with a column `photos`."
+        )
+    return _distinct(found, str(given))
+
+
+def _in_folder(folder: Path) -> Object:
+    inner = folder / "photos"
+    return Object(name=folder.resolve().name, photos=inner if inner.is_dir() else folder)
+
+
+def _by_pattern(pattern: str) -> list[Object]:
+    """Name folders by the parts of their paths from the first wildcard to the last."""
+    parts = Path(pattern).parts
+    wild = [place for place, part in enumerate(parts) if _WILD.search(part)]
+    if not wild:
+        return []
+    after = len(parts) - 1 - wild[-1]
+    found = []
+    for path in sorted(map(Path, glob.glob(pattern, recursive=True))):  # noqa: PTH207 - absolute, too
+        if path.is_dir():
+            name = "-".join(path.parts[wild[0] : len(path.parts) - after])
+            found.append(Object(name=name, photos=path))
+    return found
+
+
+def _in_table(path: Path) -> list[Object]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); needed: CSV in UTF-8.") from error
+    lines = text.splitlines()
+    head = lines[0] if lines else ""
+    delimiter = ";" if ";" in head and "," not in head else ","
+    table = csv.DictReader(lines, delimiter=delimiter)
+    columns = [(name or "").strip() for name in table.fieldnames or ()]
+    if "photos" not in columns or len({*columns}) < len(columns):
+        raise ConfigError(
+            f"{path}: its columns are {some(columns) or 'none'}; needed: `photos`, and `name` or "
+            "options of `pimper reconstruct` without dashes, each once."
+        )
+    if taken := {"out", "o", "overwrite", "view"} & {*columns}:
+        raise ConfigError(f"{path}: has the column {min(taken)}, which is the batch's own.")
+    found, kinds = [], _kinds()
+    for row in table:
+        where = f"{path}, row {table.line_num}"
+        cells = {
+            name: (cell or "").strip() for name, cell in zip(columns, row.values(), strict=False)
+        }
+        if None in row:
+            raise ConfigError(f"{where}: has more cells than there are columns ({len(columns)}).")
+        photos, name = cells.pop("photos"), cells.pop("name", "")
+        if not photos:
+            raise InputError(f"{where}: `photos` is empty; needed: a folder of photographs.")
+        folder = path.parent / photos
+        settings = [
+            word
+            for column, cell in cells.items()
+            if cell
+            for word in _words(f"--{column.replace('_', '-')}", cell, kinds, path.parent)
+        ]
+        one = _in_folder(folder)
+        found.append(
+            Object(name=name or one.name, photos=one.photos, settings=(*settings,), where=where)
+        )
+    return found
+
+
+def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list[str]:
+    """Write a cell as on a command line; paths are relative to the table."""
+    kind = kinds.get(option)
+    if kind == "" and cell.lower() in (*_YES, *_NO):
+        stage, dot, last = option[2:].rpartition(".")
+        negated = f"--{stage}{dot}no-{last}"
+        return [option] if cell.lower() in _YES else [negated] if negated in kinds else []
+    if kind in _PATHS or (option == "--preset" and (base / cell).is_file()):
+        cell = str((base / cell).absolute())
+    return [option, *(cell.split() if kind and " " in kind else [cell])]
+
+
+def _kinds() -> dict[str, str]:
+    """Return what follows every option of ``pimper reconstruct``, of any preset."""
+    with absent():
+        from pimper_torch.cli.options import every_option
+    return {name: one.value for one in every_option("reconstruct") for name in one.names}
+
+
+def _distinct(found: list[Object], where: str) -> list[Object]:
+    counts = Counter(one.name.casefold() for one in found)  # which some disks do not tell apart
+    twice = [one for one in found if counts[one.name.casefold()] > 1]
+    if twice:
+        same = [f"{one.photos} ({one.name})" for one in twice]
+        raise InputError(
+            f"{where}: several objects have one name: {some(same)}; needed: a name each. Give a "
+            "CSV file with a column `name`."
+        )
+    return found

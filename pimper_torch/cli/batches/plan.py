@@ -1,0 +1,131 @@
+"""Plan of every object before anything starts: its arguments, and its expected cost."""
+
+import hashlib
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import accumulate
+from pathlib import Path
+
+from PIL import Image
+
+from pimper_torch.cli.batches.objects import Object
+from pimper_torch.cli.batches.task import Outcome, Task, is_whole
+from pimper_torch.cli.light import absent
+from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.runtime.errors import ConfigError, PimperError
+
+_REPLACES = "--overwrite"
+# A try may take so many times the estimate, and an hour in any case: a choice. What a slower
+# machine has finished by then is kept for the next try.
+_PATIENCE, _LEAST_S = 10.0, 3600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The tasks of a batch.
+
+    Attributes:
+        settled: Objects that are not begun: whole already, or refused.
+    """
+
+    tasks: tuple[Task, ...]
+    settled: tuple[Outcome, ...]
+
+
+def planned_batch(
+    objects: Sequence[Object],
+    out: Path,
+    settings: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+    limit_s: float | None = None,
+    mem_gb: float | None = None,
+) -> Plan:
+    """Check every object as ``pimper reconstruct`` would, and estimate what it takes.
+
+    Args:
+        settings: Options of ``pimper reconstruct`` for every object; its own come after them.
+        limit_s: Seconds that a try may take; by the estimate unless given.
+        mem_gb: Memory that a run takes; the estimate unless given.
+    """
+    out = out.absolute()
+    with absent():
+        # With their own classes where torch is not loaded: they leave this block as plain values.
+        from pimper_torch.cli.doctor.cost import estimate
+        from pimper_torch.cli.options import check, inputs_of, parse
+
+        read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
+
+        def one(thing: Object) -> Task | Outcome:
+            given = (*settings, *thing.settings)
+            own = tuple(word for word in given if word != _REPLACES)
+            words = (*own, *((_REPLACES,) if overwrite or own != given else ()))
+            photos, target = Path(thing.photos).absolute(), out / thing.name
+            try:
+                job = replace(read(words), photos=photos, out=target)
+                seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))
+                task = Task(
+                    name=thing.name,
+                    arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
+                    out=target,
+                    key=_key(own, inputs_of(job).values()),
+                    limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
+                    mem_gb=mem_gb or gigabytes,
+                    threads=1,
+                )
+                if is_whole(task):
+                    return Outcome(name=thing.name, status="kept")
+                check(job)
+            except ConfigError as error:
+                raise ConfigError(f"{thing.where or thing.name}: {error}") from error
+            except PimperError as error:
+                return Outcome(name=thing.name, status="failed", message=str(error))
+            return task
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # each run warns of its own
+            found = [one(thing) for thing in objects]
+    return Plan(
+        tasks=tuple(each for each in found if isinstance(each, Task)),
+        settled=tuple(each for each in found if isinstance(each, Outcome)),
+    )
+
+
+def runs_at_once(gigabytes: Sequence[float]) -> int:
+    """Return how many runs fit the free memory and the cores of this machine."""
+    with absent():
+        from pimper_torch.cli.doctor.machine import available_gb
+    most = available_gb()
+    together = accumulate(sorted(gigabytes, reverse=True)[: usable_cores()])
+    # A fifth is left to what else runs.
+    return max(1, sum(most is None or held <= 0.8 * most for held in together))
+
+
+def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
+    """Return the megapixels of all photographs by the size of the first, and their number."""
+    files = [path for path in sorted(photos.rglob("*")) if path.is_file()]
+    for path in files:
+        try:
+            with Image.open(path) as image:
+                width, height = image.size
+        except (OSError, Image.DecompressionBombError):
+            continue
+        shrunk = min(1.0, max_size_px / max(width, height)) if max_size_px else 1.0
+        return len(files) * width * height * shrunk**2 / 1e6, len(files)
+    return 24.0 * len(files), len(files)  # Pillow reads none of them, as camera raw
+
+
+def _key(words: Sequence[str], inputs: Iterable[Path | None]) -> str:
+    """Hash arguments, and the names, sizes and times of all files that a run reads."""
+    hashed = hashlib.blake2b(repr(words).encode(), digest_size=16)
+    presets = [Path(word) for word in words if word.endswith((".yaml", ".yml"))]
+    for given in (*inputs, *presets):
+        if given is None:
+            continue
+        for path in (given, *sorted(given.rglob("*"))):
+            if path.is_file():
+                about = path.stat()
+                hashed.update(f"{path} {about.st_size} {about.st_mtime_ns}\n".encode())
+    return hashed.hexdigest()

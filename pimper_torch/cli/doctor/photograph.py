@@ -1,0 +1,139 @@
+"""A photograph in a few numbers and a small copy."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from pimper_torch.doors.io.radiance import resized_radiance
+from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.records import Record, Views
+from pimper_torch.runtime.parallel import side_by_side
+
+# Smoothing before the two gradients that are compared: enough for noise, little beside the blur
+# that is to be found.
+_FINE, _WIDE = 1.0, 2.0
+
+
+def edge_blur_px(grey: Float[Tensor, "height width"]) -> float:
+    r"""Measure the standard deviation of the blur at the strongest edges.
+
+    An ideal edge under a Gaussian blur of variance :math:`s^2` has, after smoothing with variances
+    :math:`a^2` and :math:`b^2`, gradients in the ratio
+    :math:`R^2 = (s^2 + b^2) / (s^2 + a^2)`, so that :math:`s^2 = (b^2 - R^2 a^2) / (R^2 - 1)`.
+    Edges are taken by orientation and the most blurred orientation counts, as motion blurs edges
+    across it alone.
+
+    Returns:
+        NaN where there are no edges to tell it.
+
+    Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
+    """
+    top, left = (max(0, (side - 1024) // 2) for side in grey.shape)
+    grey = grey[top : top + 1024, left : left + 1024].float()  # the centre, where the object is
+    fine, wide = _gradient(grey, _FINE), _gradient(grey, _WIDE)
+    strength = torch.hypot(fine[0], fine[1])
+    peaks = max_pool2d(strength[None, None], 3, 1, 1)[0, 0] == strength
+    peaks &= strength > 6 * strength.median() + 1e-4  # else noise
+    angle = torch.atan2(fine[1], fine[0]) % torch.pi
+    bins = (angle * (4 / torch.pi) + 0.5).floor() % 4
+    found = [
+        _blur(strength, torch.hypot(wide[0], wide[1]), peaks & (bins == one)) for one in range(4)
+    ]
+    known = [one for one in found if one == one]
+    return max(known, default=float("nan"))
+
+
+def _blur(
+    fine: Float[Tensor, "height width"],
+    wide: Float[Tensor, "height width"],
+    edges: Bool[Tensor, "height width"],
+) -> float:
+    strength, other = fine[edges], wide[edges]
+    if len(strength) < 40:
+        return float("nan")
+    strongest = strength.topk(min(400, len(strength))).indices
+    ratio = (strength[strongest] / other[strongest]).square().clamp_min(1 + 1e-6)
+    # Central differences over two pixels are a box of variance 1 / 3.
+    a, b = _FINE**2 + 1 / 3, _WIDE**2 + 1 / 3
+    variance = ((b - ratio * a) / (ratio - 1)).clamp_min(0)
+    return float(variance.median().sqrt())
+
+
+def _gradient(
+    grey: Float[Tensor, "height width"], sigma: float
+) -> Float[Tensor, "2 height_in width_in"]:
+    smooth = torch.from_numpy(gaussian_filter(grey.numpy(), sigma, mode="nearest"))
+    across = (smooth[1:-1, 2:] - smooth[1:-1, :-2]) / 2
+    down = (smooth[2:, 1:-1] - smooth[:-2, 1:-1]) / 2
+    return torch.stack([across, down])
+
+
+SMALL_PX = 640  # longer side of the small copy: features of 24 photographs take seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Photograph(Record):
+    """Measurements of one photograph without its neighbours.
+
+    Attributes:
+        width: As a run would take it, in pixels.
+        focal_px: By EXIF; NaN where it does not say.
+        bright: Radiance that a hundredth of the pixels exceed; 1 is saturation.
+        blur_px: Standard deviation of the blur at the strongest edges; NaN where there are none.
+        small: Mean of the colours in a small copy.
+    """
+
+    name: str
+    width: int
+    height: int
+    focal_px: float
+    saturated: float
+    bright: float
+    blur_px: float
+    small: Float[Tensor, "rows columns"]
+
+
+def summarize(
+    name: str,
+    radiance: Float[Tensor, "channel height width"],
+    focal_px: float,
+    mask: Bool[Tensor, "height width"] | None = None,
+) -> Photograph:
+    """Make the numbers and the small copy of linear radiance; saturation counts in the mask."""
+    height, width = radiance.shape[-2:]
+    shrink = min(1.0, SMALL_PX / max(height, width))
+    small = resized_radiance(
+        radiance, max(1, round(width * shrink)), max(1, round(height * shrink))
+    )
+    highest = small.amax(dim=0)
+    saturated = radiance.amax(dim=0) >= SATURATED
+    counted = saturated if mask is None else saturated[mask]
+    return Photograph(
+        name=name,
+        width=width,
+        height=height,
+        focal_px=focal_px,
+        saturated=float(counted.sum()) / max(1, counted.numel()),
+        bright=float(highest.flatten().kthvalue(math.ceil(0.99 * highest.numel())).values),
+        blur_px=edge_blur_px(radiance.mean(dim=0)),
+        small=small.mean(dim=0),
+    )
+
+
+def of_views(views: Views) -> list[Photograph]:
+    """Summarize photographs that were read for a run."""
+
+    def one(index: int) -> Photograph:
+        width, height = views.sizes_px[index].tolist()
+        image = views.images[index, :, :height, :width].detach().cpu().float()
+        focal = math.nan if views.focals_px is None else float(views.focals_px[index])
+        mask = None if views.masks is None else views.masks[index, :height, :width].cpu()
+        return summarize(views.names[index], image, focal, mask)
+
+    with torch.no_grad():
+        return list(side_by_side(one, range(views.num_views), tracked=False))

@@ -1,0 +1,137 @@
+"""Cameras in NumPy's archives: IDR's and NeuS's ``cameras.npz``, and plain arrays."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.posed_camera import (
+    PosedCamera,
+    SizesOf,
+    decompose_projections,
+    number_lenses,
+    pinhole_lens,
+    rigid_or_refuse,
+)
+from pimper_torch.ground.geometry.pixels import pixels_from_indices
+from pimper_torch.runtime.errors import some
+from pimper_torch.runtime.numpy_files import read_npz
+
+Arrays = dict[str, np.ndarray]
+Rig = tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]
+
+_KIND = "an archive of cameras"
+
+
+def read_camera_arrays(
+    path: Path, photographs: Sequence[str], sizes_of: SizesOf
+) -> list[PosedCamera]:
+    """Read the cameras of an archive.
+
+    Either IDR's ``world_mat_0`` and so on, ``K [R t]`` as 4x4 matrices from the world to pixels,
+    with our camera axes; IDR and NeuS cast rays through whole numbers (``uv`` of ``mgrid``,
+    ``pixels_x`` of ``arange``): they count centres from 0, so half a pixel is added. Or arrays, in
+    our conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x
+    right, y down, z forward):
+
+    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world`` (3x4 or 4x4 each) or
+      with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
+    - or ``projections`` or ``P``, 3x4 each, ``K [R | t]`` up to a factor.
+
+    They belong to ``names``, if that array is there, or else to the photographs in plain order of
+    their names (``10`` before ``2``), of which there are as many.
+
+    Returns:
+        Without cameras of photographs that are not there.
+    """
+    file = DataSetPath(path, _KIND)
+    arrays = file.read(read_npz, "an archive of numpy.savez")
+    count = sum(name.startswith("world_mat_") and "inv" not in name for name in arrays)
+    intrinsics, poses = _world_mats(arrays, count, file) if count else _plain(arrays, file)
+    if "names" in arrays:
+        names = [str(name) for name in arrays["names"].reshape(-1).tolist()]
+        file.expect(len(names) == len(poses), f"{len(poses)} names", f"{len(names)}")
+    else:
+        file.expect(
+            len(poses) == len(photographs),
+            f"one camera for each of {len(photographs)} photographs, in plain order of their "
+            "names, or an array `names`",
+            f"{len(poses)} cameras",
+        )
+        names = sorted(photographs)
+    cameras = [
+        PosedCamera(
+            name=name, lens=pinhole_lens(K, size), skew_px=float(K[0, 1]), cam_from_world=pose
+        )
+        for name, size, K, pose in zip(names, sizes_of(names), intrinsics, poses, strict=True)
+        if size is not None
+    ]
+    return number_lenses(cameras)
+
+
+def _world_mats(arrays: Arrays, count: int, file: DataSetPath) -> Rig:
+    names = [f"world_mat_{index}" for index in range(count)]
+    file.expect(set(names) <= set(arrays), f"world_mat_0 to {names[-1]}", "other numbers")
+    matrices = [file.numbers(arrays[name], 16, name).reshape(4, 4)[:3] for name in names]
+    intrinsics, poses = _decomposed(matrices, "world_mat_", file)
+    intrinsics[:, :2, 2] = pixels_from_indices(intrinsics[:, :2, 2])
+    return intrinsics, poses
+
+
+def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
+    projections = _array(arrays, ("projections", "P"), ((3, 4),), file)
+    if projections is not None:
+        return _decomposed(list(projections), "projection ", file)
+    intrinsics = _array(arrays, ("intrinsics", "K"), ((3, 3),), file)
+    matrices = _array(arrays, ("cam_from_world",), ((3, 4), (4, 4)), file)
+    rotations = _array(arrays, ("R",), ((3, 3),), file)
+    shifts = _array(arrays, ("t",), ((3,), (3, 1)), file)
+    if matrices is None and rotations is not None and shifts is not None:
+        file.expect(len(rotations) == len(shifts), "as many R as t", f"{len(shifts)} t")
+        matrices = torch.cat([rotations, shifts.reshape(-1, 3, 1)], dim=2)
+    if intrinsics is None or matrices is None or not len(matrices):
+        file.refuse(
+            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, or with R and t; or "
+            "projections (P)",
+            some(sorted(arrays)) or "no arrays",
+        )
+    several = len(intrinsics) in (1, len(matrices))
+    file.expect(several, f"1 or {len(matrices)} intrinsics", f"{len(intrinsics)}")
+    for index, K in enumerate(intrinsics):
+        ok = bool((K.diagonal() > 0).all()) and K[2].tolist() == [0, 0, 1] and float(K[1, 0]) == 0
+        file.expect(ok, f"f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 as K {index}", f"{K.tolist()}")
+    poses = [
+        rigid_or_refuse(matrix[:3, :3], matrix[:3, 3], f"cam_from_world {index}", file)
+        for index, matrix in enumerate(matrices)
+    ]
+    return intrinsics.expand(len(poses), 3, 3), torch.stack(poses)
+
+
+def _array(
+    arrays: Arrays, names: Sequence[str], shapes: Sequence[tuple[int, ...]], file: DataSetPath
+) -> Tensor | None:
+    """Return the first array of these names, one entry a camera; refuse one of other shapes."""
+    name = next((name for name in names if name in arrays), None)
+    if name is None:
+        return None
+    found = arrays[name]
+    if "K" in names and found.shape == (3, 3):
+        found = found[None]
+    ok = found.dtype.kind in "iuf" and found.shape[1:] in shapes
+    needed, there = ("x".join(map(str, shape)) for shape in (shapes[0], found.shape))
+    file.expect(ok, f"{needed} numbers a camera as {name}", there)
+    file.expect(bool(np.isfinite(found).all()), f"finite numbers as {name}", "others")
+    return torch.from_numpy(found.astype(np.float64))
+
+
+def _decomposed(matrices: Sequence[Float[Tensor, "3 4"]], what: str, file: DataSetPath) -> Rig:
+    for index, matrix in enumerate(matrices):
+        try:
+            decompose_projections(matrix[None])
+        except ValueError as error:
+            file.refuse(f"K [R t] in {what}{index}", str(error))
+    return decompose_projections(torch.stack(list(matrices)))

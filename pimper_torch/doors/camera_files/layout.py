@@ -1,0 +1,160 @@
+"""Folders and files of data sets, and refusals of those of another layout."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple, NoReturn, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.runtime.errors import InputError, some
+
+T = TypeVar("T")
+
+
+class DataSetPath(NamedTuple):
+    """A folder or file of a data set.
+
+    Attributes:
+        kind: The data set, as its users call it.
+    """
+
+    path: Path
+    kind: str
+
+    def inner(self, name: str | Path) -> "DataSetPath":
+        """Return a file or folder inside."""
+        return self._replace(path=self.path / name)
+
+    def refuse(self, needed: str, found: str | None = None) -> NoReturn:
+        """Refuse it.
+
+        Args:
+            found: What is there instead; by default what the folder holds.
+        """
+        found = contents(self.path) if found is None else found
+        raise InputError(
+            f"{self.path}: not the layout of {self.kind}. Needed: {_shortened(needed, 400)}. "
+            f"Found: {_shortened(found, 400)}. Point to the folder that holds it, or choose "
+            "the reader of another layout."
+        )
+
+    def expect(self, ok: bool, needed: str, found: str | None = None) -> None:
+        """Refuse it unless it is as needed."""
+        if not ok:
+            self.refuse(needed, found)
+
+    def read(self, reader: Callable[[Path], T], what: str) -> T:
+        """Read the file.
+
+        Args:
+            what: The format, for messages.
+
+        Raises:
+            InputError: There is no such file, or the reader fails.
+        """
+        parent = self._replace(path=self.path.parent)
+        parent.expect(self.path.is_file(), f"a file {self.path.name}")
+        try:
+            return reader(self.path)
+        except (InputError, MemoryError):
+            raise
+        except Exception as error:  # every parser has its own kinds
+            raise InputError(
+                f"{self.path}: cannot be read as {what} ({error}); needed: {what} of {self.kind}. "
+                "Copy it again, or write it anew."
+            ) from error
+
+    def read_text(self) -> str:
+        """Read a text file, or refuse it."""
+        return self.read(lambda path: path.read_text(encoding="utf-8-sig"), "a text in UTF-8")
+
+    def read_json(self) -> dict[str, object]:
+        """Read a JSON file of one object, or refuse it."""
+        found = self.read(lambda path: json.loads(path.read_text("utf-8-sig")), "JSON in UTF-8")
+        self.expect(isinstance(found, dict), "a JSON object", f"a {type(found).__name__}")
+        return dict(found)
+
+    def inside(self, name: str) -> Path:
+        """Join a path that a file of the data set names to its folder.
+
+        Links that lie in the folder are followed wherever they lead: who put them there wants that.
+
+        Raises:
+            InputError: The path is absolute, leads out by ``..``, or is no path.
+        """
+        longest = max(
+            len(part.encode("utf-8", "surrogatepass")) for part in (*Path(name).parts, "")
+        )
+        self.expect(longest <= 255, "names of files", f"{name!r}")
+        within = os.path.normpath(name)
+        stays = not Path(name).anchor and Path(within).parts[:1] != ("..",) and "\0" not in name
+        self.expect(stays, "paths that stay in this folder", f"{name!r}, which leads out of it")
+        return self.path / within
+
+    def objects(self, value: object, what: str) -> list[dict[str, object]]:
+        """Return a value of the file as a list of objects; refuse anything else, or none."""
+        entries = list(value) if isinstance(value, list) else []
+        ok = bool(entries) and all(isinstance(entry, dict) for entry in entries)
+        self.expect(ok, f"a list of objects as {what}", _shown(value))
+        return entries
+
+    def numbers(self, value: object, count: int, what: str) -> Float[Tensor, " number"]:
+        """Return a value of the file as so many finite numbers in float64; refuse anything else.
+
+        Args:
+            value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.
+        """
+        pieces = value.split() if isinstance(value, str) else value
+        try:
+            array = np.asarray(pieces, dtype=np.float64).reshape(-1)
+        except (ValueError, TypeError, OverflowError):
+            array = np.full(1, np.nan)
+        ok = len(array) == count and bool(np.isfinite(array).all())
+        plural = "s" if count > 1 else ""
+        self.expect(ok, f"{count} finite number{plural} as {what}", _shown(value))
+        return torch.from_numpy(array.copy())
+
+
+def contents(path: Path) -> str:
+    """List a folder's contents, for a message."""
+    if path.is_dir():
+        names = sorted(inner.name for inner in path.iterdir())
+        return some(names) if names else "an empty folder"
+    return "a file" if path.exists() else "nothing there"
+
+
+def first_of(candidates: Sequence[Path]) -> Path | None:
+    """Return the first path that exists."""
+    return next((path for path in candidates if path.exists()), None)
+
+
+def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
+    """Return a file, or the one of these names, or of one pattern, in a folder.
+
+    Raises:
+        InputError: There is none, or several fit the pattern.
+    """
+    given = Path(given)
+    if given.is_file():
+        return DataSetPath(given, kind)
+    folder, found = DataSetPath(given, kind), [given / name for name in names]
+    if names[0].startswith("*"):
+        found = sorted(given.glob(names[0])) if given.is_dir() else []
+        folder.expect(len(found) == 1, f"one file named {names[0]}")
+    path = first_of(found)
+    if path is None:
+        folder.refuse(f"a file {' or '.join(names)}")
+    return DataSetPath(path, kind)
+
+
+def _shown(value: object) -> str:
+    return "nothing" if value is None else _shortened(repr(value), 80)
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."

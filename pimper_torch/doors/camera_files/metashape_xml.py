@@ -1,0 +1,193 @@
+"""Cameras of Agisoft Metashape (PhotoScan): the XML that "Export Cameras" writes."""
+
+from collections import Counter
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
+from pimper_torch.records import Lens
+from pimper_torch.runtime.errors import InputError, caution, some
+
+KIND = "a Metashape camera XML"
+
+
+def read_metashape_cameras(path: Path) -> list[PosedCamera]:
+    """Read the cameras, which are called as Metashape labels them.
+
+    A camera's ``transform`` is ``chunk_from_cam``, row by row, with our camera axes. The
+    chunk's own transform (of the camera's ``component`` in newer files) is a similarity from
+    there to the world, applied where there is one; for a georeferenced chunk that world is
+    geocentric. The manual's appendix "Camera models" defines the lens: ``f``, with ``b1``
+    added along x; ``cx``, ``cy`` from (width / 2, height / 2) in a frame whose top-left pixel
+    has its centre at (0.5, 0.5), as ours; ``p1`` and ``p2`` the other way round than OpenCV.
+
+    Cameras without a transform are not aligned and left out, as are those switched off. Chunks, and
+    components of one, have frames of their own: of several chunks with such cameras one has to be
+    exported, of several components the largest is read, with a warning.
+
+    Raises:
+        InputError: The file is something else, defines entities, or describes a lens or rig
+            that cannot be read.
+    """
+    file = DataSetPath(path, KIND)
+    chunk = _chunk(file)
+    lenses = {
+        str(sensor.get("id")): (sensor, number)
+        for number, sensor in enumerate(chunk.iterfind("sensors//sensor"), start=1)
+    }
+    for camera in chunk.iterfind("cameras//camera"):
+        rig = camera.get("master_id") not in (None, camera.get("id"))
+        file.expect(
+            not rig, f"a transform of its own for {camera.get('label')}", "a camera of a rig"
+        )
+    cameras = []
+    for camera in _component(_placed(chunk), path):
+        label = str(camera.get("label"))
+        sensor = lenses.get(str(camera.get("sensor_id")))
+        if sensor is None:
+            file.refuse(f"the sensor of {label}", "no such sensor")
+        lens, skew_px = _lens(*sensor, file)
+        pose = _cam_from_world(camera, chunk, file)
+        cameras.append(PosedCamera(name=label, cam_from_world=pose, lens=lens, skew_px=skew_px))
+    file.expect(bool(cameras), "cameras with a transform", "none")
+    return cameras
+
+
+def parse_without_entities(path: Path) -> ElementTree.Element:
+    """Parse XML from a stranger: a file that declares a document type is refused.
+
+    Entities need such a declaration, and with them a small file can grow without bound or
+    name other files.
+    """
+
+    def refuse(name: str, *_: object) -> None:
+        raise InputError(
+            f"{path}: declares the document type {name}; needed: plain XML without one. Export it "
+            "again."
+        )
+
+    content = path.read_bytes()
+    checker = expat.ParserCreate()
+    checker.StartDoctypeDeclHandler = refuse
+    checker.Parse(content, True)
+    return ElementTree.fromstring(content)
+
+
+def _chunk(file: DataSetPath) -> ElementTree.Element:
+    root = file.read(parse_without_entities, "XML")
+    chunks = [root] if root.tag == "chunk" else root.findall("chunk")
+    file.expect(bool(chunks), "a document of one chunk", f"<{root.tag}> without one")
+    aligned = [chunk for chunk in chunks if _placed(chunk)] or chunks
+    if len(aligned) > 1:
+        labels = [f"{chunk.get('label')} ({len(_placed(chunk))} cameras)" for chunk in aligned]
+        raise InputError(
+            f"{file.path}: has {len(aligned)} chunks: {some(labels)}; needed: one, as each has a "
+            "frame of its own. Export the cameras of the chunk that is meant, or merge the chunks."
+        )
+    return aligned[0]
+
+
+def _placed(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+    """Find the cameras that are aligned and switched on."""
+    return [
+        camera
+        for camera in chunk.iterfind("cameras//camera")
+        if camera.find("transform") is not None and camera.get("enabled") not in ("0", "false")
+    ]
+
+
+def _component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTree.Element]:
+    """Choose the cameras of the component that has most."""
+    sizes = Counter(camera.get("component_id") for camera in cameras).most_common()
+    if len(sizes) < 2:
+        return cameras
+    (largest, size), *rest = sizes
+    caution(
+        f"{path}: its cameras are in {len(sizes)} components, each in a frame of its own; read is "
+        f"that of {size} cameras, not {some([f'that of {count}' for _, count in rest])}. Align "
+        "them in Metashape for all.",
+        stacklevel=4,
+    )
+    return [camera for camera in cameras if camera.get("component_id") == largest]
+
+
+def _cam_from_world(
+    camera: ElementTree.Element, chunk: ElementTree.Element, file: DataSetPath
+) -> Float[Tensor, "4 4"]:
+    what = f"transform of {camera.get('label')}"
+    chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
+    pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, file)
+    components = {
+        component.get("id"): component.find("transform")
+        for component in chunk.iterfind("components/component")
+    }
+    similarity = components.get(camera.get("component_id"))
+    similarity = chunk.find("transform") if similarity is None else similarity
+    if similarity is None:
+        return invert_rigid(pose)
+
+    def values(tag: str, count: int, default: str) -> Float[Tensor, " value"]:
+        return file.numbers(similarity.findtext(tag, default), count, f"{tag} of the chunk")
+
+    rotation = values("rotation", 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    shift, scale = values("translation", 3, "0 0 0"), float(values("scale", 1, "1"))
+    file.expect(scale > 0, "a positive scale of the chunk", f"{scale}")
+    world_from_chunk = rigid_or_refuse(rotation, shift, "the chunk's transform", file)
+    # Metres or whatever: the scale moves the camera and leaves its axes unit.
+    return invert_rigid(world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3]))
+
+
+def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[Lens, float]:
+    """Translate a sensor's calibration; return the skew, too."""
+    label = sensor.get("label") or sensor.get("id")
+    given = sensor.findall("calibration")
+    adjusted = [one for one in given if one.get("class") == "adjusted"] or given
+    file.expect(bool(adjusted), f"a calibration of the sensor {label}", "none")
+    calibration = adjusted[0]
+
+    def value(tag: str) -> float:
+        text = calibration.findtext(tag, "0")
+        return float(file.numbers(text, 1, f"{tag} of the sensor {label}"))
+
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    sides = None if resolution is None else [resolution.get("width"), resolution.get("height")]
+    size_px = file.numbers(sides, 2, f"resolution of the sensor {label}")
+    width, height = (int(side) for side in size_px)
+    old = calibration.find("f") is None and calibration.find("fx") is not None
+    other = "fx and fy, as old PhotoScan wrote them; export with a newer one" if old else "none"
+    file.expect(value("f") > 0 and not old, f"a positive f of the sensor {label}", other)
+    f, b1, b2 = value("f"), value("b1"), value("b2")
+    k1, k2, k3, k4 = (value(tag) for tag in ("k1", "k2", "k3", "k4"))
+    p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
+    pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
+    kind = calibration.get("type") or sensor.get("type") or "frame"
+    model, params = "PINHOLE", tuple[float, ...]()
+    if kind == "fisheye":
+        model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+        readable = not any((p1, p2, p3, p4, b2))
+    else:
+        distorted = any((k1, k2, k3, p1, p2))
+        readable = kind == "frame" and not any((k4, p3, p4)) and not (b2 and distorted)
+        if distorted:
+            model, params = "FULL_OPENCV", (k1, k2, p2, p1, k3, 0.0, 0.0, 0.0)
+    file.expect(
+        readable,
+        f"a frame camera with k1, k2, k3, p1, p2, b1, or a fisheye with k1 to k4 and b1, for the "
+        f"sensor {label}",
+        f"a {kind} camera with {_nonzero(calibration)}; export undistorted photographs with their "
+        "cameras, or align anew without the others",
+    )
+    lens = Lens(camera=number, model=model, params=(*pinhole, *params), width=width, height=height)
+    return lens, b2
+
+
+def _nonzero(calibration: ElementTree.Element) -> str:
+    tags = [one.tag for one in calibration if (one.text or "").strip() not in ("", "0", "0.0")]
+    return ", ".join(tags)

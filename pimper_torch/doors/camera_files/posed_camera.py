@@ -1,0 +1,99 @@
+"""A camera as a file has it: pose, lens and what its photograph is called."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.records import Lens, Record
+
+SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
+"""Width and height of photographs by their names in a file; ``None`` for those not there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class PosedCamera(Record):
+    """One camera of a file.
+
+    Attributes:
+        name: Of its photograph, or path, as the file has it.
+        cam_from_world: Rigid, in float64; camera axes x right, y down, z forward.
+        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own.
+    """
+
+    name: str
+    cam_from_world: Float[Tensor, "4 4"]
+    lens: Lens
+    skew_px: float = 0.0
+
+
+def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
+    """Let cameras share a lens's number where their lenses are equal."""
+    lenses = list(dict.fromkeys(camera.lens for camera in cameras))
+    return [
+        camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
+        for camera in cameras
+    ]
+
+
+def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> Lens:
+    """Return the lens of a pinhole's ``K``, but for its skew."""
+    K = intrinsics.tolist()
+    params = (K[0][0], K[1][1], K[0][2], K[1][2])
+    return Lens(camera=1, model="PINHOLE", params=params, width=size_px[0], height=size_px[1])
+
+
+def rigid_or_refuse(
+    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
+) -> Float[Tensor, "4 4"]:
+    """Put a file's rotation and translation together, the rotation made exact."""
+    U, _, Vh = torch.linalg.svd(rotation)
+    nearest = U @ Vh
+    off = float((rotation - nearest).abs().max())
+    mirrored = bool(torch.linalg.det(nearest) < 0)
+    found = "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation"
+    # Files round a rotation to some digits; more than this is a scale or a reflection.
+    file.expect(off <= 0.01 and not mirrored, f"a rotation in {what}", found)
+    return rigid(nearest, translation)
+
+
+def decompose_projections(
+    projections: Float[Tensor, "view 3 4"],
+) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
+    r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
+
+    ``P`` is known up to a factor, negative ones included. The left 3x3 block is an upper
+    triangular matrix times an orthogonal one (RQ); that ``K`` has a positive diagonal and
+    ``R`` is a rotation makes the split unique. What the cameras project stays exactly the
+    same, also where a file's ``R`` was not orthogonal: the rest goes into ``K``.
+
+    Returns:
+        ``K`` with ``K[2, 2] = 1``, its skew kept, and rigid transforms; float64.
+
+    Raises:
+        ValueError: A left block without inverse, the matrix of no finite camera.
+
+    Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
+    """
+    intrinsics, poses = [], []
+    for matrix in projections.detach().cpu().double().numpy():
+        left = matrix[:, :3]
+        determinant = float(np.linalg.det(left))
+        size = float(np.linalg.norm(left))
+        # Rows of K [R | t] differ by the focal length in pixels, cubes of it at most.
+        if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
+            raise ValueError("the left 3x3 block has no inverse")
+        proper = matrix if determinant > 0 else -matrix
+        K, R = scipy.linalg.rq(proper[:, :3])
+        signs = np.where(np.diag(K) < 0, -1.0, 1.0)
+        K, R = K * signs, signs[:, None] * R
+        intrinsics.append(torch.from_numpy(K / K[2, 2]))
+        translation = torch.from_numpy(np.linalg.solve(K, proper[:, 3]))
+        poses.append(rigid(torch.from_numpy(R), translation))
+    return torch.stack(intrinsics), torch.stack(poses)

@@ -1,0 +1,123 @@
+"""Cameras of NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.posed_camera import (
+    PosedCamera,
+    SizesOf,
+    number_lenses,
+    rigid_or_refuse,
+)
+from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.records import Lens
+from pimper_torch.runtime.errors import InputError
+
+KIND = "a transforms.json set"
+FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+"""OpenGL's camera has y up and looks along -z."""
+
+_POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+
+
+def read_frames(path: Path) -> list[dict[str, object]]:
+    """Return the frames, each with what the whole file says."""
+    file = DataSetPath(path, KIND)
+    whole = file.read_json()
+    frames = [{**whole, **frame} for frame in file.objects(whole.get("frames"), "frames")]
+    for frame in frames:
+        name = frame.get("file_path")
+        file.expect(isinstance(name, str) and name != "", "a text as file_path", repr(name))
+    return frames
+
+
+def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
+    """Read the cameras; a file that says no sizes takes those of the photographs.
+
+    ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
+    The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
+    principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
+    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may stand in the file
+    or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
+    x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
+    centre is that of the image's area: their pixels are ours.
+
+    Args:
+        sizes_of: Of photographs, by ``file_path``.
+
+    Returns:
+        In the file's order; without frames whose size nothing tells.
+    """
+    frames = read_frames(path)
+    names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
+    sizes = [_stated_size(frame) for frame in frames]
+    read = sizes if all(sizes) else sizes_of(names)
+    cameras = [
+        _camera(frame, name, size, DataSetPath(path, KIND))
+        for frame, name, *both in zip(frames, names, sizes, read, strict=True)
+        if (size := both[0] or both[1])
+    ]
+    return number_lenses(cameras)
+
+
+def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
+    """Return a frame's width and height, where the file says them."""
+    sides = frame.get("w"), frame.get("h")
+    if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
+        return None
+    return round(float(str(sides[0]))), round(float(str(sides[1])))
+
+
+def _camera(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
+) -> PosedCamera:
+    matrix, what = frame.get("transform_matrix"), f"transform_matrix of {name}"
+    rows = matrix[:3] if isinstance(matrix, list) and len(matrix) in (3, 4) else []
+    file.expect(bool(rows), f"4 rows of 4 numbers as {what}", type(matrix).__name__)
+    world_from_cam = file.numbers(rows, 12, what).reshape(3, 4)
+    turn, shift = world_from_cam[:, :3] * FLIP, world_from_cam[:, 3]
+    pose = invert_rigid(rigid_or_refuse(turn, shift, what, file))
+    return PosedCamera(name=name, lens=_lens(frame, name, size_px, file), cam_from_world=pose)
+
+
+def _lens(
+    frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
+) -> Lens:
+    def value(key: str, default: float = 0.0) -> float:
+        given = frame.get(key)
+        if given is None:
+            return default
+        return float(file.numbers(given, 1, f"{key} of {name}"))
+
+    def focal_px(axis: str, side_px: float) -> float:
+        stated_px, angle = value(f"fl_{axis}"), value(f"camera_angle_{axis}")
+        if stated_px > 0 or angle <= 0:
+            return max(stated_px, 0.0)
+        if angle >= math.pi:
+            raise InputError(
+                f"{file.path}: camera_angle_{axis} of {name} is {angle:g}; needed: radians, below "
+                f"pi. If these are degrees, write {math.radians(angle):.6g}."
+            )
+        return side_px / 2 / math.tan(angle / 2)
+
+    width, height = size_px
+    focal, focal_y = focal_px("x", width), focal_px("y", height)
+    what = f"fl_x or camera_angle_x, in the file or for {name}"
+    file.expect(focal > 0 or focal_y > 0, what, "neither, or no positive one")
+    fx, fy = focal or focal_y, focal_y or focal
+    pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
+    k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(frame.get("camera_model") or "OPENCV")
+    kind, params = "PINHOLE", tuple[float, ...]()
+    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
+        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    else:
+        file.expect(model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
+        file.expect(k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
+        if any((k1, k2, k3, p1, p2)):
+            kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)

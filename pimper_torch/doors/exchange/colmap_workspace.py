@@ -1,0 +1,137 @@
+"""COLMAP's layouts: photographs beside a model, and the workspace of its dense stereo."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.exchange.picture_files import (
+    file_names,
+    refuse_skew,
+    write_mask,
+    write_picture,
+)
+from pimper_torch.doors.exchange.result import Result
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses, undistort_pixels
+from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.method.sfm.colmap import write_binary
+from pimper_torch.method.sfm.model import SparseModel, select_views
+from pimper_torch.method.sfm.sparse_scene import model_of_scene, point_colors
+from pimper_torch.records import Cameras, SparseScene, Views
+from pimper_torch.result.viz.maps import view_maps
+
+_KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
+
+
+def write_colmap(
+    views: Views,
+    cameras: Cameras,
+    folder: Path | str,
+    *,
+    points_world: Float[Tensor, "point 3"] | None = None,
+) -> None:
+    """Write photographs, masks and pinholes as COLMAP reads them.
+
+    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
+    ``.png`` behind, ``sparse/0/`` the model, binary.
+
+    Args:
+        views: Undistorted.
+        points_world: A cloud to put in the model, without tracks and black.
+
+    Raises:
+        InputError: A camera has a skew, which COLMAP's pinhole cannot have.
+    """
+    folder = Path(folder)
+    refuse_skew(cameras, views.names, "a COLMAP model")
+    files = _write_pictures(views, folder)
+    points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
+    nothing = torch.zeros(0, dtype=torch.long)
+    model = SparseModel(
+        names=files,
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.detach().cpu().double(),
+        points_world=points.double(),
+        observation_point=nothing,
+        observation_view=nothing,
+        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
+    )
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    write_binary(model, colors, folder / "sparse" / "0")
+
+
+def write_workspace(result: Result, folder: Path) -> None:
+    """Write what COLMAP's undistorter and dense stereo would: the surface as depths and normals.
+
+    ``images/`` and ``masks/`` are as in :func:`write_colmap`, ``sparse/`` is the model with its
+    tracks. Depths are along the camera's z, normals in its frame (x right, y down, z forward),
+    both 0 where a view does not see the surface: ``stereo_fusion`` and the meshers run on them.
+    """
+    scene = result.scene
+    files = _write_pictures(result.masked_views, folder)
+    write_pinholes(scene, result.cameras, files, folder / "sparse")
+    stereo = folder / "stereo"
+    write_stereo_folder(files, stereo)
+    for view, file in enumerate(files):
+        maps = view_maps(result.mesh, scene.cameras, view)
+        depths = maps.depth.nan_to_num(0)[..., None]
+        for kind, values in zip(_KINDS, (depths, maps.normals_cam), strict=False):
+            _write_array(values, stereo / kind / f"{file}.geometric.bin")
+
+
+def write_pinholes(
+    scene: SparseScene, cameras: Cameras, files: Sequence[str], folder: Path
+) -> None:
+    """Write a scene's pinholes, cloud and tracks as a model of its undistorted photographs.
+
+    Points that fewer than two views see are left out: stereo programs take none.
+
+    Args:
+        cameras: Those of the scene, in the frame of ``scene.offset_world``.
+        folder: Gets the binary files; made if it is not there.
+    """
+    pixels = torch.empty_like(scene.observation_pixels, dtype=torch.float64)
+    for view, (lens, K) in enumerate(zip(scene.lenses, cameras.intrinsics.double(), strict=True)):
+        here = scene.observation_view == view
+        ends = homogeneous(undistort_pixels(lens, scene.observation_pixels[here].double()))
+        pixels[here] = (ends @ K.mT)[:, :2]
+    model = model_of_scene(scene).replace(
+        names=tuple(files),
+        lenses=pinhole_lenses(cameras),
+        cam_from_world=cameras.cam_from_world.double(),
+        observation_pixels=pixels,
+    )
+    tied = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
+    write_binary(select_views(model, range(model.num_views)), point_colors(scene)[tied], folder)
+
+
+def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
+    """Write what COLMAP's undistorter would: which views to compare and to fuse, and folders.
+
+    The photographs have no lenses any more, so the undistorter itself is not run: it would
+    resample them once more.
+    """
+    for kind in _KINDS:
+        (folder / kind).mkdir(parents=True)
+    pairs = "".join(f"{name}\n__auto__, 20\n" for name in names)
+    (folder / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+    (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+
+
+def _write_pictures(views: Views, folder: Path) -> tuple[str, ...]:
+    files = file_names(views.names)
+    for index, file in enumerate(files):
+        write_picture(views, index, folder / "images" / file)
+        if views.masks is not None:
+            write_mask(views, index, folder / "masks" / f"{file}.png")
+    return files
+
+
+def _write_array(values: Float[Tensor, "height width channel"], path: Path) -> None:
+    """Write COLMAP's array of float32, row by row and channel after channel (``mvs/mat.h``)."""
+    height, width, channels = values.shape
+    planes = values.movedim(-1, 0).contiguous().numpy().astype("<f4")
+    path.write_bytes(f"{width}&{height}&{channels}&".encode("ascii") + np.asarray(planes).tobytes())

@@ -1,0 +1,183 @@
+"""A folder that ``pimper reconstruct`` wrote, read back with its photographs."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.io.estimates import mask_path, read_lights, read_reference
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.photographs import image_name, list_images, load_views, read_mask
+from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.sparse_scene import assemble_scene
+from pimper_torch.method.sfm.undistort import pinholes_for
+from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views
+from pimper_torch.runtime.config import build, read_mapping
+from pimper_torch.runtime.errors import InputError, PimperWarning, some
+
+_KIND = "a result of `pimper reconstruct`"
+_FILES = ("mesh.ply", "sparse", "lights.json", "config.yaml", "summary.json")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Result(Record):
+    """All that a folder of results holds, with the photographs it was made from.
+
+    Attributes:
+        mesh: The surface as it was written, in the frame of ``scene``.
+        scene: Cameras, undistorted photographs and the sparse cloud; float32.
+        cameras: The same cameras in float64 and in the frame of the files, which is
+            ``scene.offset_world`` away from that of ``scene``.
+        silhouettes: As they were written, 0 or 1; without planes.
+        lights_world: First-order light of every view; NaN where unknown, ``None`` where all are.
+        reference: Name of the view that the pictures of the result show.
+    """
+
+    mesh: Mesh
+    scene: SparseScene
+    cameras: Cameras
+    silhouettes: Silhouettes
+    lights_world: Float[Tensor, "view 4"] | None
+    reference: str
+    summary: Mapping[str, object] = field(repr=False)
+
+    @property
+    def masked_views(self) -> Views:
+        """The undistorted photographs, with silhouettes for masks where there are some."""
+        views = self.scene.views
+        if self.silhouettes.source == "everything":
+            return views
+        return views.replace(masks=self.silhouettes.masks)
+
+
+def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
+    """Read a folder of results, and the photographs it was made from with the same settings.
+
+    Args:
+        folder: Written by ``pimper reconstruct`` or
+            :func:`~pimper_torch.doors.io.results.write_result`.
+        photographs: Their folder; by default the one that ``summary.json`` names. They may be
+            larger than the run read them, and are shrunk then.
+
+    Returns:
+        On the CPU.
+
+    Raises:
+        InputError: A file of the result is missing or damaged, or the photographs are not where
+            they were, or others.
+    """
+    folder = Path(folder)
+    _require_result(folder)
+    summary = DataSetPath(folder / "summary.json", _KIND).read_json()
+    model = read_model(folder / "sparse")
+    views = _photographs(folder, photographs or summary.get("photographs"), model)
+    scene = assemble_scene(views, model)
+    mesh = read_mesh(folder / "mesh.ply")
+    local = mesh.vertices_world - mesh.vertices_world.new_tensor(scene.offset_world)
+    return Result(
+        mesh=mesh.replace(vertices_world=local).to(scene.points_world.dtype),
+        scene=scene,
+        cameras=Cameras(
+            intrinsics=pinholes_for(model.lenses),
+            cam_from_world=model.cam_from_world,
+            sizes_px=scene.cameras.sizes_px,
+        ),
+        silhouettes=_silhouettes(folder, scene.views, summary, given=views.masks is not None),
+        lights_world=read_lights(folder / "lights.json", model.names),
+        reference=_reference(folder, summary, model.names),
+        summary=summary,
+    )
+
+
+def _require_result(folder: Path) -> None:
+    missing = [name for name in _FILES if not (folder / name).exists()]
+    if missing:
+        found = f"holds no {some(missing)}" if folder.is_dir() else "is no folder"
+        raise InputError(f"{folder}: {found}; needed: a folder written by `pimper reconstruct`.")
+
+
+def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
+    """Read the photographs of a model as the run read them.
+
+    The longest side of the model's pictures is that which the run shrank photographs to. What
+    reading them warns of was told by the run.
+    """
+    if not isinstance(named, str | Path):
+        raise InputError(
+            f"{folder}: its summary.json does not name its photographs; needed: their folder. "
+            "Name it by `--photos DIR` (`photographs=`)."
+        )
+    path = Path(named)
+    names = {image_name(file, path) for file in list_images(path)} if path.is_dir() else set()
+    missing = [name for name in model.names if name not in names]
+    if missing:
+        raise InputError(
+            f"{folder}: its photographs {some(missing)} are not in {path.absolute()}; needed: all "
+            f"{model.num_views} that it was made from. Name their folder by `--photos DIR` "
+            "(`photographs=`)."
+        )
+    settings = read_mapping(folder / "config.yaml").get("photographs") or {}
+    where = f"{folder / 'config.yaml'}: photographs"
+    encoding = build(Encoding, settings if isinstance(settings, Mapping) else {}, where)
+    longest = max(max(lens.width, lens.height) for lens in model.lenses)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PimperWarning)
+        views = load_views(path, encoding=encoding, max_size_px=longest)
+    sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
+    for name, lens in zip(model.names, model.lenses, strict=True):
+        if sizes[name] != [lens.width, lens.height]:
+            raise InputError(
+                f"{path / name}: has {sizes[name][0]} x {sizes[name][1]} pixels, but {folder} was "
+                f"made from {lens.width} x {lens.height}; needed: the same photograph. Name the "
+                "folder of the originals by `--photos DIR` (`photographs=`)."
+            )
+    return views
+
+
+def _silhouettes(
+    folder: Path, views: Views, summary: Mapping[str, object], *, given: bool
+) -> Silhouettes:
+    """Read the masks that were written; views whose silhouette was doubted stay so."""
+    if not (folder / "masks").is_dir():
+        return Silhouettes.everything(views)
+    inside = torch.zeros_like(views.images[:, 0])
+    for index, (name, size) in enumerate(zip(views.names, views.sizes_px.tolist(), strict=True)):
+        path = mask_path(folder / "masks", name)
+        mask = read_mask(path)
+        width, height = size
+        if mask.shape != (height, width):
+            raise InputError(
+                f"{path}: has {mask.shape[1]} x {mask.shape[0]} pixels; needed: {width} x "
+                f"{height}, as its photograph. Run `pimper reconstruct` again."
+            )
+        inside[index, :height, :width] = mask.to(inside)
+    doubted = _left_out(summary, ("silhouettes.unreliable", "silhouettes.empty"))
+    return Silhouettes(
+        inside=inside,
+        reliable=torch.tensor([name not in doubted for name in views.names]),
+        source="masks" if given or summary.get("masks") else "found",
+    )
+
+
+def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[object]:
+    """Return the names of photographs that guards left out."""
+    entries = summary.get("left_out")
+    return {
+        name
+        for entry in (entries if isinstance(entries, list) else [])
+        if isinstance(entry, dict) and entry.get("guard") in guards
+        for name in entry.get("names") or ()
+    }
+
+
+def _reference(folder: Path, summary: Mapping[str, object], names: tuple[str, ...]) -> str:
+    """Return the reference view; the first where nothing names one."""
+    named = summary.get("reference") or read_reference(folder / "depth.npz")
+    return str(named) if named in names else names[0]

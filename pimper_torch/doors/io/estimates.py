@@ -1,0 +1,115 @@
+"""Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
+
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.doors.io.reports import common_lights
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.epipolar import pinholes_of
+from pimper_torch.records import Estimate, Reconstruction
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.numpy_files import read_npz
+
+_KIND = "a result of `pimper reconstruct`"
+
+
+def estimate_of(result: Reconstruction) -> Estimate:
+    """Take what a run of ours says about the object, in the frame that it is written in.
+
+    A view's light is that of the patches that determine it, taken together, NaN where none
+    does; see :func:`pimper_torch.doors.io.reports.common_lights`.
+    """
+    lights, counts = common_lights(result)
+    names, offset = result.scene.views.names, result.scene.offset_world
+    mesh, cameras = result.mesh, result.cameras
+    if offset != NO_OFFSET:
+        vertices = mesh.vertices_world.double()
+        mesh = mesh.replace(vertices_world=vertices + vertices.new_tensor(offset))
+        poses = from_local(cameras.cam_from_world, offset)
+        intrinsics = cameras.intrinsics.double()
+        cameras = cameras.replace(cam_from_world=poses, intrinsics=intrinsics)
+    return Estimate(
+        mesh=mesh,
+        names=names,
+        cameras=cameras,
+        lights_world=torch.where(counts[:, None] > 0, lights, torch.nan),
+        reference=names[result.coarse.reference],
+    )
+
+
+def read_estimate(path: Path | str) -> Estimate:
+    """Read what a method says about an object.
+
+    Args:
+        path: A mesh or point cloud; or a folder with ``mesh.ply`` and, as far as they are
+            there, ``sparse/`` (COLMAP model whose pinholes are the cameras), ``lights.json``
+            and ``depth.npz`` (whose ``name`` is the reference view), as
+            :func:`pimper_torch.doors.io.results.write_result` writes them.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return Estimate(mesh=read_mesh(path))
+    if not (path / "mesh.ply").is_file():
+        raise InputError(
+            f"{path}: holds no mesh.ply; needed: a folder written by `pimper reconstruct`, or the "
+            "path of a mesh file itself."
+        )
+    mesh = read_mesh(path / "mesh.ply")
+    names: tuple[str, ...] = ()
+    cameras = None
+    if (path / "sparse").is_dir():
+        model = read_model(path / "sparse")
+        names, cameras = model.names, pinholes_of(model)
+    lights = read_lights(path / "lights.json", names)
+    return Estimate(
+        mesh=mesh,
+        names=names,
+        cameras=cameras,
+        lights_world=lights,
+        reference=read_reference(path / "depth.npz"),
+    )
+
+
+def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
+    """Read the light of every named view; NaN where the file has none.
+
+    Returns:
+        ``None`` where there is no such file, no view, or no light.
+    """
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file() or not names:
+        return None
+    views = file.objects(file.read_json().get("views"), "views")
+    known = {str(view.get("name")): view.get("light") for view in views}
+    unknown = torch.full((4,), torch.nan, dtype=torch.float64)
+    rows = [
+        file.numbers(known[name], 4, f"light of {name}") if known.get(name) else unknown
+        for name in names
+    ]
+    lights = torch.stack(rows)
+    return lights if bool(lights.isfinite().any()) else None
+
+
+def read_reference(path: Path | str) -> str | None:
+    """Read the name of the reference view; ``None`` where there is no such file."""
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file():
+        return None
+    found = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")
+    return str(found["name"]) if "name" in found else None
+
+
+def mask_path(folder: Path | str, name: str) -> Path:
+    """Return where the mask of a photograph is written: under its name, never outside the folder.
+
+    >>> mask_path(Path("masks"), "pose_03/../light_02.jpg").as_posix()
+    'masks/pose_03/light_02.png'
+    """
+    parts = PurePosixPath(name.replace("\\", "_")).with_suffix(".png").parts
+    return Path(folder).joinpath(*(part for part in parts if part not in ("/", "..")))

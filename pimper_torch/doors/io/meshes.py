@@ -1,0 +1,373 @@
+"""Meshes as files that other programs open."""
+
+import json
+import re
+import struct
+from collections.abc import Sequence
+from io import BytesIO
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
+from pimper_torch.ground.geometry.rigid import rotate, transform
+from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
+from pimper_torch.ground.geometry.topology import corners_of
+from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
+from pimper_torch.records import Mesh
+from pimper_torch.records.value_checks import beyond, not_finite
+from pimper_torch.result.asset.gltf import MATTE, gltf_of
+from pimper_torch.result.viz.maps import base_color
+from pimper_torch.runtime.errors import InputError
+
+# One number a vertex, written and read under the names of the record's fields.
+_ERRORS = ("confidence", "expected_error")
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+_NEEDED = "PLY, OBJ, STL, OFF or GLB"
+# Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
+# A cloud's spacing is taken for a thousandth of its radius.
+_MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
+_KINDS = {torch.uint8: ("uchar", "u1"), torch.float32: ("float", "<f4")}
+_KINDS |= {torch.float64: ("double", "<f8")}
+
+
+def write_ply(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
+    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
+
+    These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
+    Positions are ``double`` where ``float`` would move one by more than a thousandth of an edge,
+    as it does far from the origin.
+
+    Args:
+        offset_world: Added to the vertices; see ``SparseScene.offset_world``.
+        measured: Written as the faces' property of this name, 0 of those that close a hole.
+    """
+    path = Path(path)
+    columns = dict(zip("xyz", _positions(mesh, offset_world).unbind(dim=1), strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), _normals(mesh).float().unbind(dim=1), strict=True))
+    if mesh.albedo is not None:
+        colors = to_bytes(_colors(mesh)).unbind(dim=1)
+        columns |= dict(zip(("red", "green", "blue"), colors, strict=True))
+    for name in _ERRORS:
+        known = getattr(mesh, name)
+        if known is not None:
+            columns[name] = known.float()
+    kinds = [_KINDS[one.dtype] for one in columns.values()]
+    vertices = np.empty(
+        len(mesh.vertices_world),
+        [(name, kind) for name, (_, kind) in zip(columns, kinds, strict=True)],
+    )
+    for name, values in columns.items():
+        vertices[name] = values.detach().cpu().numpy()
+    kind = [("count", "u1"), ("corners", "<i4", 3)]
+    faces = np.empty(len(mesh.faces), kind if measured is None else [*kind, ("measured", "u1")])
+    faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
+    if measured is not None:
+        faces["measured"] = measured.cpu().numpy()
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property {kind} {name}" for name, (kind, _) in zip(columns, kinds, strict=True)),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        *([] if measured is None else ["property uchar measured"]),
+        "end_header",
+    ]
+    with path.open("wb") as file:
+        file.write("".join(f"{line}\n" for line in header).encode("ascii"))
+        vertices.tofile(file)
+        faces.tofile(file)
+
+
+def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
+    """Return positions as they are written: float32 where that tells them, else float64."""
+    vertices = mesh.vertices_world.detach().double()
+    placed = vertices + vertices.new_tensor(offset_world)
+    single = placed.float()
+    if len(vertices) == 0:
+        return single
+    if len(mesh.faces):
+        lengths = side_lengths(vertices[mesh.faces.clamp(0, len(vertices) - 1)]).flatten()
+        short = float(lengths.kthvalue(max(1, len(lengths) // 10)).values)
+    else:
+        away = (vertices - vertices.median(dim=0).values).norm(dim=1)
+        short = _CLOUD_SPACING * float(away.median())
+    lost = float((placed - single).abs().max())
+    return single if lost <= _MAX_ROUNDING * short else placed
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF or GLB.
+
+    Faces of more corners are split, the parts of a scene put together; vertices keep their
+    order and number. Vertex normals are kept if the file has some; colours are taken for
+    albedo (sRGB undone, except in glTF, whose colours are linear); ``confidence`` and
+    ``expected_error`` of PLY are kept too. What of these is not finite throughout is dropped. A
+    point cloud becomes a mesh without faces.
+
+    Args:
+        path: The file. Textures and materials beside it are not looked at.
+
+    Returns:
+        Float64 geometry on the CPU.
+
+    Raises:
+        InputError: No such file, not a mesh, one that says it holds more than its file, no
+            vertices, vertices that are not finite, or faces of vertices that are not there.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InputError(f"{path}: found {found}; needed: a mesh file such as .ply or .obj.")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        why = f"it ends in {suffix}" if suffix else "its name has no ending"
+        raise InputError(f"{path}: cannot be read as a mesh, {why}; needed: {_NEEDED}.")
+    try:
+        # Without a resolver nothing but the file itself is opened.
+        scene = trimesh.load_scene(
+            BytesIO(_readable(path, suffix)),
+            file_type=suffix.lstrip("."),
+            process=False,
+            maintain_order=True,
+        )
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        count = sum(len(scene.geometry[name].vertices) for _, name in placed)
+        if count > 100_000_000:  # a scene may place a mesh many times, and each takes memory
+            raise InputError(
+                f"{path}: its scene has {count} vertices; needed: 100,000,000 at most."
+            )
+        parts = [
+            _mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed
+        ]
+    except InputError:
+        raise
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise InputError(
+            f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
+        ) from error
+    parts = [part for part in parts if len(part.vertices_world)]
+    if not parts:
+        raise InputError(f"{path}: holds no vertices; needed: a mesh or a point cloud.")
+    mesh = _joined(parts)
+    if not bool(mesh.vertices_world.isfinite().all()):
+        raise InputError(f"{path}: some vertices are not finite; needed: numbers throughout.")
+    if found := beyond(mesh.faces, len(mesh.vertices_world)):
+        raise InputError(
+            f"{path}: the corners of its faces {found}; needed: indices of its "
+            f"{len(mesh.vertices_world)} vertices. Export it again."
+        )
+    names = ("normals_world", "albedo", *_ERRORS)
+    known = {name: getattr(mesh, name) for name in names}
+    broken = [name for name, one in known.items() if one is not None and not_finite(one)]
+    return mesh.replace(**dict.fromkeys(broken)) if broken else mesh
+
+
+def write_glb(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
+    """Write a binary glTF of the same frame, normals and colours as the PLY.
+
+    glTF has no doubles in its buffers: vertices stay round the origin, and their node's
+    ``translation``, which is text, has the offset in full. Programs that follow it in single
+    precision, as Blender does, place the model to its rounding and keep its shape.
+
+    glTF wants colours linear, so these are albedo itself; the material is matte and seen
+    from both sides. glTF calls y up: viewers show the model as it lies in the world frame
+    of structure from motion, whose up is arbitrary.
+
+    Args:
+        offset_world: Of the node; see ``SparseScene.offset_world``.
+        measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
+    """
+    attributes = {"POSITION": mesh.vertices_world, "NORMAL": _normals(mesh)}
+    if mesh.albedo is not None:
+        attributes["COLOR_0"] = _colors(mesh)
+    if measured is not None:
+        attributes["_MEASURED"] = corners_of(mesh.faces, measured, len(mesh.vertices_world))
+    data = gltf_of(
+        {name: values.detach().cpu().numpy() for name, values in attributes.items()},
+        mesh.faces.cpu().numpy(),
+        MATTE,
+        offset_world=offset_world,
+    )
+    Path(path).write_bytes(data)
+
+
+def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
+    """Write a binary STL: triangles alone, without vertices that faces share.
+
+    STL has no doubles: far from the origin vertices stay round it, and the header tells the offset.
+
+    Args:
+        offset_world: Told in the file's header; see ``SparseScene.offset_world``.
+    """
+    corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
+    normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
+    kind = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    triangles = np.zeros(len(corners), kind)
+    triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()
+    header = b"pimper_torch"
+    if offset_world != NO_OFFSET:
+        header = "offset {} {} {}".format(*offset_world).encode("ascii")
+    with Path(path).open("wb") as file:
+        file.write(header.ljust(80)[:80] + np.uint32(len(triangles)).tobytes())
+        triangles.tofile(file)
+
+
+def write_obj(
+    mesh: Mesh,
+    path: Path | str,
+    offset_world: Offset = NO_OFFSET,
+    measured: Bool[Tensor, " face"] | None = None,
+) -> None:
+    """Write an OBJ: vertex normals, and albedo as sRGB colour behind each position.
+
+    Args:
+        offset_world: Added to the vertices; see ``SparseScene.offset_world``.
+        measured: Faces that are not stand in a group ``caps`` of their own.
+    """
+    rows = mesh.vertices_world.detach().cpu().double() + torch.tensor(offset_world).double()
+    if mesh.albedo is not None:
+        rows = torch.cat([rows, srgb_from_linear(_colors(mesh)).cpu().double()], dim=1)
+    kept = torch.ones(len(mesh.faces), dtype=torch.bool) if measured is None else measured.cpu()
+    with Path(path).open("w", encoding="ascii") as file:
+        digits = 9 if offset_world == NO_OFFSET else 15
+        _rows_of("v", f"%.{digits}g " * 3 + "%.6g " * (rows.shape[1] - 3), rows, file)
+        _rows_of("vn", "%.6g %.6g %.6g", _normals(mesh).detach().cpu(), file)
+        for group, chosen in (("measured", kept), ("caps", ~kept)):
+            if bool(chosen.any()):
+                file.write(f"g {group}\n")
+                corners = mesh.faces.cpu()[chosen].repeat_interleave(2, dim=1) + 1
+                _rows_of("f", "%d//%d %d//%d %d//%d", corners, file)
+
+
+def _rows_of(word: str, template: str, rows: Tensor, file: TextIO) -> None:
+    np.savetxt(file, rows.numpy(), fmt=f"{word} {template.rstrip()}")
+
+
+def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped
+    """Take over one part of what trimesh loaded, put where the scene has it."""
+    scene_from_part = torch.tensor(np.asarray(pose), dtype=torch.float64)
+    faces = torch.tensor(np.asarray(getattr(part, "faces", ())).reshape(-1, 3)).long()
+    # Asked for normals that the file does not have, trimesh computes some; those of the file
+    # are in its cache.
+    normals = _rows(part._cache.cache.get("vertex_normals"))
+    colors = getattr(part, "colors", None)
+    if len(faces):
+        visual = part.visual
+        colors = visual.vertex_colors if visual.kind == "vertex" else None
+        colors = part.vertex_attributes.get(_RAW_COLORS, colors)
+    encoded = _rows(colors)
+    if encoded is not None:
+        kind = np.asarray(colors).dtype
+        encoded = encoded[:, :3] / (np.iinfo(kind).max if kind.kind in "ui" else 1)
+    vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
+    raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    written = getattr(getattr(raw, "dtype", None), "names", None) or raw
+    known = {name: _rows(raw[name]) if name in written else None for name in _ERRORS}
+    if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
+        normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
+    return Mesh(
+        vertices_world=transform(scene_from_part, torch.tensor(vertices)),
+        faces=faces,
+        normals_world=None
+        if normals is None
+        else normalize(rotate(scene_from_part, normals), dim=-1),
+        albedo=encoded if linear or encoded is None else linear_from_srgb(encoded),
+        **{name: None if one is None else one.reshape(-1) for name, one in known.items()},
+    )
+
+
+def _rows(values: Any) -> Tensor | None:  # noqa: ANN401 - untyped
+    if values is None or len(values) == 0:
+        return None
+    # A column of a file's records has a stride that torch does not know.
+    return torch.from_numpy(np.array(values, dtype=np.float64))
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    """Put parts in one mesh; what not every part has is dropped."""
+    if len(parts) == 1:
+        return parts[0]
+    starts = accumulate((len(part.vertices_world) for part in parts), initial=0)
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+
+    def all_of(values: Sequence[Tensor | None]) -> Tensor | None:
+        there = [value for value in values if value is not None]
+        return torch.cat(there) if len(there) == len(values) else None
+
+    return Mesh(
+        vertices_world=torch.cat([part.vertices_world for part in parts]),
+        faces=torch.cat(faces),
+        normals_world=all_of([part.normals_world for part in parts]),
+        albedo=all_of([part.albedo for part in parts]),
+        **{name: all_of([getattr(part, name) for part in parts]) for name in _ERRORS},
+    )
+
+
+def _colors(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+    return base_color(mesh).expand(-1, 3)
+
+
+def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+    if mesh.normals_world is None:
+        return vertex_normals(mesh.vertices_world, mesh.faces)
+    return mesh.normals_world
+
+
+# glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of
+# the first it rounds to 8 bits, or cuts to them.
+_COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
+
+
+def _readable(path: Path, suffix: str) -> bytes:
+    """Return a file's bytes so that trimesh reads all that they hold."""
+    data = path.read_bytes()
+    if suffix == ".glb":
+        return _with_raw_colors(path, data)
+    header, _, body = data.partition(b"end_header")
+    if suffix == ".ply" and b"format ascii" in header:
+        counts = re.findall(rb"^element \S+ (\d+)", header, re.MULTILINE)
+        told, rows = sum(map(int, counts)), len(body.strip().splitlines())
+        if told > rows:
+            raise InputError(
+                f"{path}: cannot be read as a mesh, it says that it holds {told} rows, but has "
+                f"{rows}. Export it again."
+            )
+    return data
+
+
+def _with_raw_colors(path: Path, data: bytes) -> bytes:
+    """Rename the colours of surfaces in a GLB file; trimesh reads no other attributes of points."""
+    length, size = struct.unpack_from("<2I", data, 8)
+    tree = json.loads(data[20 : 20 + size])
+    if any("sparse" in one or "bufferView" not in one for one in tree.get("accessors", [])):
+        raise InputError(
+            f"{path}: cannot be read as a mesh, it has values that are not in the file itself "
+            "(sparse, or compressed). Export it without compression."
+        )
+    for mesh in tree.get("meshes", []):
+        for part in mesh["primitives"]:
+            if _COLORS in part["attributes"] and part.get("mode") != 0:
+                part["attributes"][_RAW_COLORS] = part["attributes"].pop(_COLORS)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = struct.pack("<2I", length - size + len(text), len(text))
+    return data[:8] + sizes + data[16:20] + text + data[20 + size :]

@@ -1,0 +1,518 @@
+"""Photographs from a folder, as linear radiance."""
+
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.doors.io.decode import SUFFIXES, decode, read_header, rotated
+from pimper_torch.doors.io.extras import (
+    HEIC_SUFFIXES,
+    RAW_SUFFIXES,
+    extra_of,
+    is_installed,
+    load_extra,
+)
+from pimper_torch.doors.io.header import Header
+from pimper_torch.doors.io.radiance import OPAQUE, read_pictures, resized_mask
+from pimper_torch.doors.io.responses import tell_cautions
+from pimper_torch.ground.radiometry import FROM_FILES, SATURATED, Encoding
+from pimper_torch.records import Views
+from pimper_torch.runtime.errors import InputError, caution, some
+from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.mapped import drop_pages, each, parts, zeros
+
+MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
+_LIT_FRACTION = 1e-3  # more than hot pixels
+# What programs add to the name of a mask.
+_MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
+# What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
+_PICTURES = re.compile(
+    r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
+    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif)",
+    re.IGNORECASE,
+)
+_VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
+
+# Which of several files of one name is read: the extra that they need; least first.
+_RANKS = {"raw": 0, "": 1, "heic": 2}
+_DEVELOPED = (".png", ".tif", ".tiff")
+_MORE = "HEIC and camera raw where their extras are installed"
+
+
+def load_views(
+    folder: Path | str,
+    *,
+    masks: Path | str | None = None,
+    mask_object: Literal["auto", "bright", "dark"] = "auto",
+    encoding: Encoding = FROM_FILES,
+    max_size_px: int = 0,
+) -> Views:
+    """Read the photographs of a folder, in the natural order of their names.
+
+    Of a folder without photographs but with folders of them, three at least, each of these holds
+    the photographs of one pose of the camera, each under another light.
+
+    JPEG, PNG and TIFF of 8 or 16 bits, HEIC and camera raw where their extras are installed; other
+    files are passed over, with a warning where they look like photographs. EXIF's orientation is
+    applied, its focal length kept in pixels. The response is undone, so that radiance is linear:
+    the one given, else the one that each file tells, else sRGB. Colours are turned into the
+    primaries of sRGB. Radiance 1 is saturation, in every colour: the level that is told, or at
+    which values pile up, or full scale. Photographs of unlike sizes are padded.
+
+    Masks are images of the photographs' sizes, at least half as bright on the object as the
+    brightest pixel of all masks; labels and transparency are followed, and inverted masks turned
+    round. Without a folder of masks, alpha channels that are somewhere transparent are the masks,
+    and a warning says so. The manual has tables of what files tell, and of how masks are read.
+
+    Args:
+        masks: Folder with one mask for each photograph, of the same name whatever the
+            suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``), or of
+            one that differs in case, spaces or Unicode form. They lie as their photographs are
+            turned by EXIF, or as the files store them; where sizes do not tell, outlines do.
+        mask_object: How masks show the object; ``auto`` looks at them.
+        encoding: Response, saturation and black level of the files.
+        max_size_px: Shrink photographs whose longer side is longer, in linear light and
+            without aliasing; 0 leaves them as they are. A pixel made of some saturated ones
+            is saturated.
+
+    Returns:
+        On the CPU, float32.
+
+    Raises:
+        InputError: Names the photographs or masks that are missing, damaged, black or
+            saturated all over, do not belong together or do not fit the encoding, and says
+            what to do. A :class:`~pimper_torch.runtime.errors.PimperWarning` names photographs of
+            which hardly anything is left, and tells a level of saturation that was found.
+    """
+    if max_size_px < 0:
+        raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
+    paths = list_images(Path(folder))
+    if len(paths) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
+            f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another viewpoint "
+            "under another light."
+        )
+    _tell_passed_over(Path(folder), paths)
+    headers = [read_header(path) for path in paths]
+    tell_cautions(Path(folder), paths, headers, encoding)
+    names = tuple(image_name(path, folder) for path in paths)
+    mask_paths = _match_masks(names, Path(masks)) if masks is not None else None
+    sizes = [shrunk_size(header, max_size_px) for header in headers]
+    pictures = read_pictures(paths, headers, sizes, encoding)
+    images = pictures.images
+    has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
+    drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
+    opacities, dark = [], False
+    if mask_paths is not None:
+        opacities = _read_masks(mask_paths, paths, headers)
+        dark = mask_object == "dark"
+        if mask_object == "auto":
+            dark = _object_is_dark(opacities, str(masks))
+    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
+        if opacities:
+            opacity = 1 - opacities[index] if dark else opacities[index]
+            drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
+        else:
+            drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
+        drop_pages()
+    _refuse_black(images, sizes, names, Path(folder))
+    if has_masks and not opacities:
+        _tell_alpha(pictures.opaque, names, Path(folder))
+    if has_masks:
+        _refuse_empty(drawn, names, Path(masks) if masks is not None else None)
+    _judge_saturation(images, drawn, names, Path(folder))
+    return Views(
+        images=images,
+        sizes_px=torch.tensor(sizes),
+        names=names,
+        masks=drawn if has_masks else None,
+        focals_px=shrunk_focals(headers, sizes),
+        orientations=torch.tensor([header.orientation for header in headers]),
+        poses=_poses(paths, Path(folder)),
+        folder=Path(os.path.abspath(folder)).as_posix(),  # noqa: PTH100 - follows no links
+    )
+
+
+def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
+    """Number the folders of photographs, each of which holds those of one pose of the camera."""
+    folders = list(dict.fromkeys(path.parent for path in paths))
+    if folders == [folder]:
+        return None
+    caution(
+        f"{folder}: the {len(paths)} photographs in its {len(folders)} folders are taken for "
+        f"{len(folders)} poses of the camera, each under several lights. If the camera moved "
+        "between photographs of one folder, put all photographs in one folder.",
+        stacklevel=3,
+    )
+    return torch.tensor([folders.index(path.parent) for path in paths])
+
+
+def image_name(path: Path | str, folder: Path | str) -> str:
+    """Return the name of an image of a folder, with the folder inside that it lies in."""
+    return Path(path).relative_to(folder).as_posix()
+
+
+def list_images(folder: Path | str) -> list[Path]:
+    """List the image files of a folder in natural order: ``img2`` before ``img10``.
+
+    Of a folder that holds none, those of the folders inside, if three at least hold some: each
+    holds the photographs of one pose of the camera.
+
+    Raises:
+        InputError: No such folder, no images in it, or two of one stem.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        _refuse_video([folder])
+        found = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {found}; needed: a folder of images.")
+    try:
+        entries = _visible(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
+    paths = _readable(entries)
+    if not paths:
+        inside = [path for path in sorted(entries) if path.is_dir() and _holds_images(path)]
+        if len(inside) >= MIN_PHOTOGRAPHS:
+            paths = [image for one in inside for image in _readable(_visible(one))]
+    if not paths:
+        for path in sorted(entries):
+            if path.is_file() and (extra := extra_of(path)):
+                load_extra(extra, path)  # refuses what needs a package that is absent
+        _refuse_video(entries)
+        content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
+        raise InputError(
+            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
+            f"{_MORE}; or those in three folders inside at least, one a pose of the camera."
+        )
+    paths.sort(key=lambda path: _natural(image_name(path, folder)))
+    stems: dict[Path, Path] = {}
+    for path in paths:
+        other = stems.setdefault(path.with_suffix(""), path)
+        if other is not path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} differ only in their suffix; masks "
+                "and results go by the name without it. Rename or remove one."
+            )
+    return paths
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if not path.name.startswith(".")]
+
+
+def _readable(entries: Sequence[Path]) -> list[Path]:
+    """Choose the image files, one of those that a camera writes of one photograph.
+
+    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF beside raw are
+    taken for developed on purpose.
+    """
+    ranks: dict[str, dict[Path, int]] = defaultdict(dict)
+    for path in entries:
+        suffix = path.suffix.lower()
+        if suffix in (*SUFFIXES, *HEIC_SUFFIXES, *RAW_SUFFIXES) and path.is_file():
+            extra = "" if suffix in SUFFIXES else extra_of(path)
+            if not extra or is_installed(extra):
+                ranks[path.stem.casefold()][path] = _RANKS[extra]
+    chosen: list[Path] = []
+    for twins in ranks.values():
+        developed = any(path.suffix.lower() in _DEVELOPED for path in twins)
+        best = max(min(twins.values()), _RANKS[""] if developed else 0)
+        chosen += [path for path, rank in twins.items() if rank == best]
+    return chosen
+
+
+def _refuse_video(entries: Sequence[Path]) -> None:
+    """State what makes photographs of the first video."""
+    for path in sorted(entries):
+        if path.is_file() and _VIDEO.fullmatch(path.suffix):
+            raise InputError(
+                f"{path}: is a video; needed: a folder of images. `pimper frames {path} -o "
+                "photos/` chooses photographs out of it."
+            )
+
+
+def _tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
+    """Warn of what looks like photographs and is not read, kind by kind with its count."""
+    names = {path.relative_to(folder).parts[0] for path in read}
+    raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
+    kinds: Counter[str] = Counter()
+    examples: list[str] = []
+    twins: list[str] = []
+    lacking: set[str] = set()
+    for path in sorted(folder.iterdir()):
+        suffix = path.suffix.lower()
+        if path.name.startswith(".") or path.name in names:
+            continue
+        if path.is_symlink() and not path.exists():
+            kind = "broken link"
+        elif path.is_dir():
+            kind = "folder of images" if _holds_images(path) else ""
+        elif path.stem.casefold() in raw and suffix in (*SUFFIXES, *HEIC_SUFFIXES):
+            twins.append(path.name)
+            continue
+        else:
+            known = _PICTURES.fullmatch(suffix) or _VIDEO.fullmatch(suffix)
+            kind = suffix[1:].upper() if known else ""
+            extra = extra_of(path) if known else ""
+            if extra and not is_installed(extra):
+                lacking.add(extra)
+        if kind:
+            kinds[kind] += 1
+            examples.append(path.name)
+    if twins:
+        caution(
+            f"{folder}: {some(twins)} were not read, as camera raw of the same names was. Move the "
+            "raw away to read them.",
+            stacklevel=3,
+        )
+    if kinds:
+        counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
+        hint = "".join(
+            f' `pip install "pimper_torch[{extra}]"` reads {extra}.' for extra in sorted(lacking)
+        )
+        caution(
+            f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
+            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside.{hint} Convert or move "
+            "what belongs to the photographs.",
+            stacklevel=3,
+        )
+
+
+def _holds_images(folder: Path) -> bool:
+    try:
+        suffixes = {path.suffix.lower() for path in folder.iterdir()}
+    except OSError:
+        return False
+    return any(suffix in SUFFIXES or _PICTURES.fullmatch(suffix) for suffix in suffixes)
+
+
+def _tell_alpha(
+    opaque: Sequence[Bool[Tensor, "height width"] | None], names: tuple[str, ...], folder: Path
+) -> None:
+    """State that transparency is taken for masks."""
+    drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
+    caution(
+        f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
+        f"({some(drawn)}), which are taken for masks: opaque is the object. If that is wrong, save "
+        "them without transparency, or give masks by `--masks`.",
+        stacklevel=3,
+    )
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort digits as numbers; the name itself settles ``1`` against ``01``."""
+    pieces = re.split(r"([0-9]+)", name)
+    key = [(int(piece), "") if piece.isdigit() else (0, piece.lower()) for piece in pieces]
+    return [*key, (0, name)]
+
+
+def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
+    """Return width and height after shrinking to a longest side; 0 shrinks nothing."""
+    longer = max(header.width, header.height)
+    if not 0 < max_size_px < longer:
+        return header.width, header.height
+    factor = max_size_px / longer
+    return max(1, round(header.width * factor)), max(1, round(header.height * factor))
+
+
+def shrunk_focals(
+    headers: Sequence[Header], sizes: Sequence[tuple[int, int]]
+) -> Float[Tensor, " view"]:
+    """Compute focal lengths in pixels of photographs shrunk to these sizes; NaN where unknown."""
+    scales = [
+        max(size) / max(header.width, header.height)
+        for header, size in zip(headers, sizes, strict=True)
+    ]
+    focals = torch.tensor([header.focal_px for header in headers], dtype=torch.float32)
+    return focals * torch.tensor(scales)
+
+
+def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
+    """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``.
+
+    Those not found so are looked for as another program may have written the name.
+    """
+    by_stem = {image_name(path.with_suffix(""), folder): path for path in list_images(folder)}
+    found = [_mask_of(name, by_stem) for name in names]
+    lost = [name for name, mask in zip(names, found, strict=True) if mask is None]
+    if lost:
+        free = {_MASK.sub(r"\1", mask.name): mask for mask in by_stem.values() if mask not in found}
+        others = match_files(lost, list(free), where=str(folder), what="mask")
+        places = dict(zip(lost, others, strict=True))
+        found = [
+            mask if mask or (at := places[name]) is None else list(free.values())[at]
+            for name, mask in zip(names, found, strict=True)
+        ]
+    missing = [name for name, mask in zip(names, found, strict=True) if mask is None]
+    if missing:
+        raise InputError(
+            f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
+            f"name (such as {missing[0].rpartition('.')[0]}.png). There are "
+            f"{some([path.name for path in by_stem.values()])}."
+        )
+    return [mask for mask in found if mask is not None]
+
+
+def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
+    """Find a photograph's mask by exact names; one may be for all photographs of a pose."""
+    stem, folder = name.rpartition(".")[0], name.rpartition("/")[0]
+    names = (stem, name, f"{stem}_mask", folder)
+    return next((by_stem[one] for one in names if one in by_stem), None)
+
+
+def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
+    """Read a mask by the rule of :func:`load_views`; shrunk as photographs are."""
+    path = Path(path)
+    drawn = _on_object([_brightness(path)])[0]
+    if max_size_px == 0:
+        return drawn > 0
+    return resized_mask(drawn, *shrunk_size(read_header(path), max_size_px))
+
+
+def _read_masks(
+    paths: Sequence[Path], photographs: Sequence[Path], headers: Sequence[Header]
+) -> list[Float[Tensor, "_ _"]]:
+    """Read 1 on the object, 0 off it."""
+    masks = [read_header(path) for path in paths]
+    levels = parts([(mask.height, mask.width) for mask in masks])
+    for (level,), path, mask, header in zip(each(levels), paths, masks, headers, strict=True):
+        # One of another size is refused without decoding it.
+        if sorted((mask.width, mask.height)) == sorted((header.width, header.height)):
+            level.copy_(_brightness(path))
+    drawn = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
+    return [_laid(*one) for one in drawn]
+
+
+def _laid(
+    drawn: Float[Tensor, "_ _"], path: Path, mask: Header, photograph: Path, header: Header
+) -> Float[Tensor, "_ _"]:
+    """Return a mask as it is, or where only that fits turned by its photograph's EXIF.
+
+    Args:
+        drawn: As the mask's file has it, turned by an EXIF of its own.
+    """
+    ways = [drawn]
+    if header.orientation != 1 and mask.orientation == 1:
+        ways.append(torch.from_numpy(rotated(drawn.numpy(), header.orientation)))
+    fitting = [way for way in ways if way.shape == (header.height, header.width)]
+    if fitting:
+        return fitting[0]
+    raise InputError(
+        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} is "
+        f"{header.width} x {header.height}; needed: a mask of the same size."
+    )
+
+
+def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: str) -> bool:
+    """Return whether masks show the object dark, by all of them together; a warning says so."""
+    border, centre = [], []
+    for (opacity,) in each(opacities):
+        high, wide = opacity.shape
+        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
+        border.append(opacity[:, -1].mean())
+        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
+        centre.append(inner.mean())
+    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    # An object that fills its photographs is bright in the centre, too.
+    dark = fractions[1] < 0.75 < fractions[0]
+    if dark:
+        caution(
+            f"{where}: the masks are bright along {fractions[0]:.0%} of the border and "
+            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
+            "`--mask-object bright` says that it is not.",
+            stacklevel=4,
+        )
+    return dark
+
+
+def _brightness(path: Path) -> Float[Tensor, "height width"]:
+    """Read how bright a mask is; 1 on the object where labels or transparency tell it."""
+    decoded = decode(path)
+    brightest = decoded.samples.amax(dim=0)
+    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < 32
+    coloured = (brightest > 0).float()
+    if decoded.alpha is None or bool((decoded.alpha >= OPAQUE).all()):
+        return coloured if labelled else brightest
+    opaque = (decoded.alpha >= OPAQUE).float()
+    drawn = opaque * coloured
+    return drawn if bool(drawn.any()) else opaque
+
+
+def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor, "_ _"]]:
+    """Write 1 where a mask is at least half as bright as the brightest of all, 0 elsewhere."""
+    half = max(float(level.max()) for (level,) in each(levels)) / 2
+    for (level,) in each(levels):
+        level.copy_((level >= half) & (level > 0))
+    return levels
+
+
+def _refuse_black(
+    images: Float[Tensor, "view channel height width"],
+    sizes: Sequence[tuple[int, int]],
+    names: tuple[str, ...],
+    folder: Path,
+) -> None:
+    # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
+    lit = [
+        float((image[:, :high, :wide] > 1e-3).float().mean()) > _LIT_FRACTION
+        for (image,), (wide, high) in zip(each(images), sizes, strict=True)
+    ]
+    black = [name for name, one in zip(names, lit, strict=True) if not one]
+    if black:
+        raise InputError(
+            f"{folder}: {some(black)} {'is' if len(black) == 1 else 'are'} black all over. Take "
+            "them out of the folder; at least some of the object has to be lit."
+        )
+
+
+def _judge_saturation(
+    images: Float[Tensor, "view channel height width"],
+    drawn: Bool[Tensor, "view height width"],
+    names: tuple[str, ...],
+    folder: Path,
+) -> None:
+    """Refuse photographs saturated all over, and warn of those with hardly anything else."""
+    usable = [
+        float((image.amax(dim=0)[mask] < SATURATED).float().mean())
+        for image, mask in each(images, drawn)
+    ]
+    blind = [
+        name for name, fraction in zip(names, usable, strict=True) if fraction <= _LIT_FRACTION
+    ]
+    what = "Expose less, or tell the level of saturation by `photographs.saturation`"
+    if blind:
+        raise InputError(
+            f"{folder}: {some(blind)} {'is' if len(blind) == 1 else 'are'} saturated all over. "
+            f"Take them out of the folder. {what}."
+        )
+    scant = [
+        f"{name} ({fraction:.1%} left)"
+        for name, fraction in zip(names, usable, strict=True)
+        if fraction < 0.1
+    ]
+    if scant:
+        caution(
+            f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
+            stacklevel=3,
+        )
+
+
+def _refuse_empty(
+    drawn: Bool[Tensor, "view height width"], names: tuple[str, ...], folder: Path | None
+) -> None:
+    empty = [name for name, (mask,) in zip(names, each(drawn), strict=True) if not bool(mask.any())]
+    if empty:
+        where = f"{folder}: the masks" if folder else "the alpha channels"
+        raise InputError(
+            f"{where} of {some(empty)} mark no pixel as object; needed: bright (opaque) on the "
+            "object, black off it. Draw them again, or leave these photographs out."
+        )

@@ -1,0 +1,348 @@
+"""Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.doors.io.decode import Decoded, decode
+from pimper_torch.doors.io.header import Header
+from pimper_torch.doors.io.responses import response_of
+from pimper_torch.ground.radiometry import (
+    SATURATED,
+    Curve,
+    Encoding,
+    Response,
+    Srgb,
+    find_saturation,
+)
+from pimper_torch.ground.radiometry.primaries import in_srgb_primaries
+from pimper_torch.ground.radiometry.saturation import PIXELS
+from pimper_torch.records import Record
+from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.mapped import drop_pages, zeros
+from pimper_torch.runtime.progress import track
+
+OPAQUE = 0.5
+# What sensors digitize to; 16 bits hold all of it.
+_SENSOR_BITS = (10, 12, 14)
+# Choices: photographs share one raster, and one that makes it so many times as large as all are
+# together is no photograph of theirs, from 400 MB of raster on.
+_MAX_PADDING, _MUCH_PADDING = 8, 10**8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pictures(Record):
+    """Photographs on one raster, padded right and below.
+
+    Attributes:
+        images: Linear radiance, 1 where saturated.
+        opaque: Where each photograph's alpha channel shows the object, false in the padding;
+            ``None`` where it has none, or none that is transparent anywhere.
+    """
+
+    images: Float[Tensor, "view channel height width"]
+    opaque: tuple[Bool[Tensor, "height width"] | None, ...]
+
+
+class _Kind(NamedTuple):
+    """Files of one kind: their level of full scale, whether they tell it, and their response."""
+
+    full: int
+    full_told: bool
+    response: Response
+
+
+# Levels of saturation of files of a kind, fractions of full scale, one a colour.
+_Whites = Mapping[_Kind, Float[Tensor, " channel"]]
+
+
+def read_pictures(
+    paths: Sequence[Path | str],
+    headers: Sequence[Header],
+    sizes_px: Sequence[tuple[int, int]],
+    encoding: Encoding,
+) -> Pictures:
+    """Read image files as linear radiance that is 1 where the sensor saturates.
+
+    Black is taken away, values above saturation are cut off. Files whose saturation is to be
+    found are read once more if it lies below full scale, which a
+    :class:`~pimper_torch.runtime.errors.PimperWarning` reports. Colours of other primaries than
+    sRGB's, as a file says, are turned into those of sRGB.
+
+    Args:
+        sizes_px: Width and height of each, at most those of its header.
+
+    Raises:
+        InputError: Names a file that cannot be read, that the encoding does not fit, or that is
+            much larger than all others.
+    """
+    response = None if encoding.response == "auto" else response_of(encoding)
+    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
+    channels = max(header.channels for header in headers)
+    files = [Path(path) for path in paths]
+    _refuse_padding(files, sizes_px, channels)
+    images = zeros((len(files), channels, height, width))
+    given = None if encoding.saturation == "auto" else encoding
+    opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
+    whites = _found(tallies)
+    _tell_low(files[0].parent, tallies, whites)
+    if whites:
+        _tell(files[0].parent, whites)
+        opaque, _ = _fill(images, files, sizes_px, response, encoding, whites, tally=False)
+    return Pictures(images=images, opaque=opaque)
+
+
+def _refuse_padding(
+    files: Sequence[Path], sizes_px: Sequence[tuple[int, int]], channels: int
+) -> None:
+    """Refuse, before memory is taken, a picture that all others would be padded to."""
+    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
+    areas = [wide * high for wide, high in sizes_px]
+    raster = len(files) * width * height
+    if raster * channels < _MUCH_PADDING or raster < _MAX_PADDING * sum(areas):
+        return
+    largest = areas.index(max(areas))
+    (wide, high), usual = sizes_px[largest], sizes_px[areas.index(sorted(areas)[len(areas) // 2])]
+    raise InputError(
+        f"{files[largest]}: has {wide} x {high} pixels, others have {usual[0]} x {usual[1]}; "
+        "needed: photographs of similar sizes, as memory is taken for the largest. Take it out of "
+        "the folder, or give all one longest side by `--max-size-px`."
+    )
+
+
+def radiance_of(
+    decoded: Decoded, response: Response, black: Float[Tensor, ""], white: Float[Tensor, " channel"]
+) -> Float[Tensor, "channel height width"]:
+    """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
+
+    Args:
+        black: Fraction of full scale.
+        white: Fractions of full scale, one a colour.
+    """
+    levels = white[:, None, None]
+    dark = response.linear_from_encoded(black.expand_as(levels))
+    span = response.linear_from_encoded(levels) - dark
+    return ((response.linear_from_encoded(decoded.samples) - dark) / span).clamp(0, 1)
+
+
+def resized(
+    planes: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
+    if tuple(planes.shape[-2:]) == (height, width):
+        return planes
+    return interpolate(
+        planes[None], size=(height, width), mode="bilinear", antialias=True, align_corners=False
+    )[0]
+
+
+def resized_radiance(
+    radiance: Float[Tensor, "channel height width"], width: int, height: int
+) -> Float[Tensor, "channel {height} {width}"]:
+    """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
+
+    The radiance of saturated pixels is unknown, and so is their mean with others.
+    """
+    if tuple(radiance.shape[-2:]) == (height, width):
+        return radiance
+    # Less is rounding of the filter's weights.
+    touched = resized((radiance >= SATURATED).to(radiance), width, height) > 1e-3
+    return torch.where(touched, 1.0, resized(radiance, width, height))
+
+
+def resized_mask(
+    opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
+) -> Bool[Tensor, "{height} {width}"]:
+    """Shrink opacity and call what is at least half opaque the object; ``None`` is all of it."""
+    if opacity is None:
+        return torch.ones(height, width, dtype=torch.bool)
+    return resized(opacity[None], width, height)[0] >= OPAQUE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Tally(Record):
+    """Histogram of levels over all files of equal bits, and each level's number of files."""
+
+    counts: Int[Tensor, "channel level"]
+    photographs: Int[Tensor, "channel level"]
+
+
+def _fill(
+    images: Float[Tensor, "view channel height width"],
+    paths: Sequence[Path],
+    sizes_px: Sequence[tuple[int, int]],
+    given: Response | None,
+    encoding: Encoding,
+    whites: _Whites,
+    *,
+    tally: bool,
+) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[_Kind, _Tally]]:
+    """Write the radiance of each file into the images; count its levels if that is asked for.
+
+    Args:
+        given: Response of all; ``None`` for that of each file.
+        whites: Levels of saturation that were found.
+    """
+    opaque: list[Tensor | None] = []
+    drawn: Tensor | None = None
+    tallies: dict[_Kind, _Tally] = {}
+    for index in track(range(len(paths))):
+        decoded, (wide, high) = decode(paths[index]), sizes_px[index]
+        response = file_response(decoded) if given is None else given
+        kind = _Kind(decoded.full, decoded.full_told, response)
+        black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
+        _require_fit(response, decoded, paths[index])
+        radiance = radiance_of(decoded, _on_full_scale(response, decoded), black, white)
+        if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
+            radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
+        images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
+        opaque.append(None)
+        if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
+            if drawn is None:
+                drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
+            drawn[index, :high, :wide] = resized_mask(decoded.alpha, wide, high)
+            opaque[-1] = drawn[index]
+        if tally:
+            tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
+        drop_pages()
+    return tuple(opaque), tallies
+
+
+def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
+    full = decoded.full
+    levels = (full * decoded.samples).round().to(torch.int32)
+    counts = torch.stack([torch.bincount(one.flatten(), minlength=full + 1) for one in levels])
+    counts = counts.expand(channels, -1)
+    often = (counts >= PIXELS).long()
+    if former is None:
+        return _Tally(counts=counts, photographs=often)
+    return _Tally(counts=former.counts + counts, photographs=former.photographs + often)
+
+
+def file_response(decoded: Decoded) -> Response:
+    """Return the response that a file says it has, sRGB where it does not say."""
+    said = decoded.colour.response
+    if said is None or (isinstance(said, Curve) and len(said.radiance) > len(decoded.samples)):
+        return Srgb()
+    return said
+
+
+def _on_full_scale(response: Response, decoded: Decoded) -> Response:
+    """Let a curve that was measured over 16 bits begin and end with those that a file uses."""
+    most = 2**decoded.bits - 1
+    if not isinstance(response, Curve) or response.bits is None or decoded.full == most:
+        return response
+    return replace(response, encoded=response.encoded * most / decoded.full)
+
+
+def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
+    """Return the saturation of files of each kind, where it is below full scale.
+
+    A colour that shows none saturates where the highest of the others does.
+    """
+    whites = {}
+    for kind, tally in tallies.items():
+        found = [
+            find_saturation(counts, photographs)
+            for counts, photographs in zip(tally.counts, tally.photographs, strict=True)
+        ]
+        levels = [level for level in found if level is not None]
+        if not levels:
+            continue
+        filled = [max(levels) if level is None else level for level in found]
+        white = torch.tensor(filled) / kind.full
+        beyond = kind.response.linear_from_encoded(white[:, None, None]).min()
+        end = kind.response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
+        if beyond < SATURATED * end:
+            whites[kind] = white
+    return whites
+
+
+def _tell(folder: Path, whites: _Whites) -> None:
+    for kind, white in whites.items():
+        full = kind.full
+        levels = [str(round(full * float(one))) for one in white]
+        same = len(set(levels)) == 1
+        text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
+        caution(
+            f"{folder}: values of its files of {full.bit_length()} bits pile up at {text} of "
+            f"{full}, which is taken for the level of saturation. If it is not, set "
+            "`photographs.saturation` to the true level, or to 1 for full scale.",
+            stacklevel=4,
+        )
+
+
+def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) -> None:
+    """Warn of files of 16 bits that may hold 10, 12 or 14, as cameras' sensors do."""
+    deep = {
+        kind: tally
+        for kind, tally in tallies.items()
+        if kind.full == 2**16 - 1 and not kind.full_told
+    }
+    if not deep or any(kind in whites for kind in deep):
+        return
+    highest = max(int(tally.counts.sum(dim=0).nonzero().max()) for tally in deep.values())
+    bits = next((bits for bits in _SENSOR_BITS if highest < 2**bits), None)
+    if bits is not None:
+        caution(
+            f"{folder}: no value of its files of 16 bits is above {highest} of 65535. If they hold "
+            f"{bits} bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; "
+            "saturated pixels are taken for radiance otherwise.",
+            stacklevel=4,
+        )
+
+
+def _levels(
+    encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
+) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
+    """Return black and white of a file as fractions of its full scale."""
+    full, channels = decoded.full, decoded.samples.shape[0]
+    saturation, black = encoding.saturation, encoding.black
+    if saturation == "auto":
+        white = (torch.ones(channels) if found is None else found)[:channels]
+        given: tuple[float | int, ...] = ()
+    else:
+        given = saturation if isinstance(saturation, tuple) else (saturation,) * channels
+        white = torch.tensor([one if one <= 1 else one / full for one in given])
+    highest = max((black, *given))
+    if highest > full:
+        raise InputError(
+            f"{path}: holds {full.bit_length()} bits, levels 0 to {full}, but a level of "
+            f"{highest:g} is given for saturation or black; needed: a level that the files have, "
+            "or a fraction of full scale up to 1."
+        )
+    if len(white) != channels:
+        raise InputError(
+            f"{path}: is gray, but saturation has levels for red, green and blue; needed: one."
+        )
+    dark = torch.tensor(black if black <= 1 else black / full)
+    if bool((white <= dark).any()):
+        raise InputError(
+            f"{path}: black is {float(dark):.4g} of full scale and saturation "
+            f"{float(white.min()):.4g}; needed: saturation above black."
+        )
+    return dark, white
+
+
+def _require_fit(response: Response, decoded: Decoded, path: Path) -> None:
+    """Refuse a curve that was measured on files of another kind."""
+    if not isinstance(response, Curve):
+        return
+    if response.bits not in (None, decoded.bits):
+        last = float(response.encoded[-1]) * (2**response.bits - 1)
+        raise InputError(
+            f"{path}: holds {decoded.bits} bits, levels 0 to {2**decoded.bits - 1}, but the "
+            f"response curve ends at level {last:g}, for files of {response.bits} bits; needed: a "
+            "curve over the levels of these files, or over fractions of full scale from 0 to 1."
+        )
+    if len(response.radiance) not in (1, decoded.samples.shape[0]):
+        raise InputError(
+            f"{path}: is gray, but the response curve is one for red, green and blue; needed: one "
+            "for all."
+        )

@@ -1,0 +1,154 @@
+"""Responses of photographs: measured curves from small files, and contradictions of files."""
+
+import csv
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pimper_torch.doors.io.header import Header
+from pimper_torch.ground.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
+from pimper_torch.ground.radiometry.colour import disagree, told
+from pimper_torch.ground.radiometry.response import curve_from_table
+from pimper_torch.runtime.errors import InputError, caution, some
+from pimper_torch.runtime.numpy_files import read_npy
+
+_LAYOUT = (
+    "a column of radiance, or red, green and blue, for the levels 0, 1, 2 and on; or two or four "
+    "columns, of which the first is the level"
+)
+
+
+def response_of(encoding: Encoding) -> Response:
+    """Return the response that was chosen, reading its file if it is a measured one.
+
+    ``auto``, where no file says another, is sRGB.
+    """
+    choice = encoding.response
+    if choice in ("auto", "srgb"):
+        return Srgb()
+    if choice == "linear":
+        return Linear()
+    if isinstance(choice, int | float):
+        return Gamma(exponent=float(choice))
+    return read_curve(Path(choice))
+
+
+def read_curve(path: Path | str) -> Curve:
+    """Read a measured inverse response: the radiance that belongs to each level.
+
+    The table has one column, the radiance of the levels 0, 1, 2 and on; three, of red, green
+    and blue; or two or four, of which the first is the level. Levels go from 0 to 1 (shares
+    of full scale), to 255 (files of 8 bits), or to more (of 16). Radiance is in any unit.
+
+    ``.csv`` has rows of numbers, a first row of names is passed over; ``.npy`` rows, such as
+    OpenCV's ``CalibrateDebevec`` gives with its colours turned round.
+
+    Raises:
+        InputError: No such file, one of another kind, no table of numbers, or no curve:
+            see :func:`~pimper_torch.ground.radiometry.response.curve_from_table`.
+    """
+    path = Path(path)
+    readers: Mapping[str, Callable[[Path], np.ndarray]] = {".csv": _read_csv, ".npy": _read_npy}
+    reader = readers.get(path.suffix.lower())
+    if reader is None or not path.is_file():
+        found = "no such file" if reader else f"a {path.suffix} file" if path.suffix else "no file"
+        raise InputError(
+            f"{path}: is no response of photographs ({found}); needed: srgb, linear, the exponent "
+            f"of a gamma curve, or a file ending in {', '.join(readers)}."
+        )
+    if path.stat().st_size > 20_000_000:  # 65536 levels in three colours take 5 MB as text
+        raise InputError(f"{path}: has {path.stat().st_size} bytes; needed: a small table.")
+    try:
+        table = reader(path)
+    except (OSError, ValueError, TypeError, OverflowError, csv.Error) as error:
+        raise InputError(
+            f"{path}: holds no table of a response curve ({str(error)[:200]}); needed: {_LAYOUT}."
+        ) from error
+    if table.ndim != 2 or not 1 <= table.shape[1] <= 4:
+        raise InputError(
+            f"{path}: holds a table of {' x '.join(str(side) for side in table.shape)}; needed: "
+            f"{_LAYOUT}."
+        )
+    columns = torch.from_numpy(np.ascontiguousarray(table.T))
+    if len(columns) in (1, 3):
+        columns = torch.cat([torch.arange(columns.shape[1])[None].double(), columns])
+    try:
+        return curve_from_table(columns[0], columns[1:])
+    except InputError as error:
+        raise InputError(f"{path}: is no response curve: {error}") from error
+
+
+def _read_csv(path: Path) -> np.ndarray:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        text = file.read()
+    comma = ";" if ";" in text else ","
+    rows = [row for row in csv.reader(text.splitlines(), delimiter=comma) if any(row)]
+    if rows and not any(_is_number(cell) for cell in rows[0]):
+        rows = rows[1:]
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("its rows are of unlike lengths, or there are none")
+    return np.array([[float(cell) for cell in row] for row in rows])
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    table = read_npy(path)
+    if table.dtype.kind not in "iuf":
+        raise ValueError("it is no array of numbers")
+    if table.ndim == 3 and table.shape[1] == 1:  # as OpenCV has it
+        table = table[:, 0]
+    return (table[:, None] if table.ndim == 1 else table).astype(np.float64)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+# Of the warning that a given response contradicts what files say.
+CONTRADICTED = "is given, but"
+
+
+def tell_cautions(
+    folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
+) -> None:
+    """Warn of what photographs say and is not followed.
+
+    Args:
+        encoding: As given. A measured curve is not compared with what files say.
+    """
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for path, header in zip(paths, headers, strict=True):
+        for sentence in (*header.cautions, *_of_colour(header, encoding)):
+            kinds[sentence].append(Path(path).name)
+    for sentence, names in kinds.items():
+        caution(
+            f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
+            stacklevel=3,
+        )
+
+
+def _of_colour(header: Header, encoding: Encoding) -> list[str]:
+    said, choice = header.colour, encoding.response
+    if isinstance(choice, Path):
+        return []
+    if choice == "auto":
+        if not said.trouble:
+            return []
+        taken = "srgb" if said.response is None else told(said.response)
+        return [
+            f"{said.source} {said.trouble}, and cannot be followed; taken is the response {taken}. "
+            "Give the true one by `photographs.response`, or save them as sRGB"
+        ]
+    given = response_of(encoding)
+    if said.response is None or not disagree(given, said.response):
+        return []
+    return [
+        f"the response {told(given)} is given, but {said.source} says {told(said.response)}; what "
+        "is given is taken. Leave out `photographs.response` to follow the files"
+    ]

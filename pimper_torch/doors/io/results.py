@@ -1,0 +1,215 @@
+"""Results to a folder."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from pimper_torch.doors.io.estimates import mask_path
+from pimper_torch.doors.io.meshes import write_glb, write_obj, write_ply, write_stl
+from pimper_torch.doors.io.reports import (
+    lights_report,
+    relighting_report,
+    summary_report,
+    write_json,
+)
+from pimper_torch.doors.outputs.folders import written_whole
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.method.sfm.sparse_scene import write_model
+from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
+from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.asset.write import write_asset, write_asset_obj
+from pimper_torch.result.report.page import asset_within, write_page
+from pimper_torch.result.report.predictions import predictions
+from pimper_torch.result.report.vertex_layers import surface_layers
+from pimper_torch.result.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
+from pimper_torch.result.viz.overview import draw_overview, headline
+from pimper_torch.result.viz.turn import draw_turn
+from pimper_torch.runtime.config import to_yaml
+from pimper_torch.runtime.mapped import each
+from pimper_torch.runtime.progress import part
+from pimper_torch.runtime.reporting import reported
+
+RESULT_NAMES = (
+    "mesh.ply",
+    "mesh.glb",
+    "mesh.stl",
+    "mesh.obj",
+    "asset.glb",
+    "asset.obj",
+    "asset.mtl",
+    "asset_albedo.png",
+    "asset_normal.png",
+    "sparse",
+    "masks",
+    "normals.png",
+    "albedo.png",
+    "depth.npz",
+    "lights.json",
+    "config.yaml",
+    "summary.json",
+    "overview.png",
+    "turn.webp",
+    "report.html",
+)
+"""Files of a result, and nothing else; a table in the manual tells what each holds."""
+_PARTS = 6  # of the bar: meshes, asset, maps, sheet, turning picture, page
+
+
+def write_result(
+    result: Reconstruction,
+    config: object,
+    folder: Path | str,
+    *,
+    overwrite: bool = False,
+    about: Mapping[str, object] | None = None,
+    files: MeshFiles | None = None,
+    report: bool = True,
+) -> None:
+    """Write everything a run found into a folder: the files of :data:`RESULT_NAMES`.
+
+    Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
+    the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
+    their origin. The PLY then has doubles, and the GLB the offset as its node's translation.
+
+    The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
+    spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
+    within :func:`~pimper_torch.result.asset.finish.written_channels` of what is blended there
+    (``summary.json`` tells how far off they are). ``files`` asks for every vertex, or for fewer.
+    The pictures show what is written, but for the caps of a mesh that shall be watertight: those
+    are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
+
+    It is there whole or not at all; see :func:`pimper_torch.doors.outputs.folders.written_whole`.
+
+    Args:
+        config: The dataclass of settings that it ran with.
+        folder: New or empty; its parents are made.
+        files: How many faces the mesh has, and in which formats; of a result that is not finished
+            yet, see :meth:`~pimper_torch.method.chains.chain.Chain.finish`.
+
+    Raises:
+        OutputError: The folder holds something else, or cannot be written.
+    """
+    folder, began = Path(folder), time.perf_counter()
+    files = files or MeshFiles()
+    if result.finished is None:
+        result = CoarseToFine().finish(result, files)
+    with written_whole(folder, "result", overwrite=overwrite) as staging:
+        ready, asset, relighting = result.finished, result.asset, result.relighting
+        assert ready is not None
+        assert asset is not None
+        assert relighting is not None
+        found, whole = result, result.replace(mesh=ready.mesh)
+        offset = whole.scene.offset_world
+        with part(0, _PARTS):
+            _write_meshes(ready, files, offset, staging)
+        with part(1, _PARTS):
+            write_asset(asset, staging / "asset.glb", offset)
+            if "obj" in files.formats:
+                write_asset_obj(asset, staging / "asset.obj", offset)
+        _write_all(whole, config, staging)
+        writing = reported("write", time.perf_counter() - began)
+        found = found.replace(report=(*found.report, writing))
+        summary = {
+            **summary_report(found, about or {}),
+            **({ready.how: ready.counts} if ready.how else {}),
+            **({"caps": ready.caps} if ready.caps else {}),
+            "asset": asset.summary,
+            "relighting": relighting_report(relighting),
+        }
+        write_json(summary, staging / "summary.json")
+        with part(5, _PARTS):
+            if report:
+                write_page(
+                    staging / "report.html",
+                    title=folder.absolute().name,
+                    headline=headline(whole),
+                    asset=asset_within(asset, staging / "asset.glb"),
+                    scene=whole.scene,
+                    silhouettes=whole.silhouettes,
+                    reference=whole.coarse.reference,
+                    predictions=predictions(ready.few, whole.scene, relighting),
+                    layers=surface_layers(asset.mesh),
+                    summary=summary,
+                    settings=(staging / "config.yaml").read_text(encoding="utf-8"),
+                )
+
+
+def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
+    mesh, measured = ready.mesh, None
+    if ready.closed is not None:
+        mesh, measured = ready.closed.mesh, ready.closed.measured
+    write_ply(mesh, folder / "mesh.ply", offset, measured)
+    write_glb(mesh, folder / "mesh.glb", offset, measured)
+    if "stl" in files.formats:
+        write_stl(mesh, folder / "mesh.stl", offset)
+    if "obj" in files.formats:
+        write_obj(mesh, folder / "mesh.obj", offset, measured)
+
+
+def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
+    write_model(result.scene, folder / "sparse")
+    if result.silhouettes.source != "everything":
+        _write_masks(result.silhouettes, result.scene, folder / "masks")
+    with part(2, _PARTS):
+        _write_maps(result, folder)
+    write_json(lights_report(result), folder / "lights.json", indent=None)
+    (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
+    with part(3, _PARTS):
+        draw_overview(result, folder / "overview.png")
+    with part(4, _PARTS):
+        draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
+
+
+def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:
+    folder.mkdir()
+    names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
+    for name, (shown,), (width, height) in zip(names, each(silhouettes.shown), sizes, strict=True):
+        drawn = shown[:height, :width].to(torch.uint8) * 255
+        path = mask_path(folder, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(drawn.numpy()).save(path)
+
+
+def _write_maps(result: Reconstruction, folder: Path) -> None:
+    reference, cameras = result.coarse.reference, result.cameras
+    maps = view_maps(result.mesh, cameras, reference)
+    _write_png((255 * normal_colors(maps.normals_cam)).round(), folder / "normals.png")
+    albedo = (maps.albedo * albedo_scale(result.mesh)).nan_to_num(0).clamp(0, 1)
+    _write_png(to_bytes(albedo), folder / "albedo.png")
+    _write_depth(result, maps, folder / "depth.npz")
+
+
+def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
+    reference, cameras = result.coarse.reference, result.cameras
+    error = maps.expected_error
+    pose, offset = cameras.cam_from_world[reference], result.scene.offset_world
+    far = offset != NO_OFFSET
+    np.savez_compressed(
+        path,
+        depth=_array(maps.depth),
+        mask=maps.seen.numpy(),
+        confidence=_array(maps.confidence),
+        **({} if error is None else {"expected_error": _array(error)}),
+        intrinsics=_array(cameras.intrinsics[reference]),
+        cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else _array(pose),
+        name=np.array(result.scene.views.names[reference]),
+        allow_pickle=False,
+    )
+
+
+def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Path) -> None:
+    array = picture.detach().to(torch.uint8).numpy()
+    Image.fromarray(array[..., 0] if array.shape[-1] == 1 else array).save(path)
+
+
+def _array(values: Float[Tensor, "*batch"]) -> np.ndarray:
+    array: np.ndarray = values.detach().float().numpy()
+    return array

@@ -1,0 +1,160 @@
+"""Detection and drawing of ArUco markers by OpenCV. Imports ``cv2``."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixels_from_indices
+from pimper_torch.records import Record
+
+# Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
+# 10^8. Of DICT_4X4_50, with its 2^16, it would be 3 in 10^3.
+_FAMILY = cv2.aruco.DICT_APRILTAG_36h11
+
+CELLS = 8
+"""Cells along a marker's side, with its black border."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Square(Record):
+    """A marker in a photograph.
+
+    Attributes:
+        code: Its number, of 587.
+        corners: Pixels of the black border's outer corners, clockwise from the marker's top left;
+            to about a pixel as OpenCV gives them.
+    """
+
+    code: int
+    corners: Float[Tensor, "4 2"]
+
+
+def find_squares(picture: UInt8[Tensor, "height width"]) -> list[Square]:
+    """Find AprilTags of the family 36h11 in a picture, none of whose cells is misread.
+
+    A number that stands twice is left out: no one can tell which is which in other pictures.
+
+    Args:
+        picture: Grey, encoded by a curve such as sRGB.
+    """
+    settings = cv2.aruco.DetectorParameters()
+    settings.errorCorrectionRate = 0.0
+    family = cv2.aruco.getPredefinedDictionary(_FAMILY)
+    detector = cv2.aruco.ArucoDetector(family, settings)
+    corners, codes, _ = detector.detectMarkers(np.ascontiguousarray(picture.numpy()))
+    if codes is None:
+        return []
+    numbers = [int(code) for code in np.ravel(codes)]
+    return [
+        Square(
+            code=code,
+            corners=pixels_from_indices(torch.from_numpy(np.array(four, np.float64).reshape(4, 2))),
+        )
+        for code, four in zip(numbers, corners, strict=True)
+        if numbers.count(code) == 1
+    ]
+
+
+def cells_of(code: int) -> Bool[Tensor, "8 8"]:
+    """Return the cells of a marker, true where they are black."""
+    family = cv2.aruco.getPredefinedDictionary(_FAMILY)
+    return torch.from_numpy(cv2.aruco.generateImageMarker(family, code, CELLS) < 128)
+
+
+# Reach of a profile: of a cell, as the border is one cell of black; at least pixels' own blur.
+_REACH, _MIN_REACH_PX = 0.6, 1.5
+
+
+def refined_corners(
+    picture: Float[Tensor, "height width"], corners: Float[Tensor, "square 4 2"]
+) -> Float[Tensor, "square 4 2"]:
+    """Intersect lines through the sides of squares.
+
+    Across each side profiles are read; a step is where their gradient has its centroid, whatever
+    the blur, as long as the picture is linear. OpenCV's own corners are up to half a pixel inside.
+
+    Args:
+        picture: Linear radiance, black squares on white; NaN where unknown. Profiles across such
+            pixels do not count.
+        corners: Pixels, to about two of them; clockwise, as seen.
+
+    Returns:
+        The same corners; NaN where most profiles of a side have no step.
+    """
+    found = corners.double()
+    for _ in range(4):
+        found = _refined_once(picture.double(), found)
+    return found
+
+
+def _refined_once(
+    picture: Float[Tensor, "height width"], corners: Float[Tensor, "square 4 2"]
+) -> Float[Tensor, "square 4 2"]:
+    along = corners.roll(-1, dims=1) - corners
+    length = along.norm(dim=-1, keepdim=True)
+    outward = torch.stack([along[..., 1], -along[..., 0]], dim=-1) / length
+    reach = (_REACH * length.mean(dim=(1, 2)) / CELLS).nan_to_num(0).clamp_min(_MIN_REACH_PX)
+    share = torch.linspace(0.1, 0.9, 24).to(corners)  # near a corner the other side is near
+    count = 2 * int((4 * reach.max()).ceil()) + 1 if len(reach) else 3
+    across = reach[:, None] * torch.linspace(-1, 1, count).to(corners)
+    base = corners[:, :, None] + share[:, None] * along[:, :, None]
+    places = base[:, :, :, None] + across[:, None, None, :, None] * outward[:, :, None, None]
+    steps = _looked_up(picture, places).diff(dim=-1).clamp_min(0)  # keeps NaN
+    middle = ((across[:, 1:] + across[:, :-1]) / 2)[:, None, None]
+    total = steps.sum(dim=-1)
+    off = (steps * middle).sum(dim=-1) / total
+    start, end = _line(share, off)
+    first = corners + start[..., None] * outward
+    second = corners + along + end[..., None] * outward
+    return _crossing(first.roll(1, dims=1), second.roll(1, dims=1), first, second)
+
+
+def _looked_up(
+    picture: Float[Tensor, "height width"], places: Float[Tensor, "*batch 2"]
+) -> Float[Tensor, "*batch"]:
+    height, width = picture.shape
+    grid = grid_from_pixels(places.reshape(1, 1, -1, 2), width, height)
+    found = grid_sample(
+        picture[None, None], grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return found.reshape(places.shape[:-1])
+
+
+def _line(
+    share: Float[Tensor, " along"], off: Float[Tensor, "square 4 along"]
+) -> tuple[Float[Tensor, "square 4"], Float[Tensor, "square 4"]]:
+    """Fit lines to offsets along each side with Cauchy's weights; give them at its ends."""
+    known = off.isfinite()
+    values = off.nan_to_num(0)
+    middle = torch.where(known, off, torch.nan).nanmedian(dim=-1, keepdim=True).values
+    predicted = middle.expand_as(off)
+    for _ in range(3):
+        weight = known / (1 + ((values - predicted) / 0.3).square())
+        total = weight.sum(dim=-1)
+        mean_share = (weight * share).sum(dim=-1) / total
+        mean = (weight * values).sum(dim=-1) / total
+        centred = share - mean_share[..., None]
+        slope = (weight * centred * values).sum(dim=-1) / (weight * centred**2).sum(dim=-1)
+        predicted = mean[..., None] + slope[..., None] * centred
+    mean = torch.where(known.double().mean(dim=-1) > 0.5, mean, torch.nan)
+    return mean - slope * mean_share, mean + slope * (1 - mean_share)
+
+
+def _crossing(
+    a: Float[Tensor, "*batch 2"],
+    b: Float[Tensor, "*batch 2"],
+    c: Float[Tensor, "*batch 2"],
+    d: Float[Tensor, "*batch 2"],
+) -> Float[Tensor, "*batch 2"]:
+    """Return where the line through two points crosses that through two others."""
+    one, other = b - a, d - c
+
+    def cross(first: Tensor, second: Tensor) -> Tensor:
+        return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+    return a + (cross(c - a, other) / cross(one, other))[..., None] * one

@@ -1,0 +1,85 @@
+"""The real size of a result, from whatever tells it."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+
+from pimper_torch.doors.size.given import CameraDistance, ScaleBar, Unit
+from pimper_torch.doors.size.marker_scale import scale_of_markers
+from pimper_torch.doors.size.marks import place_of, view_of
+from pimper_torch.doors.size.scale import Length, Scale, fitted, most_accurate
+from pimper_torch.records import Reconstruction
+from pimper_torch.runtime.errors import caution
+
+
+def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit = "mm") -> Scale:
+    """Find the scale of a result from places that are known distances apart."""
+    lengths = [
+        Length(
+            found=float((place_of(bar.first, result) - place_of(bar.second, result)).norm()),
+            known=bar.length,
+            what=f"{bar.first} to {bar.second}",
+        )
+        for bar in bars
+    ]
+    return fitted(lengths, unit, "scale bars")
+
+
+def scale_of_cameras(
+    result: Reconstruction, distances: Sequence[CameraDistance], unit: Unit = "mm"
+) -> Scale:
+    """Find the scale of a result from cameras that are known distances apart."""
+    centers = result.cameras.detach().to("cpu", torch.float64).centers_world
+    lengths = []
+    for one in distances:
+        first, second = (centers[view_of(name, result.scene)] for name in (one.first, one.second))
+        found = float((first - second).norm())
+        lengths.append(Length(found=found, known=one.length, what=f"{one.first} to {one.second}"))
+    return fitted(lengths, unit, "camera distances")
+
+
+def find_scale(
+    result: Reconstruction,
+    *,
+    bars: Sequence[ScaleBar] = (),
+    camera_distances: Sequence[CameraDistance] = (),
+    markers: Literal["auto", "off"] | float = "auto",
+    unit: Unit = "mm",
+    own_frame: bool = False,
+) -> Scale | None:
+    """Find what a result's lengths have to be multiplied by to be in a known unit.
+
+    :func:`~pimper_torch.doors.size.scaled.scaled` multiplies them.
+
+    The most accurate of what is given counts: scale bars, else markers, else camera distances.
+    Where another one differs by more than 2 %, a warning says so.
+
+    Args:
+        bars: Places that are known distances apart.
+        markers: Whether markers of ``pimper markers`` are looked for, and the length of their
+            sides in millimetres, if it is not what their numbers say.
+        own_frame: The cameras came with the photographs, in a unit of their own, which markers of
+            which nothing was said do not change.
+
+    Returns:
+        ``None`` where nothing tells the size.
+    """
+    scales = []
+    if bars:
+        scales.append(scale_of_bars(result, bars, unit))
+    if camera_distances:
+        scales.append(scale_of_cameras(result, camera_distances, unit))
+    asked = not isinstance(markers, str)
+    if markers != "off" and (asked or scales or not own_frame):
+        side_mm = float(markers) if not isinstance(markers, str) else None
+        found = scale_of_markers(result.scene, side_mm, unit)
+        if found is None and asked:
+            caution(
+                "No marker was found that two photographs show alike. Print a sheet (`pimper "
+                "markers`), lay it flat beside the object, and photograph both sharply, not "
+                "overexposed."
+            )
+        elif found is not None:
+            scales.append(found)
+    return most_accurate(scales)

@@ -1,0 +1,117 @@
+"""A result in another unit of length."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    DepthPatches,
+    DepthPrior,
+    Depths,
+    FacetPoints,
+    Heights,
+    Mesh,
+    PatchPriors,
+    Record,
+    Silhouettes,
+    SparseScene,
+    StageReport,
+    Surface,
+    Templates,
+)
+from pimper_torch.runtime.config import require
+
+AnyRecord = TypeVar("AnyRecord", bound=Record)
+
+POWERS: Mapping[type[Record], Mapping[str, int]] = {
+    Mesh: {"vertices_world": 1, "expected_error": 1},
+    CoarseMesh: {"covariance_world": 2},
+    FacetPoints: {"points_world": 1, "covariance_world": 2},
+    SparseScene: {"points_world": 1},
+    Templates: {"origin": 1, "spacing": 1, "depth": 1},
+    Depths: {"depth": 1},
+    DepthPatches: {"mismatch": 1},
+    Heights: {"offset": 1, "information": -2},
+    PatchPriors: {"offset": 1, "offset_information": -2},
+    DepthPrior: {"depth": 1, "variance": 2},
+    Surface: {"vertices_world": 1, "expected_error": 1, "height_information": -2},
+}
+"""Which power of a length each field is; fields that are not named have no unit, or hold others."""
+
+POSES: Mapping[type[Record], str] = {Cameras: "cam_from_world", Templates: "patch_from_world"}
+"""Rigid transforms, whose shift is a length."""
+
+LAST: Mapping[type[Record], str] = {Depths: "transform", Silhouettes: "planes_world"}
+"""Vectors of which the last entry alone is a length."""
+
+# What stages tell as scene units.
+_FIGURES = ("mismatch", "mismatch_before")
+
+
+def scaled(record: AnyRecord, factor: float) -> AnyRecord:
+    """Return a result, or a part of one, in another unit: every length times a factor.
+
+    Vertices, expected errors, cameras, cloud, templates and their heights, covariances and inverse
+    variances, the plane that the object stands on, and ``offset_world``. Photographs, normals,
+    albedo and lights have no unit and are shared with ``record``; what is one object in it is one
+    in the copy.
+
+    Args:
+        record: Of a run, such as a :class:`~pimper_torch.records.Reconstruction`.
+        factor: Of the new unit's numbers to the old one's.
+
+    Differentiable in the record's tensors.
+
+    >>> import torch
+    >>> from pimper_torch.records import Mesh
+    >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    >>> scaled(Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2]])), 25.4).vertices_world
+    tensor([[ 0.0000,  0.0000,  0.0000],
+            [25.4000,  0.0000,  0.0000],
+            [25.4000, 25.4000,  0.0000]])
+    """
+    require(0 < factor < float("inf"), "factor", factor, "above 0 and finite")
+    copies: dict[int, Any] = {}
+    found: AnyRecord = record if factor == 1 else _copy(record, factor, copies)
+    return found
+
+
+def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: ANN401 - of any field
+    """Scale whatever stands in a field; each object once."""
+    if isinstance(value, tuple) and any(isinstance(item, Record) for item in value):
+        return tuple(_copy(item, factor, copies) for item in value)
+    if not isinstance(value, Record):
+        return value
+    if id(value) not in copies:
+        copies[id(value)] = _scaled_record(value, factor, copies)
+    return copies[id(value)]
+
+
+def _scaled_record(record: Record, factor: float, copies: dict[int, Any]) -> Record:
+    kind, changes = type(record), dict[str, object]()
+    for field in fields(record):
+        value = getattr(record, field.name)
+        new = _copy(value, factor, copies)
+        if isinstance(value, Tensor):
+            if power := POWERS.get(kind, {}).get(field.name):
+                new = value * factor**power
+            elif POSES.get(kind) == field.name:
+                new = rigid(value[..., :3, :3], factor * value[..., :3, 3])
+            elif LAST.get(kind) == field.name:
+                new = value * value.new_tensor([1.0, 1.0, 1.0, factor])
+        if new is not value:
+            changes[field.name] = new
+    if isinstance(record, SparseScene):
+        changes["offset_world"] = tuple(factor * one for one in record.offset_world)
+    if isinstance(record, StageReport) and set(_FIGURES) & record.figures.keys():
+        figures = record.figures
+        changes["figures"] = {
+            name: factor * figure if name in _FIGURES else figure
+            for name, figure in figures.items()
+        }
+    return record.replace(**changes) if changes else record

@@ -1,0 +1,1 @@
+"""Geometry, linear algebra, radiometry and compiled kernels: nothing of the method."""

@@ -1,0 +1,388 @@
+"""Constraints of the silhouettes on the surface.
+
+Pixels of the silhouettes become rays that the surface is tangent to, with its normal there. Where a
+ray touches the surface follows from the surface, as far as it is known.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.pixels import pixels_from_indices
+from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.geometry.visual_hull import Everywhere, Hull
+from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.failures import solved_or
+from pimper_torch.runtime.parallel import num_workers, side_by_side
+
+Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+
+# Variance of a place that is known to a pixel: that of the uniform distribution over it.
+_PIXEL = 1 / 12
+
+# Variance that reading a slope between pixels adds: a difference over one pixel (1/12) of
+# values interpolated linearly (1/6).
+_READING = 1 / 12 + 1 / 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayConfig:
+    """Which points of the silhouettes become rays.
+
+    Lengths are in pixels of the probability maps.
+
+    Attributes:
+        per_view: About so many rays a view, evenly spaced, at least a pixel apart.
+        blur_px: Standard deviation of the Gaussian that the maps are smoothed with.
+        tangent_px: The same along the silhouette, for its tangents.
+        corner_px: A corner is where the tangent turns too far from so far before to so far
+            after it.
+        max_convex_deg: Turn of a silhouette that bends round the object, at most.
+        max_concave_deg: The same of one that bends into it: where one part of the surface
+            hides another, the silhouette has a concave corner, and no normal.
+        border_px: Rays keep so far from the photograph's border.
+        min_length_px: Shorter silhouettes are specks.
+    """
+
+    per_view: Annotated[int, Range(least=1, most=1_000_000)] = 300
+    blur_px: Annotated[float, Range(above=0, most=65_535)] = 1.0
+    tangent_px: Annotated[float, Range(above=0, most=65_535)] = 3.0
+    corner_px: Annotated[float, Range(least=1, most=65_535)] = 6.0
+    max_convex_deg: Annotated[float, Range(above=0, most=180)] = 90.0
+    max_concave_deg: Annotated[float, Range(above=0, most=180)] = 40.0
+    border_px: Annotated[float, Range(least=0, most=65_535)] = 3.0
+    min_length_px: Annotated[float, Range(least=0, most=65_535)] = 24.0
+
+    def __post_init__(self) -> None:
+        require_ranges(self, "contours")
+
+
+def contour_rays(
+    silhouettes: Silhouettes, cameras: Cameras, config: RayConfig | None = None
+) -> ContourRays:
+    r"""Cast rays through the silhouettes, and tell the surface's normal on each.
+
+    A surface that ends in the picture is tangent there to the ray, and its contour to the
+    silhouette: its normal is :math:`\pm r \times \dot r`, with :math:`r` the ray and
+    :math:`\dot r` its change along the silhouette (Cipolla & Blake, IJCV 9(2), 1992). Silhouettes
+    are where the smoothed probability is a half; read as the distribution of the silhouette's
+    place, it has there a slope of :math:`1 / (\sigma \sqrt{2 \pi})`.
+
+    Args:
+        silhouettes: Probabilities that pixels show the object; views that are not reliable get
+            no rays.
+
+    Returns:
+        Rays of all reliable views. Corners, where the surface has no single normal, specks,
+        and what lies at the photograph's border have none. A constant to autograd.
+    """
+    config = config or RayConfig()
+
+    def of_view(view: int) -> ContourRays:
+        return solved_or(
+            lambda: _of_view(silhouettes.inside[view], cameras, view, config),
+            lambda: _nothing(cameras),
+            stage="contours",
+            name=f"contours of view {view}",
+            done="The surface is found without these contours",
+        )
+
+    views = silhouettes.reliable.nonzero()[:, 0].tolist()
+    return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])
+
+
+def _nothing(cameras: Cameras) -> ContourRays:
+    none = cameras.intrinsics.new_zeros(0, 3)
+    return ContourRays(
+        view=torch.zeros(0, dtype=torch.long, device=none.device),
+        pixels=none[:, :2],
+        rays_world=none,
+        normals_world=none,
+        sigma_px=none[:, 0],
+    )
+
+
+@torch.no_grad()
+def _of_view(
+    inside: Float[Tensor, "height width"], cameras: Cameras, view: int, config: RayConfig
+) -> ContourRays:
+    like, (width, height) = cameras.intrinsics, cameras.sizes_px[view].tolist()
+    smooth = gaussian_filter(
+        inside[:height, :width].detach().cpu().double().numpy(), config.blur_px, mode="nearest"
+    )
+    lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
+    lines = [line for line in lines if len(line.points) >= config.min_length_px]
+    stride = max(1.0, sum(len(line.points) for line in lines) / config.per_view)
+    rows = [_samples(line, smooth, stride, config) for line in lines]
+    table = torch.from_numpy(np.concatenate([np.zeros((0, 7)), *rows])).to(like)
+    point, along, outward, slope = torch.split(table, [2, 2, 2, 1], dim=1)
+    pixels = pixels_from_indices(point)
+    frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
+    rays = rays_through(pixels, frame, intrinsics)
+    # Rays are affine in the pixel.
+    across = torch.linalg.cross(rays, rays_through(pixels + along, frame, intrinsics) - rays)
+    towards = rays_through(pixels + outward, frame, intrinsics) - rays
+    side = (across * towards).sum(dim=1, keepdim=True).sign()
+    added = config.blur_px**2 + _READING
+    spread = 1 / (math.sqrt(2 * math.pi) * slope[:, 0])
+    return ContourRays(
+        view=torch.full_like(pixels[:, 0], view, dtype=torch.long),
+        pixels=pixels,
+        rays_world=rays,
+        normals_world=normalize(side * across, dim=1),
+        sigma_px=((spread.square() - added).clamp_min(0) + _PIXEL).sqrt(),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A silhouette's points ``(u, v)``, about a pixel apart, that count from 0."""
+
+    points: Array
+    closed: bool
+
+    def shifted(self, values: Array, by: int) -> Array:
+        """Return what stands so many points further along; the end's beyond an open one's end."""
+        at = np.arange(len(values)) + by
+        at = at % len(values) if self.closed else at.clip(0, len(values) - 1)
+        shifted: Array = values[at]
+        return shifted
+
+
+def _resampled(corners: Array) -> _Line:
+    steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    closed = bool((corners[0] == corners[-1]).all())
+    wanted = np.linspace(0, length[-1], round(length[-1]), endpoint=not closed)
+    points = [np.interp(wanted, length, corners[:, axis]) for axis in (1, 0)]
+    return _Line(np.stack(points, axis=1), closed)
+
+
+def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Array:
+    """Return rows of place, tangent and outward direction, two numbers each, and slope."""
+    points = line.points
+    how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
+    tangent = _unit(gaussian_filter1d(points, config.tangent_px, axis=0, order=1, mode=how))
+    # The probability falls outward; half a pixel to either side tells how fast.
+    across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
+    outward = -np.sign(rise)[:, None] * across
+    reach = round(config.corner_px)
+    behind, ahead = line.shifted(tangent, -reach), line.shifted(tangent, reach)
+    rotation = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
+    convex = ((ahead - behind) * outward).sum(axis=1) < 0
+    most = np.where(convex, config.max_convex_deg, config.max_concave_deg)
+    size = np.array([smooth.shape[1], smooth.shape[0]]) - 1.0
+    margin = np.minimum(points, size - points).min(axis=1) + 0.5
+    good = (rotation <= most) & (margin >= config.border_px) & (rise != 0)
+    chosen = np.arange(0, len(points), stride).astype(int)
+    chosen = chosen[chosen < len(points)]  # rounding may add one
+    chosen = chosen[good[chosen]]
+    rows = np.concatenate([points, tangent, outward, np.abs(rise)[:, None]], axis=1)
+    return np.asarray(rows[chosen])
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def _read(values: Array, points: Array) -> Array:
+    return np.asarray(map_coordinates(values, points.T[::-1], order=1, mode="nearest"))
+
+
+# Cosine between the offset from the nearest point's disc and its normal, from which on a place
+# is below the surface: beside the border of what is known, none is.
+_ALONG_NORMAL = 0.9
+
+# How far outside the visual hull a ray may touch the surface.
+_TOLERANCE_PX = 1.5
+
+# Points, itself included, to the last of which a point's disc reaches: those round it in a
+# triangle mesh.
+_NEIGHBOURS = 7
+
+
+@torch.no_grad()
+def contour_points(
+    rays: ContourRays,
+    cameras: Cameras,
+    hull: Hull,
+    points_world: Float[Tensor, "point 3"],
+    normals_world: Float[Tensor, "point 3"],
+) -> ContourPoints:
+    """Find where each contour ray touches a surface, of which points with normals are given.
+
+    It touches where, of all positions inside the visual hull, the ray runs deepest below the
+    surface or, if it passes the surface by, nearest to it. The place may be off along the ray:
+    the surface is tangent there, so that this matters little across it.
+
+    Args:
+        points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
+            any, positions are in the centre of what is in the hull.
+
+    Returns:
+        At most one place a ray. A ray has none where it does not meet the hull, and where
+        two surfaces, one behind the other, are as near to it: parts that hide each other.
+        A constant to autograd.
+    """
+    centers = cameras.centers_world[rays.view]
+    focal = cameras.intrinsics[rays.view, 0, 0]
+    low, high = _depths_in_box(hull, centers, rays.rays_world)
+    steps = 128
+    depth = low + torch.linspace(0, 1, steps).to(low) * (high - low)
+    pixel = depth.mean(dim=1) / focal
+    surface = _SignedDistance(points_world, normals_world) if len(points_world) else None
+    cost = _costs(rays, centers, depth, hull, _TOLERANCE_PX * pixel, surface)
+    # Places nearer to each other than that tell nothing of which surface a ray touches.
+    clear = ~ambiguous(cost, 2.0 * pixel)
+    (met,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
+    best = depth[met].gather(1, cost[met].argmin(dim=1, keepdim=True))
+    offset = torch.linspace(-1, 1, 25).to(low)
+    fine = best + offset * (high - low)[met] / (steps - 1)
+    tolerance = _TOLERANCE_PX * pixel[met]
+    cost = _costs(rays.take(met), centers[met], fine, hull, tolerance, surface)
+    found = fine.gather(1, cost.argmin(dim=1, keepdim=True))
+    sigma = rays.sigma_px[met] * found[:, 0] / focal[met]
+    return ContourPoints(
+        points_world=centers[met] + found * rays.rays_world[met],
+        normals_world=rays.normals_world[met],
+        variance=sigma.square(),
+        view=rays.view[met],
+        ray=met,
+    )
+
+
+class _SignedDistance:
+    """Distance to the surface round some of its points, negative below it.
+
+    A point stands for a disc of its tangent plane that reaches to its neighbours.
+    """
+
+    def __init__(self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]) -> None:
+        positions = points.detach().cpu().double().numpy()
+        self._points, self._normals, self._tree = points, normals, cKDTree(positions)
+
+    def __call__(self, positions: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
+        _, nearest = self._tree.query(
+            positions.detach().cpu().double().numpy(), workers=num_workers()
+        )
+        index = torch.from_numpy(nearest).to(self._points.device)
+        offset, normals = positions - self._points[index], self._normals[index]
+        height = (offset * normals).sum(dim=1)
+        beside = (offset - height[:, None] * normals).norm(dim=1) - self._radii(index)
+        distance = torch.hypot(height, beside.clamp_min(0))
+        return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
+
+    def _radii(self, index: Int[Tensor, " place"]) -> Float[Tensor, " place"]:
+        some, place = torch.unique(index, return_inverse=True)
+        count = min(_NEIGHBOURS, len(self._points))
+        chosen = self._points[some].detach().cpu().double().numpy()
+        reach, _ = self._tree.query(chosen, k=[count], workers=num_workers())
+        return torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
+
+
+def _depths_in_box(
+    hull: Hull, centers: Float[Tensor, "ray 3"], rays: Float[Tensor, "ray 3"]
+) -> tuple[Float[Tensor, "ray 1"], Float[Tensor, "ray 1"]]:
+    """Return the depths at which rays enter and leave the ball round the hull's grid."""
+    corners = hull.corners_world.to(rays)
+    centre, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
+    square = rays.square().sum(dim=1, keepdim=True)
+    along = ((centre - centers) * rays).sum(dim=1, keepdim=True) / square
+    reach = radius / square.sqrt()
+    return (along - reach).clamp_min(0), (along + reach).clamp_min(0)
+
+
+def _costs(
+    rays: ContourRays,
+    centers: Float[Tensor, "ray 3"],
+    depth: Float[Tensor, "ray step"],
+    hull: Hull,
+    tolerance: Float[Tensor, " ray"],
+    surface: _SignedDistance | None,
+) -> Float[Tensor, "ray step"]:
+    """Return the signed distance to the surface along the rays; infinite outside the hull.
+
+    Without a surface it is the distance to the centre of what is in the hull.
+    """
+    positions = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
+    inside = hull.depth_of(positions.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
+    inside &= depth > 0
+    if surface is None:
+        centre = (inside * depth).sum(dim=1) / inside.sum(dim=1).clamp_min(1)
+        return torch.where(inside, (depth - centre[:, None]).abs(), torch.inf)
+    cost = torch.full_like(depth, torch.inf)
+    cost[inside] = surface(positions[inside])
+    return cost
+
+
+def ambiguous(
+    cost: Float[Tensor, "ray step"], tolerance: Float[Tensor, " ray"]
+) -> Bool[Tensor, " ray"]:
+    """Report rays that come equally near to two surfaces, one behind the other.
+
+    Args:
+        cost: Signed distance to the surface along the rays; infinite where they cannot
+            touch it.
+        tolerance: Difference of distances that does not count. Places are on two surfaces if the
+            distance between them rises by more.
+    """
+    margin = tolerance[:, None]
+    # Below the surface, or on it, is all the same: thick and thin parts are alike near.
+    lowest = cost.amin(dim=1, keepdim=True).clamp_min(0)
+    near, far = cost <= lowest + margin, cost > lowest + 2 * margin
+    # A new stretch begins where positions are near again after some that are far.
+    stretch = far.cumsum(dim=1)
+    first = torch.where(near, stretch, cost.shape[1] + 1).amin(dim=1)
+    last = torch.where(near, stretch, -1).amax(dim=1)
+    return last > first
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Contours(Record):
+    """Rays that the surface is tangent to, and the hull that it lies in.
+
+    Attributes:
+        rays: Through the silhouettes of all reliable views.
+    """
+
+    silhouettes: Silhouettes
+    rays: ContourRays
+    cameras: Cameras
+    hull: Hull
+
+    @classmethod
+    def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
+        """Return contours without rays; the hull holds everything, or what is above planes."""
+        hull = Everywhere.of(cameras, silhouettes.planes_world)
+        return cls(silhouettes=silhouettes, rays=_nothing(cameras), cameras=cameras, hull=hull)
+
+    @property
+    def confine(self) -> bool:
+        """Whether the object lies in a hull that silhouettes tell."""
+        return not isinstance(self.hull, Everywhere)
+
+    def touching(
+        self, points_world: Float[Tensor, "point 3"], normals_world: Float[Tensor, "point 3"]
+    ) -> ContourPoints:
+        """Find where the rays touch a surface; see :func:`.contour_points`."""
+        if not self.confine:
+            rays, none = self.rays, points_world.new_zeros(0)
+            return ContourPoints(
+                points_world=none.reshape(0, 3),
+                normals_world=none.reshape(0, 3),
+                variance=none,
+                view=rays.view,
+                ray=rays.view,
+            )
+        return contour_points(self.rays, self.cameras, self.hull, points_world, normals_world)

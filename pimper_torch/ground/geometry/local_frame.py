@@ -1,0 +1,76 @@
+"""The frame that a scene far from its origin is computed in: shifted, neither turned nor scaled.
+
+Georeferenced models stand at coordinates of 1e5 units and more, of which single precision keeps
+hundredths. A scene's own frame has its origin among what is photographed.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.ground.geometry.rigid import rigid
+
+Offset = tuple[float, float, float]
+
+NO_OFFSET: Offset = (0.0, 0.0, 0.0)
+
+
+def local_origin(
+    cam_from_world: Float[Tensor, "view 4 4"], points_world: Float[Tensor, "point 3"]
+) -> Offset:
+    """Choose the origin of a scene's own frame, a round number; zero where its own will do.
+
+    It is the median of the cloud, or of the cameras where there is none, so that points far out
+    change nothing.
+
+    Args:
+        points_world: The cloud; may be empty.
+
+    >>> poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    >>> poses[:, 0, 3] = torch.tensor([-500_002.0, -500_000.0])
+    >>> local_origin(poses, torch.zeros(0, 3, dtype=torch.float64))
+    (500000.0, 0.0, 0.0)
+    """
+    poses = cam_from_world.detach().double()
+    centers = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+    points = points_world.detach().to(centers)
+    points = points[points.isfinite().all(dim=1)]
+    centers = centers[centers.isfinite().all(dim=1)]
+    if len(centers) == 0:
+        return NO_OFFSET
+    middle = (points if len(points) else centers).median(dim=0).values
+    radius = float((centers - middle).norm(dim=1).median())
+    if radius == 0:  # cameras that all stand there
+        radius = float((centers - middle).norm(dim=1).max())
+    # From here on single precision moves points by a thousandth of a pixel of 2000.
+    if radius == 0 or float(middle.norm()) <= 10.0 * radius:
+        return NO_OFFSET
+    digits = -math.floor(math.log10(radius))
+    x, y, z = (round(value, digits) + 0.0 for value in middle.tolist())  # no -0.0
+    return x, y, z
+
+
+def to_local(
+    cam_from_world: Float[Tensor, "view 4 4"], offset: Offset
+) -> Float[Tensor, "view 4 4"]:
+    """Return the poses that see points of which ``offset`` was subtracted; differentiable."""
+    rotation, translation = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
+    return rigid(rotation, translation + rotation @ rotation.new_tensor(offset))
+
+
+def from_local(
+    cam_from_local: Float[Tensor, "view 4 4"], offset: Offset
+) -> Float[Tensor, "view 4 4"]:
+    """Undo :func:`to_local`, in float64.
+
+    Rotations are made exact first: those of single precision would carry their rounding times the
+    offset into the cameras' centres.
+    """
+    if offset == NO_OFFSET:
+        return cam_from_local.double()
+    U, _, Vh = torch.linalg.svd(cam_from_local[:, :3, :3].double())
+    rotation = U @ Vh
+    shift = rotation @ rotation.new_tensor(offset)
+    return rigid(rotation, cam_from_local[:, :3, 3].double() - shift)

@@ -1,0 +1,264 @@
+"""Barycentric subdivided meshes: a coarse triangle mesh subdivided into a dense, conforming one.
+
+Every edge of the coarse mesh is cut into as many pieces as its length asks for, and every
+facet carries the triangular subdivided mesh of its most finely cut edge. Where another edge has
+fewer pieces, the subdivided mesh points on it slide to the nearest cut, and triangles that vanish
+thereby are left out. Both facets of an edge so use the same cuts, whatever their sizes.
+
+A long and narrow facet would be far too fine across its length, so the cuts of its edges are
+limited by its area: it is then a little too coarse along its length.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.records import Record
+
+# Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
+# which one counts alone.
+_BLENDED, _TOGETHER = 3, 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Subdivision(Record):
+    """A coarse mesh, subdivided.
+
+    Attributes:
+        points: Where the vertices lie on the flat facets.
+        facet: A facet each vertex lies in; a vertex on an edge or a corner of the coarse
+            mesh exists once and names one of its facets.
+        barycentric: Where in that facet; exactly 0 on its edges.
+    """
+
+    points: Float[Tensor, "vertex 3"]
+    facet: Int[Tensor, " vertex"]
+    barycentric: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    face_facet: Int[Tensor, " face"]
+
+    def interpolate(
+        self, per_corner: Float[Tensor, "corner channel"], facets: Int[Tensor, "facet 3"]
+    ) -> Float[Tensor, "vertex channel"]:
+        """Blend what is known at the coarse mesh's vertices; continuous across its edges.
+
+        Args:
+            per_corner: One row a vertex of the coarse mesh.
+        """
+        corners = per_corner[facets[self.facet]]
+        return (self.barycentric[..., None] * corners).sum(dim=1)
+
+
+def subdivide(
+    vertices: Float[Tensor, "corner 3"],
+    facets: Int[Tensor, "facet 3"],
+    spacing: Float[Tensor, " facet"],
+) -> Subdivision:
+    """Subdivide a triangle mesh into pieces of about ``spacing``.
+
+    Args:
+        vertices: Of the coarse mesh. Unused ones do not appear in the result.
+        facets: Its faces, any number of them at an edge.
+        spacing: Wanted length of the pieces' edges in each facet, scene units; an edge
+            follows the finer of its facets. Pieces of a narrow facet are longer along it
+            and shorter across.
+
+    Returns:
+        A mesh with the coarse mesh's topology and surface: an edge inside it has as many
+        faces as the coarse edge it lies on, areas add up, and no face is turned round.
+        Needle-shaped facets give needle-shaped faces.
+
+    Differentiable in ``vertices`` through ``points``; the cuts are constants.
+
+    >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    >>> faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    >>> subdivision = subdivide(square, faces, torch.full((2,), 0.5))
+    >>> len(subdivision.points), len(subdivision.faces)
+    (12, 14)
+    """
+    edges, facet_edges = face_edges(facets)
+    pieces = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
+    # Slot 0 opposite to a longest edge: that edge carries the subdivided mesh's own cuts, so that
+    # only two edges ever slide, both counted from slot 0.
+    first = pieces[facet_edges].argmax(dim=1)
+    slots = (first[:, None] + torch.arange(3, device=first.device)) % 3
+    cuts = _Cuts(
+        pieces=pieces,
+        edges=edges,
+        corner=facets.gather(1, slots),
+        edge=facet_edges.gather(1, slots),
+        slot=slots,
+        first_cut=len(vertices) + _starts(pieces - 1),
+        first_inner=len(vertices) + int((pieces - 1).sum()),
+    )
+    return _assemble(vertices, facets, cuts)
+
+
+def transferred(
+    values: Float[Tensor, " vertex"], source: Subdivision, points: Float[Tensor, "asked 3"]
+) -> Float[Tensor, " asked"]:
+    """Return values known on a subdivided mesh at other points of the same facets.
+
+    They are blended from the three nearest vertices, by the inverse of the distance. For what is
+    smooth. A constant to autograd but in ``values``.
+    """
+    tree = cKDTree(source.points.detach().cpu().double().numpy())
+    asked = points.detach().cpu().double().numpy()
+    count = min(_BLENDED, len(source.points))
+    apart, near = tree.query(asked, k=list(range(1, count + 1)), workers=-1)
+    closeness = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)
+    fraction = (closeness / closeness.sum(dim=1, keepdim=True)).to(values)
+    return (fraction * values[torch.from_numpy(near).to(values.device)]).sum(dim=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cuts:
+    """Subdivision of edges, and each facet's corners and edges from slot 0."""
+
+    pieces: Int[Tensor, " edge"]
+    edges: Int[Tensor, "edge 2"]
+    corner: Int[Tensor, "facet 3"]
+    edge: Int[Tensor, "facet 3"]  # opposite to the corner in the same place
+    slot: Int[Tensor, "facet 3"]  # which corner of the coarse facet that is
+    first_cut: Int[Tensor, " edge"]
+    first_inner: int
+
+
+def _assemble(
+    vertices: Float[Tensor, "corner 3"], facets: Int[Tensor, "facet 3"], cuts: _Cuts
+) -> Subdivision:
+    """Lay the subdivided meshes of all facets, like sizes together, and number their points."""
+    sizes = cuts.pieces[cuts.edge[:, 0]]
+    inner_start = cuts.first_inner + _starts((sizes - 1) * (sizes - 2) // 2)
+    names, places, owners, faces, owned = [], [], [], [], []
+    for size in torch.unique(sizes).tolist():
+        members = (sizes == size).nonzero()[:, 0]
+        steps, triangles = _subdivision_of(size, device=facets.device)
+        slid = _slide(steps, cuts.pieces[cuts.edge[members]], size)
+        named = _name(steps, slid, cuts, members, inner_start[members])
+        cut = slid[..., 2] / slid[..., 3].clamp_min(1)
+        place = _barycentric(steps.to(vertices) / size, cut.to(vertices), slid[..., :2])
+        back = cuts.slot[members].argsort(dim=1)[:, None].expand_as(place)
+        names.append(named.flatten())
+        places.append(place.gather(2, back).flatten(0, 1))
+        owners.append(members[:, None].expand_as(named).flatten())
+        faces.append(named[:, triangles].flatten(0, 1))
+        owned.append(members[:, None].expand(-1, len(triangles)).flatten())
+    name, owner, place = torch.cat(names), torch.cat(owners), torch.cat(places)
+    face, face_facet = torch.cat(faces), torch.cat(owned)
+
+    used, index = torch.unique(name, return_inverse=True)
+    row = torch.empty_like(used).scatter_reduce_(
+        0, index, torch.arange(len(name), device=name.device), "amin", include_self=False
+    )
+    facet, barycentric = owner[row], place[row]
+    points = (barycentric[..., None] * vertices[facets[facet]]).sum(dim=1)
+    whole = (face != face.roll(1, dims=1)).all(dim=1)
+    renumbered = torch.searchsorted(used, face[whole])
+    return Subdivision(
+        points=points,
+        facet=facet,
+        barycentric=barycentric,
+        faces=renumbered,
+        face_facet=face_facet[whole],
+    )
+
+
+def _pieces(
+    vertices: Float[Tensor, "corner 3"],
+    facets: Int[Tensor, "facet 3"],
+    edges: Int[Tensor, "edge 2"],
+    facet_edges: Int[Tensor, "facet 3"],
+    spacing: Float[Tensor, " facet"],
+) -> Int[Tensor, " edge"]:
+    """Count the pieces each edge is cut into."""
+    ends = vertices[edges]
+    length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
+    area = face_normals(vertices, facets).norm(dim=-1) / 2
+    equilateral = (4 / 3**0.5 * area).sqrt()  # the side of one of that area
+
+    def least(per_facet: Float[Tensor, " facet"]) -> Float[Tensor, " edge"]:
+        spread = per_facet.repeat_interleave(3)
+        unset = torch.full_like(length, torch.inf)
+        return unset.scatter_reduce(0, facet_edges.flatten(), spread, "amin")
+
+    # The pieces of a half square's diagonal: at most 2 points a spacing squared.
+    length = torch.minimum(length, 1.32 * least(equilateral))
+    return (length / least(spacing)).round().long().clamp_min(1)
+
+
+def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:
+    """Return where each group begins when they are put in a row."""
+    return counts.cumsum(dim=0) - counts
+
+
+def _subdivision_of(
+    size: int, device: torch.device
+) -> tuple[Int[Tensor, "point 3"], Int[Tensor, "triangle 3"]]:
+    """Return the vertices of one subdivided facet, as steps that add up to ``size``, and faces."""
+    rows, columns = torch.tril_indices(size + 1, size + 1, device=device)
+    steps = torch.stack([size - rows, rows - columns, columns], dim=1)
+    row, column = torch.tril_indices(size, size, device=device)
+    here = row * (row + 1) // 2 + column
+    below = (row + 1) * (row + 2) // 2 + column
+    upright = torch.stack([here, below, below + 1], dim=1)
+    rotated = torch.stack([here, below + 1, here + 1], dim=1)[column < row]
+    return steps, torch.cat([upright, rotated])
+
+
+def _slide(
+    steps: Int[Tensor, "point 3"], pieces: Int[Tensor, "member 3"], size: int
+) -> Int[Tensor, "member point 4"]:
+    """Move points on edges to the nearest cut.
+
+    Returns:
+        The slots of the edge's two ends, the cut counted from the first of them, and the
+        number of pieces; 0 pieces for points inside the facet. A point halfway between two
+        cuts goes towards slot 0: were it to go to the far end, the centre triangle of a
+        facet with 1, 1 and 2 pieces would be flat.
+    """
+    edge = torch.full_like(steps[:, 0], -1)
+    for opposite in (0, 2, 1):  # corners are on two edges; either names them
+        edge = torch.where(steps[:, opposite] == 0, opposite, edge)
+    start = torch.where(edge == 0, 1, 0)
+    end = torch.where(edge == 2, 1, 2)
+    gone = steps.gather(1, end[:, None])[:, 0]
+    cut_into = torch.where(edge >= 0, pieces[:, edge.clamp_min(0)], 0)
+    cut = (2 * gone * cut_into + size - 1) // (2 * size)
+    return torch.stack([start.expand_as(cut), end.expand_as(cut), cut, cut_into], dim=-1)
+
+
+def _name(
+    steps: Int[Tensor, "point 3"],
+    slid: Int[Tensor, "member point 4"],
+    cuts: _Cuts,
+    members: Int[Tensor, " member"],
+    inner_start: Int[Tensor, " member"],
+) -> Int[Tensor, "member point"]:
+    """Number points so that facets agree: corners, then cuts of edges, then insides."""
+    start_slot, end_slot, cut, pieces = slid.unbind(dim=-1)
+    corner = cuts.corner[members]
+    start, end = corner.gather(1, start_slot), corner.gather(1, end_slot)
+    edge = cuts.edge[members].gather(1, 3 - start_slot - end_slot)
+    from_lower = torch.where(start == cuts.edges[edge, 0], cut, pieces - cut)
+    named = cuts.first_cut[edge] + from_lower - 1
+    named = torch.where(cut == 0, start, torch.where(cut == pieces, end, named))
+    inner: Bool[Tensor, " point"] = (steps > 0).all(dim=1)
+    return torch.where(inner, inner_start[:, None] + inner.cumsum(dim=0) - 1, named)
+
+
+def _barycentric(
+    free: Float[Tensor, "point 3"],
+    cut: Float[Tensor, "member point"],
+    ends: Int[Tensor, "member point 2"],
+) -> Float[Tensor, "member point 3"]:
+    """Return coordinates in slots: free inside, on the cut at an edge."""
+    inner = (free > 0).all(dim=1)[:, None]
+    on_edge = free.new_zeros(*cut.shape, 3)
+    on_edge = on_edge.scatter(2, ends, torch.stack([1 - cut, cut], dim=-1))
+    return torch.where(inner, free, on_edge)

@@ -1,0 +1,48 @@
+"""Normals of templates: of the surface that they carry, or of the mesh."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.rigid import rotate
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.records import CoarseMesh, Templates
+
+# Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
+MIN_FACING = 0.05
+
+
+def transferred_normals(
+    coarse: CoarseMesh, templates: Templates
+) -> Float[Tensor, "patch height width 3"]:
+    """Return the normals of a template, patch frame: of its surface, or else of the mesh."""
+    if templates.normals_patch is None:
+        return coarse_normals(coarse, templates)
+    return facing_viewer(templates.normals_patch)
+
+
+def coarse_normals(
+    coarse: CoarseMesh, templates: Templates
+) -> Float[Tensor, "patch height width 3"]:
+    """Blend the mesh's smoothed vertex normals over every template, patch frame.
+
+    Outside the facet barycentric coordinates are clamped to it, as the blend would
+    otherwise run away. All face the viewer.
+    """
+    mesh = coarse.mesh
+    per_vertex = mesh.normals_world
+    if per_vertex is None:
+        per_vertex = vertex_normals(mesh.vertices_world, mesh.faces)
+    corners = rotate(templates.patch_from_world, per_vertex[mesh.faces[templates.facet]])
+    inner = templates.barycentric.clamp_min(0)
+    inner = inner / inner.sum(dim=-1, keepdim=True)
+    return facing_viewer(torch.einsum("phwc,pcx->phwx", inner, corners.to(inner)))
+
+
+def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Make normals unit, and rotate those that face away until they just face the viewer."""
+    unit = normalize(normals, dim=-1)
+    aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
+    rotated = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)
+    return torch.where(unit[..., 2:] > -MIN_FACING, rotated, unit)

@@ -1,0 +1,216 @@
+"""Which points a camera sees: ray casting on triangle meshes.
+
+The one place that talks to embree. It runs on the CPU in float32 whatever the device of the
+tensors, and which face a ray meets is a constant to autograd; where it meets that face is not, see
+:meth:`Hits.refined`.
+"""
+
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+import torch
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.records import Cameras, Mesh, Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Hits(Record):
+    """Where rays first meet a mesh.
+
+    Attributes:
+        face: Index of the face; -1 where the ray meets nothing.
+        distance: Along the ray in units of its direction's length; infinite for a miss.
+    """
+
+    face: Int[Tensor, "*batch"]
+    distance: Float[Tensor, "*batch"]
+    barycentric: Float[Tensor, "*batch 3"]
+
+    def interpolate(
+        self, per_vertex: Float[Tensor, "vertex channel"], faces: Int[Tensor, "face 3"]
+    ) -> Float[Tensor, "*batch channel"]:
+        """Blend values of the hit faces' vertices; zero for a miss."""
+        corners = per_vertex[faces[self.face.clamp_min(0)]]
+        blended = (self.barycentric[..., None] * corners).sum(dim=-2)
+        return torch.where((self.face >= 0)[..., None], blended, 0)
+
+    def refined(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        faces: Int[Tensor, "face 3"],
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+    ) -> "Hits":
+        """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
+
+        Differentiable in vertices, origins and directions. A ray that lies in the plane of its
+        face keeps what ray casting gave.
+        """
+        hit = self.face >= 0
+        a, b, c = vertices[faces[self.face.clamp_min(0)]].unbind(dim=-2)
+        one, other = b - a, c - a
+        normal = torch.linalg.cross(one, other)
+        rate = (directions * normal).sum(dim=-1)
+        sound = hit & (rate != 0)
+        distance = ((a - origins) * normal).sum(dim=-1) / torch.where(sound, rate, 1)
+        along = origins + distance[..., None] * directions - a
+        area = torch.where(sound, normal.square().sum(dim=-1), 1)
+        v = (torch.linalg.cross(along, other) * normal).sum(dim=-1) / area
+        w = (torch.linalg.cross(one, along) * normal).sum(dim=-1) / area
+        return self.replace(
+            distance=torch.where(sound, distance, self.distance),
+            barycentric=torch.where(
+                sound[..., None], torch.stack([1 - v - w, v, w], dim=-1), self.barycentric
+            ),
+        )
+
+
+class RayCaster:
+    """A mesh prepared for ray casting.
+
+    >>> square = torch.tensor([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    >>> caster = RayCaster(square, torch.tensor([[0, 2, 1], [0, 3, 2]]))
+    >>> caster.cast(torch.zeros(1, 3), torch.tensor([[0.2, 0.1, 1.0]])).distance
+    tensor([1.])
+    """
+
+    def __init__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> None:
+        self._origin = _origin(vertices.detach())
+        triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
+        self._scene = rtcore_scene.EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
+        # The first ray builds the tree, and threads must not do so together.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def cast(
+        self,
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+        reach: Float[Tensor, "*#batch"] | None = None,
+    ) -> Hits:
+        """Find the first face each ray meets.
+
+        Args:
+            reach: How far each goes, in lengths of its direction; without, to infinity.
+        """
+        shape = directions.shape[:-1]
+        start = _as_rows(self._near(origins).expand_as(directions))
+        along = _as_rows(directions)
+        far = None if reach is None else _reaches(reach, shape)
+        found = self._scene.run(start, along, dists=far, output=1)
+        face = torch.from_numpy(found["primID"].astype(np.int64))
+        hit = face >= 0
+        distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
+        v, w = torch.from_numpy(found["u"]), torch.from_numpy(found["v"])
+        barycentric = torch.stack([1 - v - w, v, w], dim=-1) * hit[:, None]
+        like = directions
+        return Hits(
+            face=face.reshape(shape).to(like.device),
+            distance=distance.reshape(shape).to(like),
+            barycentric=barycentric.reshape(*shape, 3).to(like),
+        )
+
+    def _near(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return points by the origin that the mesh is stored round."""
+        return points if self._origin is None else points - self._origin.to(points)
+
+    def occluded(
+        self,
+        points: Float[Tensor, "*batch 3"],
+        center: Float[Tensor, " 3"],
+        tolerance: float | Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Return whether the mesh hides points from a camera.
+
+        Args:
+            tolerance: A surface closer than this in front of the point does not count: it
+                is the surface the point itself lies on. Scene units.
+        """
+        directions = points - center
+        length = directions.norm(dim=-1)
+        hits = self.cast(center, directions / length[..., None])
+        return hits.distance < length - tolerance
+
+    def blocked(
+        self,
+        origins: Float[Tensor, "*#batch 3"],
+        directions: Float[Tensor, "*batch 3"],
+        reach: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Return whether a ray meets any face at all; several times as fast as its first one.
+
+        Args:
+            reach: How far each goes, in lengths of its direction; may be infinite.
+        """
+        shape = directions.shape[:-1]
+        start = _as_rows(self._near(origins).expand_as(directions))
+        along = _as_rows(directions)
+        far = _reaches(reach, shape)
+        found = self._scene.run(start, along, dists=far, query="OCCLUDED")
+        return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
+
+
+# Of meshes, while their vertices live: faces, and the caster.
+_prepared: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+_preparing = Lock()
+
+
+def ray_caster(mesh: Mesh) -> RayCaster:
+    """Return a mesh prepared for ray casting, once as long as it lives."""
+    with _preparing:
+        faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]
+        if faces is not mesh.faces:
+            caster = RayCaster(mesh.vertices_world, mesh.faces)
+            _prepared[mesh.vertices_world] = mesh.faces, caster
+        return caster
+
+
+def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
+    """Cast a ray through every pixel of a view.
+
+    Args:
+        mesh: Prepared for casting already where several views look at it.
+
+    Returns:
+        Hits of shape ``height width``; ``distance`` is depth along the camera's z.
+    """
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    pixels = pixel_centers(width, height, like=cameras.intrinsics)
+    rays = rays_through(
+        pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
+    ).reshape(height, width, 3)
+    caster = RayCaster(mesh.vertices_world, mesh.faces) if isinstance(mesh, Mesh) else mesh
+    return caster.cast(cameras.centers_world[view], rays)
+
+
+def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:
+    """Choose an origin for a mesh that is too far from its own for single precision, if it is."""
+    if len(vertices) == 0:
+        return None
+    low, high = vertices.amin(dim=0), vertices.amax(dim=0)
+    middle = (low + high) / 2
+    # Single precision moves such a mesh by more than a millionth of its diagonal.
+    return middle if bool(middle.norm() > 16.0 * (high - low).norm()) else None
+
+
+def _reaches(
+    reach: Float[Tensor, "*#batch"], shape: torch.Size
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
+    # embree's own word for infinity
+    return far.clamp(0, 1e37).contiguous().numpy()
+
+
+def _as_rows(
+    vectors: Float[Tensor, "*batch 3"],
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    rows = vectors.detach().to("cpu", torch.float32).reshape(-1, 3)
+    return np.ascontiguousarray(rows.numpy())

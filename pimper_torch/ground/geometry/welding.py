@@ -1,0 +1,53 @@
+"""Vertices at the same place made one: what STL and texture seams keep apart."""
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pimper_torch.ground.geometry.topology import first_of_each, graph_components
+
+# Of the diagonal: the widest distance of vertices that are one. A choice: rounding in single
+# precision and in text of seven digits is below, edges of any mesh of an object are far above.
+TOLERANCE = 1e-6
+
+
+def welded(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> tuple[Float[Tensor, "kept 3"], Int[Tensor, "face 3"]]:
+    """Merge vertices that are closer than a millionth of the diagonal; drop those without faces.
+
+    Returns:
+        The first vertex of each place, in their order, and as many faces, some of which may now
+        name a vertex twice. A mesh that has nothing to merge comes back as it is.
+
+    >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    >>> welded(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))[1]
+    tensor([[0, 1, 2],
+            [1, 3, 2]])
+    """
+    used, faces = torch.unique(faces, return_inverse=True)
+    vertices = vertices[used]
+    if len(vertices) == 0:
+        return vertices, faces
+    label = _places(vertices.detach().cpu().double()).to(faces.device)
+    first = first_of_each(label[:, None])
+    rank = torch.empty_like(first).scatter(0, label[first], torch.arange(len(first)).to(first))
+    return vertices[first], rank[label][faces]
+
+
+def _places(vertices: Float[Tensor, "vertex 3"]) -> Int[Tensor, " vertex"]:
+    """Label vertices by place: those of one cell of a grid, and cells whose vertices are close."""
+    low = vertices.amin(dim=0)
+    tolerance = TOLERANCE * float((vertices.amax(dim=0) - low).norm())
+    if tolerance == 0:
+        return torch.zeros(len(vertices), dtype=torch.long)
+    # A cell's diagonal is within the tolerance, and three of its numbers fit in 63 bits.
+    x, y, z = ((vertices - low) / (tolerance / 2)).floor().long().unbind(dim=1)
+    _, cell = torch.unique((x << 42) | (y << 21) | z, return_inverse=True)
+    of_cell = torch.empty(int(cell.max()) + 1, dtype=torch.long)
+    of_cell[cell] = torch.arange(len(vertices))
+    close = cKDTree(vertices[of_cell].numpy()).query_pairs(tolerance, output_type="ndarray")
+    if len(close) == 0:
+        return cell
+    return graph_components(torch.from_numpy(close).long(), len(of_cell))[cell]

@@ -1,0 +1,320 @@
+"""The adjoint of :mod:`pimper_torch.ground.kernels.sweep_costs`."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pimper_torch.ground.kernels.arrays import (
+    Doubles1,
+    Doubles2,
+    Doubles3,
+    Doubles4,
+    Floats2,
+    Floats4,
+    Integers2,
+    PictureRows,
+    Projection,
+    Samples,
+)
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import shrinkage
+from pimper_torch.ground.kernels.lookup_adjoint import spread
+from pimper_torch.ground.kernels.sweep_costs import (
+    FLOOR,
+    Shading,
+    Trial,
+    choose,
+    look_up,
+    lower_median,
+    room,
+    trace,
+)
+
+Array = NDArray[Any]
+
+
+class CostGradients(NamedTuple):
+    """Derivatives by pictures, and by the arguments of the costs."""
+
+    finest: Floats2
+    coarser: Floats2
+    image_from_patch: Doubles3
+    centers_patch: Doubles2
+    focals: Doubles1
+    origin: Doubles2
+    spacing: Doubles1
+    depth: Doubles3
+    outward: Doubles4
+    normals: Doubles4
+    lights: Doubles3
+    gains: Doubles2
+    scale: Doubles1
+
+
+@compiled(
+    "float64(float32[:,::1], int64, float32[::1], float32[::1], int64, float32, float32[::1],"
+    "int64[::1], float32, float32[:,::1], float32[::1])",
+    fast=True,
+)
+def _inconsistency(
+    radiance: Array,
+    step: int,
+    shading: Array,
+    per_shading: Array,
+    count: int,
+    per_scale: float,
+    ratios: Array,
+    order: Array,
+    on_cost: float,
+    on_radiance: Array,
+    on_shading: Array,
+) -> float:
+    """Differentiate the cost of one sample and height.
+
+    Args:
+        on_radiance: Set, at this step.
+        on_shading: Added to.
+
+    Returns:
+        The derivative by ``per_scale``.
+    """
+    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    for view in range(count):
+        ratios[view] = radiance[step, view] * per_shading[view]
+    first = np.float32(lower_median(ratios, order, count))
+    median = order[(count - 1) // 2]
+    square, product = zero, zero
+    for view in range(count):
+        residual = (radiance[step, view] - first * shading[view]) * per_scale
+        lit = shading[view] / (one + residual * residual)
+        square += lit * shading[view]
+        product += lit * radiance[step, view]
+    per_first = one / square if square > 0 else one
+    falls = square > 0
+    second = product * per_first
+    square, product = zero, zero
+    for view in range(count):
+        residual = (radiance[step, view] - second * shading[view]) * per_scale
+        lit = shading[view] / (one + residual * residual)
+        square += lit * shading[view]
+        product += lit * radiance[step, view]
+    per_second = one / square if square > 0 else one
+    third = product * per_second
+    on_scale, on_albedo = zero, zero
+    for view in range(count):
+        error = radiance[step, view] - third * shading[view]
+        residual = error * per_scale
+        drawn = on_cost * residual / (one + residual * residual)
+        on_radiance[step, view] = drawn * per_scale
+        on_shading[view] -= drawn * per_scale * third
+        on_albedo -= drawn * per_scale * shading[view]
+        on_scale += drawn * error
+    falls_second = square > 0
+    for iteration in range(2):
+        albedo = second if iteration == 0 else first
+        mean = third if iteration == 0 else second
+        on_product = on_albedo * (per_second if iteration == 0 else per_first)
+        on_square = -on_product * mean if (falls_second if iteration == 0 else falls) else zero
+        on_albedo = zero
+        for view in range(count):
+            error = radiance[step, view] - albedo * shading[view]
+            residual = error * per_scale
+            weight = one / (one + residual * residual)
+            lit = shading[view] * weight
+            on_lit = on_square * shading[view] + on_product * radiance[step, view]
+            drawn = -two * residual * on_lit * lit * weight
+            on_radiance[step, view] += on_product * lit + drawn * per_scale
+            on_shading[view] += on_square * lit + on_lit * weight - drawn * per_scale * albedo
+            on_albedo -= drawn * per_scale * shading[view]
+            on_scale += drawn * error
+    on_radiance[step, median] += on_albedo * per_shading[median]
+    on_shading[median] -= on_albedo * per_shading[median] * first
+    return float(on_scale)
+
+
+@compiled(annotated=True)
+def pull_back(
+    gray: PictureRows,
+    levels: Integers2,
+    projection: Projection,
+    focals: Doubles1,
+    samples: Samples,
+    shaded: Shading,
+    trial: Trial,
+    on_cost: Floats4,
+    on_pixels: int,
+    found: CostGradients,
+) -> None:
+    """Compute derivatives by pictures, geometry and light from those by the costs.
+
+    Which views a sample is compared in, and which of them is the median, is constant.
+
+    Args:
+        on_pixels: Whether derivatives by pictures are wanted, 1 or 0.
+        found: Added to.
+    """
+    patches, views, height, width = trial.valid.shape
+    heights, limit = len(trial.ladder), min(trial.num_views, views)
+    choice = room(views, limit)
+    lit = np.empty(limit, np.float32)
+    per_lit = np.empty(limit, np.float32)
+    ratios = np.empty(limit, np.float32)
+    order = np.empty(limit, np.int64)
+    fractions = shrinkage(levels)
+    radiance = np.empty((heights, limit), np.float32)
+    on_radiance = np.empty((heights, limit), np.float32)
+    on_lit = np.empty(limit, np.float32)
+    paths = np.empty((limit, 2, 3))
+    areas = np.empty(limit)
+    on_channel = np.empty(1, np.float32)
+    place, on_place = np.empty(3), np.empty(3)
+    along, on_along = np.empty(3), np.empty(3)
+    on_path = np.empty((2, 3))
+    for patch in range(patches):
+        spacing = samples.spacing[patch]
+        per_scale = np.float32(1) / trial.scale[patch]
+        on_per_scale = 0.0
+        for row in range(height):
+            for column in range(width):
+                if not np.any(on_cost[patch, :, row, column] != 0):
+                    continue
+                count = choose(
+                    patch, row, column, projection, focals, samples, shaded, trial, choice
+                )
+                if count == 0:
+                    continue
+                for slot in range(count):
+                    view = choice.views[slot]
+                    lit[slot] = choice.shading[view]
+                    per_lit[slot] = np.float32(1) / choice.shading[view]
+                    order[slot] = slot
+                    on_lit[slot] = 0
+                    m = projection.image_from_patch[patch * views + view]
+                    trace(m, samples, patch, row, column, paths[slot])
+                    footprint = choice.footprints[view]
+                    bounded = max(choice.facings[view], trial.min_facing)
+                    areas[slot] = footprint * footprint * bounded
+                    look_up(
+                        gray,
+                        levels,
+                        fractions,
+                        projection.rows[view],
+                        paths[slot],
+                        spacing,
+                        trial.ladder,
+                        areas[slot],
+                        shaded.gains[patch, view],
+                        radiance[:, slot],
+                    )
+                for step in range(heights):
+                    on_per_scale += _inconsistency(
+                        radiance,
+                        step,
+                        lit,
+                        per_lit,
+                        count,
+                        per_scale,
+                        ratios,
+                        order,
+                        on_cost[patch, step, row, column],
+                        on_radiance,
+                        on_lit,
+                    )
+                place[0] = samples.origin[patch, 0] + spacing * column
+                place[1] = samples.origin[patch, 1] + spacing * row
+                place[2] = samples.depth[patch, row, column]
+                on_place[:], on_along[:] = 0, 0
+                for axis in range(3):
+                    along[axis] = samples.outward[patch, row, column, axis]
+                normal = shaded.normals[patch, row, column]
+                on_normal = found.normals[patch, row, column]
+                on_spacing = 0.0
+                for slot in range(count):
+                    view = choice.views[slot]
+                    both = patch * views + view
+                    gain = shaded.gains[patch, view]
+                    path = paths[slot]
+                    on_path[:] = 0
+                    on_level, on_gain = 0.0, 0.0
+                    for step in range(heights):
+                        drawn = on_radiance[step, slot]
+                        if drawn == 0:
+                            continue
+                        on_gain += drawn * radiance[step, slot]
+                        on_channel[0] = drawn * gain
+                        move = spacing * trial.ladder[step]
+                        z_cam = path[0, 2] + move * path[1, 2]
+                        inverse_z = 1 / z_cam if z_cam != 0 else 1.0
+                        u = inverse_z * (path[0, 0] + move * path[1, 0])
+                        v = inverse_z * (path[0, 1] + move * path[1, 1])
+                        on_u, on_v, more = spread(
+                            gray.finest,
+                            gray.coarser,
+                            found.finest,
+                            found.coarser,
+                            levels,
+                            fractions,
+                            projection.rows[view],
+                            u,
+                            v,
+                            areas[slot],
+                            on_channel,
+                            on_pixels > 0,
+                        )
+                        on_level += more
+                        if z_cam == 0:
+                            continue  # no place in the picture
+                        a, b = on_u * inverse_z, on_v * inverse_z
+                        c = -(a * u + b * v)
+                        on_path[0, 0] += a
+                        on_path[0, 1] += b
+                        on_path[0, 2] += c
+                        on_path[1, 0] += a * move
+                        on_path[1, 1] += b * move
+                        on_path[1, 2] += c * move
+                        on_move = a * path[1, 0] + b * path[1, 1] + c * path[1, 2]
+                        on_spacing += on_move * trial.ladder[step]
+                    if gain != 0:
+                        found.gains[patch, view] += on_gain / gain
+                    # The level is the logarithm of the footprint, and half that of the facing.
+                    on_level /= math.log(2)
+                    on_spacing += on_level / spacing
+                    found.focals[view] += on_level / focals[view]
+                    if path[0, 2] > FLOOR:
+                        on_path[0, 2] -= on_level / path[0, 2]
+                    facing = choice.facings[view]
+                    if facing > trial.min_facing:
+                        on_facing = 0.5 * on_level / facing
+                        center = projection.centers_patch[both]
+                        away = 0.0
+                        for axis in range(3):
+                            away += (center[axis] - place[axis]) ** 2
+                        away = math.sqrt(away)
+                        for axis in range(3):
+                            way = (center[axis] - place[axis]) / away
+                            on_along[axis] += on_facing * way
+                            part = on_facing * (along[axis] - facing * way) / away
+                            found.centers_patch[both, axis] += part
+                            on_place[axis] -= part
+                    m, by_m = projection.image_from_patch[both], found.image_from_patch[both]
+                    for i in range(3):
+                        for axis in range(3):
+                            on_place[axis] += on_path[0, i] * m[i, axis]
+                            on_along[axis] += on_path[1, i] * m[i, axis]
+                            by_m[i, axis] += on_path[0, i] * place[axis]
+                            by_m[i, axis] += on_path[1, i] * along[axis]
+                        by_m[i, 3] += on_path[0, i]
+                    on_light, light = found.lights[patch, view], shaded.lights[patch, view]
+                    on_light[0] += on_lit[slot]
+                    for axis in range(3):
+                        on_light[1 + axis] += on_lit[slot] * normal[axis]
+                        on_normal[axis] += on_lit[slot] * light[1 + axis]
+                found.origin[patch, 0] += on_place[0]
+                found.origin[patch, 1] += on_place[1]
+                found.depth[patch, row, column] += on_place[2]
+                found.spacing[patch] += on_spacing + on_place[0] * column + on_place[1] * row
+                for axis in range(3):
+                    found.outward[patch, row, column, axis] += on_along[axis]
+        found.scale[patch] -= on_per_scale * per_scale * per_scale

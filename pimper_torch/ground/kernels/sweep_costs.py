@@ -1,0 +1,403 @@
+"""Costs of all height hypotheses of a bucket's samples: twin of ``method.sweep.sweep``.
+
+Arguments are documented there; images are laid out as in ``ground.kernels.resampling``.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pimper_torch.ground.kernels.arrays import (
+    Doubles1,
+    Floats1,
+    Floats2,
+    Floats3,
+    Floats4,
+    Integers1,
+    Integers2,
+    Masks3,
+    Masks4,
+    PictureRows,
+    Projection,
+    Samples,
+)
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
+
+Array = NDArray[Any]
+
+FLOOR = float(np.finfo(np.float32).eps)
+
+
+@compiled(
+    "float32(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,::1], int64, int64, float32,"
+    "float64, float64)"
+)
+def _gray(
+    finest: Array,
+    coarser: Array,
+    levels: Array,
+    fractions: Array,
+    view: int,
+    level: int,
+    blend: float,
+    u: float,
+    v: float,
+) -> float:
+    """Sample the pyramid trilinearly."""
+    tall, wide = levels[level, 0], levels[level, 1]
+    index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
+    at, right, below, across, down = index
+    if level == 0:
+        value = bilinear(finest, view, at, right, below, across, down)
+    else:
+        value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
+    if blend > 0:
+        level += 1
+        tall, wide = levels[level, 0], levels[level, 1]
+        index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
+        at, right, below, across, down = index
+        coarser_value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
+        value += blend * (coarser_value - value)
+    return value
+
+
+@compiled("float32(float32[::1], int64[::1], int64)")
+def lower_median(values: Array, order: Array, count: int) -> float:
+    """Return the lower median of the first ``count`` values.
+
+    By insertion sort of ``order``: linear time if it is nearly sorted.
+    """
+    for last in range(1, count):
+        candidate = order[last]
+        index = last
+        while index > 0 and values[order[index - 1]] > values[candidate]:
+            order[index] = order[index - 1]
+            index -= 1
+        order[index] = candidate
+    return values[order[(count - 1) // 2]]
+
+
+@compiled(
+    "float64(float32[:,::1], int64, float32[::1], float32[::1], int64, float32, float32[::1],"
+    "int64[::1])",
+    fast=True,
+)
+def _inconsistency(
+    radiance: Array,
+    step: int,
+    shading: Array,
+    per_shading: Array,
+    count: int,
+    per_scale: float,
+    ratios: Array,
+    order: Array,
+) -> float:
+    """See :func:`~pimper_torch.method.sweep.costs.inconsistency`; for one sample and height."""
+    for view in range(count):
+        ratios[view] = radiance[step, view] * per_shading[view]
+    albedo = np.float32(lower_median(ratios, order, count))
+    one = np.float32(1)
+    for _ in range(2):
+        square, product = np.float32(0), np.float32(0)
+        for view in range(count):
+            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
+            lit = shading[view] / (one + residual * residual)
+            square += lit * shading[view]
+            product += lit * radiance[step, view]
+        albedo = product / square if square > 0 else product
+    cost = 0.0
+    for first in range(0, count, 8):  # products of eight do not overflow
+        factors = 1.0
+        for view in range(first, min(first + 8, count)):
+            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
+            factors *= 1.0 + np.float64(residual) * np.float64(residual)
+        cost += math.log(factors)
+    return 0.5 * cost
+
+
+@compiled("int64(float32[::1], int64[::1], float32[::1])")
+def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
+    """See :func:`~pimper_torch.method.sweep.costs.poses_first`; views of rating 0 are not usable.
+
+    Returns:
+        How many poses have a usable view.
+    """
+    distinct = 0
+    for view in range(len(ratings)):
+        better = 0
+        if ratings[view] > 0 and len(poses):
+            for other in range(len(ratings)):
+                if poses[other] == poses[view] and (
+                    ratings[other] > ratings[view]
+                    or (ratings[other] == ratings[view] and other < view)
+                ):
+                    better += 1
+        demoted[view] = ratings[view] - np.float32(better)
+        distinct += ratings[view] > 0 and better == 0
+    return distinct
+
+
+class Shading(NamedTuple):
+    """Normals that light shades, lights of every patch and view, and factors of radiance."""
+
+    normals: Floats4
+    lights: Floats3
+    gains: Floats2
+
+
+class Trial(NamedTuple):
+    """The heights of every sample that are tried.
+
+    Attributes:
+        tested: Samples that may be swept.
+        valid: Where a view has the sample.
+        scale: Of the robust loss, for every patch.
+        ladder: In units of the samples' spacing.
+        poses: Number of each view's pose; empty where every view has its own.
+        num_views: Maximum number of views of a sample.
+        min_views: A sample with fewer views is not swept.
+        min_facing: Lower bound of the cosine that shrinks footprints.
+    """
+
+    tested: Masks3
+    valid: Masks4
+    scale: Floats1
+    ladder: Doubles1
+    poses: Integers1
+    num_views: int
+    min_views: int
+    min_facing: float
+
+
+class Choice(NamedTuple):
+    """The views that a sample is compared in, and room to choose them.
+
+    Attributes:
+        views: The best first.
+        score: Of these.
+        shading: Of albedo 1, in every view; facings and footprints where a view may be chosen.
+        ratings: Of every view, 0 where it may not.
+        demoted: Ratings, less one for each better view of the same pose.
+    """
+
+    views: Integers1
+    score: Floats1
+    shading: Floats1
+    facings: Doubles1
+    footprints: Doubles1
+    ratings: Floats1
+    demoted: Floats1
+
+
+@compiled()
+def room(views: int, limit: int) -> Choice:
+    """Return a choice of ``limit`` out of some views, to be made."""
+    return Choice(
+        np.empty(limit, np.int64),
+        np.empty(limit, np.float32),
+        np.empty(views, np.float32),
+        np.empty(views, np.float64),
+        np.empty(views, np.float64),
+        np.empty(views, np.float32),
+        np.empty(views, np.float32),
+    )
+
+
+@compiled()
+def choose(
+    patch: int,
+    row: int,
+    column: int,
+    projection: Projection,
+    focals: Array,
+    samples: Samples,
+    shaded: Shading,
+    trial: Trial,
+    choice: Choice,
+) -> int:
+    """Choose the views of a sample.
+
+    Returns:
+        How many; 0 where the sample is not swept.
+    """
+    _, image_from_patch, centers_patch = projection
+    origin, spacing, depth, outward = samples
+    normals, lights, _ = shaded
+    tested, valid, _, _, poses, _, min_views, _ = trial
+    chosen, score, shading, facings, footprints, ratings, demoted = choice
+    views, limit = len(shading), len(chosen)
+    if not tested[patch, row, column]:
+        return 0
+    num_valid = 0
+    for view in range(views):
+        num_valid += valid[patch, view, row, column]
+    if num_valid < min_views:
+        return 0
+    x = origin[patch, 0] + spacing[patch] * column
+    y = origin[patch, 1] + spacing[patch] * row
+    z = np.float64(depth[patch, row, column])
+    ox = np.float64(outward[patch, row, column, 0])
+    oy = np.float64(outward[patch, row, column, 1])
+    oz = np.float64(outward[patch, row, column, 2])
+    mean_shading = np.float32(0)
+    for view in range(views):
+        light = lights[patch, view]
+        shade = light[0] + light[1] * normals[patch, row, column, 0]
+        shade += light[2] * normals[patch, row, column, 1]
+        shade += light[3] * normals[patch, row, column, 2]
+        shading[view] = shade
+        mean_shading += max(shade, np.float32(0))
+    mean_shading /= np.float32(views)
+    for view in range(views):
+        ratings[view] = 0
+        if not valid[patch, view, row, column] or not shading[view] > 0:
+            continue
+        center = centers_patch[patch * views + view]
+        a, b, c = center[0] - x, center[1] - y, center[2] - z
+        facing = a * ox + b * oy + c * oz
+        if not facing > 0:
+            continue
+        facing /= math.sqrt(a * a + b * b + c * c)
+        m = image_from_patch[patch * views + view]
+        z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        footprint = spacing[patch] * focals[view] / max(z_cam, FLOOR)
+        facings[view], footprints[view] = facing, footprint
+        rating = facing * min(footprint, 1.0) * min(shading[view] / mean_shading, 1.0)
+        ratings[view] = np.float32(rating)
+    num_distinct = _after_other_poses(ratings, poses, demoted)
+    num_chosen = 0
+    for view in range(views):
+        rating = demoted[view]
+        if not ratings[view] > 0:
+            continue
+        if num_chosen == limit and not rating > score[limit - 1]:
+            continue
+        index = min(num_chosen, limit - 1)
+        while index > 0 and score[index - 1] < rating:
+            score[index], chosen[index] = score[index - 1], chosen[index - 1]
+            index -= 1
+        score[index], chosen[index] = rating, view
+        num_chosen = min(num_chosen + 1, limit)
+    return num_chosen if min(num_chosen, num_distinct) >= min_views else 0
+
+
+@compiled()
+def look_up(
+    gray: PictureRows,
+    levels: Array,
+    fractions: Array,
+    row: int,
+    path: Array,
+    spacing: float,
+    ladder: Array,
+    squared_footprint: float,
+    gain: float,
+    radiance: Array,
+) -> None:
+    """Look a sample up in a view at all heights.
+
+    Args:
+        row: Of the photograph among the pictures.
+        path: Images of the sample and of its outward normal, homogeneous.
+        spacing: Unit of the ladder.
+        gain: One over the view's exposure.
+        radiance: Set to ``gain`` times the picture, for every height.
+    """
+    level, blend = blended_level(squared_footprint, len(levels))
+    for step in range(len(ladder)):
+        move = spacing * ladder[step]
+        z_cam = path[0, 2] + move * path[1, 2]
+        inverse_z = 1 / z_cam if z_cam != 0 else 1.0
+        radiance[step] = gain * _gray(
+            gray.finest,
+            gray.coarser,
+            levels,
+            fractions,
+            row,
+            level,
+            blend,
+            inverse_z * (path[0, 0] + move * path[1, 0]),
+            inverse_z * (path[0, 1] + move * path[1, 1]),
+        )
+
+
+@compiled()
+def trace(m: Array, samples: Samples, patch: int, row: int, column: int, path: Array) -> None:
+    """Project a sample, and its outward normal, by a 3x4 matrix."""
+    origin, spacing, depth, outward = samples
+    x = origin[patch, 0] + spacing[patch] * column
+    y = origin[patch, 1] + spacing[patch] * row
+    z = np.float64(depth[patch, row, column])
+    ox = np.float64(outward[patch, row, column, 0])
+    oy = np.float64(outward[patch, row, column, 1])
+    oz = np.float64(outward[patch, row, column, 2])
+    for i in range(3):
+        path[0, i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+        path[1, i] = m[i, 0] * ox + m[i, 1] * oy + m[i, 2] * oz
+
+
+@compiled(annotated=True)
+def costs(
+    gray: PictureRows,
+    levels: Integers2,
+    projection: Projection,
+    focals: Doubles1,
+    samples: Samples,
+    shaded: Shading,
+    trial: Trial,
+    cost: Floats4,
+    swept: Floats3,
+) -> None:
+    """Choose the views of each sample, and evaluate its cost at all heights.
+
+    Args:
+        levels: Height, width and offset of every level.
+        swept: Result, zero before: 1 where a sample has costs.
+    """
+    patches, views, height, width = trial.valid.shape
+    heights, limit = len(trial.ladder), min(trial.num_views, views)
+    choice = room(views, limit)
+    lit = np.empty(limit, np.float32)
+    per_lit = np.empty(limit, np.float32)
+    ratios = np.empty(limit, np.float32)
+    order = np.empty(limit, np.int64)
+    fractions = shrinkage(levels)
+    radiance = np.empty((heights, limit), np.float32)
+    path = np.empty((2, 3))
+    for patch in range(patches):
+        per_scale = np.float32(1) / trial.scale[patch]
+        for row in range(height):
+            for column in range(width):
+                count = choose(
+                    patch, row, column, projection, focals, samples, shaded, trial, choice
+                )
+                if count == 0:
+                    continue
+                for slot in range(count):
+                    view = choice.views[slot]
+                    lit[slot] = choice.shading[view]
+                    per_lit[slot] = np.float32(1) / choice.shading[view]
+                    order[slot] = slot
+                    m = projection.image_from_patch[patch * views + view]
+                    trace(m, samples, patch, row, column, path)
+                    footprint = choice.footprints[view]
+                    look_up(
+                        gray,
+                        levels,
+                        fractions,
+                        projection.rows[view],
+                        path,
+                        samples.spacing[patch],
+                        trial.ladder,
+                        footprint * footprint * max(choice.facings[view], trial.min_facing),
+                        shaded.gains[patch, view],
+                        radiance[:, slot],
+                    )
+                swept[patch, row, column] = 1
+                for step in range(heights):
+                    cost[patch, step, row, column] = _inconsistency(
+                        radiance, step, lit, per_lit, count, per_scale, ratios, order
+                    )

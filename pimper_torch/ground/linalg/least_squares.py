@@ -1,0 +1,101 @@
+"""Normal equations of sparse least squares."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from pimper_torch.ground.kernels.arrays import as_array
+
+
+def normal_equations(
+    unknowns: Int[Tensor, "equation term"],
+    coefficients: Float[Tensor, "equation term"],
+    targets: Float[Tensor, " equation"],
+    weights: Float[Tensor, " equation"],
+    size: int,
+) -> tuple[
+    Int[Tensor, " entry"],
+    Int[Tensor, " entry"],
+    Float[Tensor, " entry"],
+    Float[Tensor, " unknown"],
+]:
+    r"""Return :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
+
+    Args:
+        coefficients: Of these. Pad shorter equations with 0 of any unknown.
+        weights: Of each equation, not negative.
+
+    Returns:
+        Rows, columns and values of the matrix, duplicate entries adding up, and the
+        right-hand side. Sets of equations are combined by concatenating entries and adding
+        right-hand sides. Differentiable in all but the indices.
+    """
+    scaled = weights[:, None] * coefficients
+    blocks = scaled[:, :, None] * coefficients[:, None, :]
+    rows = unknowns[:, :, None].expand_as(blocks)
+    cols = unknowns[:, None, :].expand_as(blocks)
+    rhs = scaled.new_zeros(size).index_add(
+        0, unknowns.flatten(), (scaled * targets[:, None]).flatten()
+    )
+    return rows.flatten(), cols.flatten(), blocks.flatten(), rhs
+
+
+# Of some equations: unknowns, coefficients, targets and weights.
+Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Float[Tensor, " _"]]
+
+
+def compressed_equations(
+    kinds: Sequence[Terms], damping: Float[Tensor, " unknown"], start: Float[Tensor, " unknown"]
+) -> tuple[csr_array, Float[Tensor, " unknown"]]:
+    """Return the normal equations of several sets by compiled kernels, in float64 on the CPU.
+
+    They take no memory beyond that of the matrix.
+
+    Args:
+        kinds: Unknowns, coefficients, targets and weights of each set, as in
+            :func:`normal_equations`.
+        damping: Weight of each unknown's prior; above 0.
+
+    Returns:
+        The matrix, columns in order, and the right-hand side. A constant to autograd.
+    """
+    from pimper_torch.ground.kernels import normal_equations as kernels
+
+    size = len(damping)
+    each = torch.arange(size)[:, None]
+    prior = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
+    sets = [_arrays(*kind) for kind in (prior, *kinds) if len(kind[0])]
+    counts, side = np.zeros(size, np.int32), np.zeros(size)
+    for unknowns, coefficients, targets, weights in sets:
+        kernels.count(unknowns, counts)
+        kernels.add_sides(unknowns, coefficients, targets, weights, side)
+    starts = np.zeros(size, np.int32)
+    np.cumsum(counts[:-1], out=starts[1:])
+    total = int(counts.sum(dtype=np.int64))
+    ends, columns, entries = starts.copy(), np.empty(total, np.int32), np.empty(total)
+    for unknowns, coefficients, _, weights in sets:
+        kernels.fill(unknowns, coefficients, weights, ends, columns, entries)
+    first = kernels.merge(starts, ends, columns, entries)
+    for array in (columns, entries):  # what duplicates took is given back, without a copy
+        array.resize(first[-1], refcheck=False)
+    matrix = csr_array((entries, columns, first), shape=(size, size))
+    return matrix, torch.from_numpy(side)
+
+
+def _arrays(
+    unknowns: Int[Tensor, "equation term"],
+    coefficients: Float[Tensor, "equation term"],
+    targets: Float[Tensor, " equation"],
+    weights: Float[Tensor, " equation"],
+) -> tuple[np.ndarray, ...]:
+    real = torch.promote_types(coefficients.dtype, targets.dtype)
+    return (
+        as_array(unknowns),
+        as_array(coefficients, real),
+        as_array(targets, real),
+        as_array(weights, torch.float64),
+    )

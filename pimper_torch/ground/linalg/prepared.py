@@ -1,0 +1,127 @@
+"""The base of sparse solvers: assembly of the matrix, and gradients of solutions."""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from torch import Tensor
+
+from pimper_torch.runtime.errors import NumericalError
+
+# Maximum residual of a solution, with the diagonal scaled to 1, relative to the right-hand side: a
+# choice, far above rounding and far below any noise of the data.
+WORST_RESIDUAL = 1e-6
+
+
+class SingularSystemError(NumericalError):
+    """Linear equations that do not determine their unknowns."""
+
+
+def refuse_hopeless(
+    entries: Float[Tensor, " entry"], diagonal: Float[Tensor, " unknown"], what: str
+) -> None:
+    """Refuse entries that are not finite and unknowns without a positive diagonal."""
+    if not bool(entries.isfinite().all()):
+        raise SingularSystemError(
+            f"{what} has {int((~entries.isfinite()).sum())} entries that are not finite "
+            "numbers; all must be. Look for zero weights or invalid samples in its input."
+        )
+    empty = torch.nonzero(diagonal <= 0).flatten()
+    if len(empty):
+        raise SingularSystemError(
+            f"{what} leaves {len(empty)} of {len(diagonal)} unknowns without a positive "
+            f"diagonal (the first is unknown {int(empty[0])}); each needs at least one equation "
+            "with positive weight. Add data or a prior for them."
+        )
+
+
+# Of the error's energy norm relative to the solution's: a choice; a digit costs one to two cycles.
+DEFAULT_TOLERANCE = 1e-10
+
+
+class PreparedMatrix(ABC):
+    r"""A sparse symmetric positive definite matrix, prepared for any number of right-hand sides.
+
+    :math:`A_{ij} = \sum_{k: (r_k, c_k) = (i, j)} v_k`: duplicate entries add up. Both triangles
+    must be given.
+
+    Args:
+        values: Of the entries; solutions are differentiable in them.
+        what: Names the system in errors, such as ``"the alignment"``.
+        tolerance: Of the error, in the energy norm, relative; a factor is exact.
+
+    Raises:
+        SingularSystemError: Entries that are not finite, or an unknown without a positive
+            diagonal.
+    """
+
+    def __init__(
+        self,
+        rows: Int[Tensor, " entry"],
+        cols: Int[Tensor, " entry"],
+        values: Float[Tensor, " entry"],
+        size: int,
+        what: str = "the linear system",
+        tolerance: float = DEFAULT_TOLERANCE,
+    ) -> None:
+        index = tuple(part.cpu().numpy().astype(np.int32) for part in (rows, cols))
+        entries = values.detach().double().cpu().numpy()
+        self._matrix = coo_array((entries, index), shape=(size, size)).tocsr()
+        self._diagonal = torch.from_numpy(self._matrix.diagonal())
+        refuse_hopeless(torch.from_numpy(self._matrix.data), self._diagonal, what)
+        if not values.requires_grad:  # gradients alone need the entries
+            rows, cols, values = (part.new_empty(0) for part in (rows, cols, values))
+        self.rows, self.cols, self._values, self._what = rows, cols, values, what
+        self._prepare(tolerance)
+
+    @abstractmethod
+    def _prepare(self, tolerance: float) -> None:
+        """Do once what all solves need."""
+
+    def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Solve for one right-hand side or several at once.
+
+        Differentiable in ``rhs`` and in the matrix's ``values``, any number of times, by adjoint
+        solves with the same preparation. A gradient with respect to ``values`` treats the
+        entries as free; used through a symmetric assembly it is exact.
+
+        Raises:
+            SingularSystemError: The solution does not satisfy the equations to 1e-6 of the
+                right-hand side, or the right-hand side is not finite.
+        """
+        solution: Tensor = _Solve.apply(self, self._values, rhs)  # type: ignore[no-untyped-call]
+        return solution
+
+    @abstractmethod
+    def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+        """Solve, constant to autograd, in device and dtype of rhs; see :meth:`solve` for errors."""
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        prepared: PreparedMatrix,
+        values: Float[Tensor, " entry"],
+        rhs: Float[Tensor, "unknown ..."],
+    ) -> Float[Tensor, "unknown ..."]:
+        solution = prepared.solve_values(rhs.detach())
+        ctx.prepared = prepared
+        ctx.save_for_backward(values, solution)
+        return solution
+
+    @staticmethod
+    def backward(
+        ctx: Any, upstream: Float[Tensor, "unknown ..."]
+    ) -> tuple[None, Float[Tensor, " entry"] | None, Float[Tensor, "unknown ..."]]:
+        values, solution = ctx.saved_tensors
+        prepared: PreparedMatrix = ctx.prepared
+        adjoint: Tensor = _Solve.apply(prepared, values, upstream)  # type: ignore[no-untyped-call]
+        into_values = None
+        if ctx.needs_input_grad[1]:
+            products = adjoint[prepared.rows] * solution[prepared.cols]
+            into_values = -products.reshape(len(values), -1).sum(dim=1).to(values)
+        return None, into_values, adjoint

@@ -1,0 +1,262 @@
+"""Robust losses, and robust estimates of scale."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.ground.kernels.twin_constants import (
+    CAUCHY,
+    GAUSSIAN_SCALE,
+    GEMAN_MCCLURE,
+    GEMAN_MCCLURE_TUNING,
+    HUBER,
+    HUBER_TUNING,
+    LONGEST_NEWTON_STEP,
+    NEWTON_STEPS,
+    SQUARES,
+)
+from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
+from pimper_torch.ground.linalg.sums import along_last
+from pimper_torch.runtime.config import Range, require_ranges
+
+Scale = Annotated[float, Range(above=0, most=1e12)]
+
+
+class Loss(ABC):
+    r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, by which outliers lose weight.
+
+    A loss of one's own defines :meth:`rho` and :meth:`weight`.
+
+    Attributes:
+        scale: ``s`` in standard deviations of the residuals.
+        code: Number of the loss in compiled kernels; without one, solvers run in torch.
+    """
+
+    scale: float
+    code: ClassVar[int | None] = None
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+    @abstractmethod
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the loss of squared residuals, both in units of the squared scale."""
+
+    @abstractmethod
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the derivative of :meth:`rho`, the weight of iteratively reweighted squares."""
+
+    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the derivative of :meth:`weight`, by autograd."""
+        return with_slope(self.weight, square)[1]
+
+    def weights(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Return the weight of each residual; that of a zero residual where the deviation is 0."""
+        return self.weight(_relative_square(residual, self.scale * deviation))
+
+    def curvatures(
+        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Return the second derivative of the loss by the residual, negative for some outliers."""
+        square = _relative_square(residual, self.scale * deviation)
+        return self.weight(square) + 2 * square * self.slope(square)
+
+
+@dataclass(frozen=True, slots=True)
+class Squares(Loss):
+    r"""Plain least squares, :math:`\rho = u`."""
+
+    code: ClassVar[int | None] = SQUARES
+    scale: Scale = 1.0
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the squares themselves."""
+        return square
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return 1."""
+        return torch.ones_like(square)
+
+
+@dataclass(frozen=True, slots=True)
+class Cauchy(Loss):
+    r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence."""
+
+    code: ClassVar[int | None] = CAUCHY
+    scale: Scale = CAUCHY_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return the logarithm."""
+        return square.log1p()
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`1 / (1 + u)`."""
+        return 1 / (1 + square)
+
+
+@dataclass(frozen=True, slots=True)
+class GemanMcClure(Loss):
+    r"""Geman and McClure's loss, :math:`\rho = u / (1 + u)`: outliers lose all influence.
+
+    Source: Geman & McClure, Bulletin of the International Statistical Institute 52(4), 1987.
+    """
+
+    code: ClassVar[int | None] = GEMAN_MCCLURE
+    scale: Scale = GEMAN_MCCLURE_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`u / (1 + u)`."""
+        return square / (1 + square)
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return :math:`1 / (1 + u)^2`."""
+        return 1 / (1 + square).square()
+
+
+@dataclass(frozen=True, slots=True)
+class Huber(Loss):
+    r"""Huber's loss, :math:`\rho = u` up to 1 and :math:`2 \sqrt u - 1` beyond: convex.
+
+    Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
+    """
+
+    code: ClassVar[int | None] = HUBER
+    scale: Scale = HUBER_TUNING
+
+    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return squares of small residuals, and sizes of large ones."""
+        return torch.where(square <= 1, square, 2 * square.clamp_min(1).sqrt() - 1)
+
+    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        r"""Return 1, and :math:`1 / \sqrt u` beyond."""
+        return square.clamp_min(1).rsqrt()
+
+
+def with_slope(
+    function: Callable[[Float[Tensor, "*batch"]], Float[Tensor, "..."]],
+    at: Float[Tensor, "*batch"],
+) -> tuple[Float[Tensor, "..."], Float[Tensor, "*batch"]]:
+    """Return a function's values and the derivative of their sum, both constant to autograd."""
+    with torch.enable_grad():
+        at = at.detach().requires_grad_()
+        found = function(at)
+        if not found.requires_grad:
+            return found, torch.zeros_like(at)
+        (slope,) = torch.autograd.grad(found.sum(), at)
+    return found.detach(), slope
+
+
+def median_deviation(
+    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
+) -> Float[Tensor, "*batch"]:
+    """Estimate residuals' standard deviation by their median absolute value; 0 if none is seen.
+
+    The factor 1.4826 makes it consistent for Gaussian noise. Where most residuals are close to
+    zero it rejects the others more strictly than :func:`robust_deviation`.
+    """
+    size = torch.where(seen, residual.abs(), torch.nan)
+    return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
+
+
+def robust_deviation(
+    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
+) -> Float[Tensor, "*batch"]:
+    r"""Estimate the standard deviation of residuals, robustly and differentiably.
+
+    An M-estimate of scale, of which the median absolute value is the limit of high powers: the
+    ``t`` with
+
+    .. math:: \frac1n \sum_i \frac{r_i^4}{r_i^4 + t^4} = \frac12.
+
+    Its breakdown point is a half, like that of the median; unlike the median it is a smooth
+    function of every residual.
+
+    Args:
+        residual: Ignored where not seen.
+        seen: False where missing.
+
+    Returns:
+        0 where none is seen, or half of them are zero. Differentiable by the implicit function.
+
+    >>> noise = torch.randn(100_000, generator=torch.Generator().manual_seed(0))
+    >>> torch.allclose(robust_deviation(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
+    True
+
+    Source: Huber, Robust Statistics, 1981, chapter 5, for M-estimates of scale.
+    """
+    variance = robust_variance(torch.where(seen, residual, 0).square(), seen)
+    positive = variance > 0
+    return torch.where(positive, torch.where(positive, variance, 1).sqrt(), 0)
+
+
+def robust_variance(
+    square: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
+) -> Float[Tensor, "*batch"]:
+    """Estimate the variance from squared residuals; see :func:`robust_deviation`.
+
+    Args:
+        square: Zero where not seen.
+        seen: False where missing.
+    """
+    half = seen.sum(dim=-1).to(square) / 2
+    determined = (square.detach() > 0).sum(dim=-1) > half
+    scale = _scale_of_squares(square.detach(), torch.where(determined, half, 1))[..., None]
+    fraction = _fractions(square, scale)
+    slope = 2 * along_last((fraction * (1 - fraction)).detach())
+    correction = (along_last(fraction) - half) / torch.where(slope > 0, slope, 1)
+    # One more Newton step, of length about zero: its derivative is the implicit function's.
+    variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
+    return torch.where(determined, variance / GAUSSIAN_SCALE**2, 0)
+
+
+@torch.no_grad()
+def _scale_of_squares(
+    square: Float[Tensor, "*batch item"], half: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Find the squared scale by Newton's method for its logarithm, from the mean square down."""
+    scale = along_last(square) / square.shape[-1]
+    scale = torch.where(scale > 0, scale, 1)
+    close = torch.finfo(square.dtype).eps ** 0.75
+    for _ in range(NEWTON_STEPS):
+        fraction = _fractions(square, scale[..., None])
+        slope = 2 * (along_last(fraction) - along_last(fraction.square()))
+        step = (along_last(fraction) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
+        scale = scale * step.clamp(-LONGEST_NEWTON_STEP, LONGEST_NEWTON_STEP).exp()
+        if bool((step.abs() < close).all()):
+            break
+    return scale
+
+
+def _fractions(
+    square: Float[Tensor, "*batch item"], scale: Float[Tensor, "*batch one"]
+) -> Float[Tensor, "*batch item"]:
+    ratio = (square / scale).clamp_max(1e9).square()
+    return ratio / (1 + ratio)
+
+
+def cauchy_weights(
+    residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch"]:
+    """Return the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
+
+    Iteratively reweighted least squares with them minimizes the sum of
+    ``scale^2 / 2 * log(1 + (r / scale)^2)``.
+
+    Source: Holland & Welsch, Communications in Statistics 6(9), 1977.
+    """
+    return 1 / (1 + _relative_square(residual, scale))
+
+
+def _relative_square(
+    residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch"]:
+    """Return squared residuals in units of the squared scale; 0 where the scale is 0."""
+    relative = torch.where(scale > 0, residual / torch.where(scale > 0, scale, 1), 0)
+    return relative * relative

@@ -1,0 +1,127 @@
+"""Solution of sparse systems by Cholesky or multigrid, by their size."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from pimper_torch.ground.linalg.aggregation import parts_of
+from pimper_torch.ground.linalg.multigrid import Multigrid, solve_by_cycles
+from pimper_torch.ground.linalg.prepared import (
+    DEFAULT_TOLERANCE,
+    SingularSystemError,
+    refuse_hopeless,
+)
+from pimper_torch.ground.linalg.sparse import SparseCholesky
+from pimper_torch.ground.linalg.sums import total
+from pimper_torch.records.failure import Failure
+from pimper_torch.runtime.failures import reason_of, skipped
+from pimper_torch.runtime.parallel import over_rows
+
+# At this size a factor takes three times as long to make as a hierarchy, and a third as long to
+# use; it is exact, and the three coordinates of a surface make up for half a second.
+_CHOLESKY_UNKNOWNS = 50_000
+
+# By kernels, a hierarchy is faster from this size on: the fusion of the demo's second iteration,
+# 34,000 and 137,000 unknowns, takes 6.1 s in place of 7.3.
+_COMPILED_CHOLESKY_UNKNOWNS = 10_000
+
+# Maximum fraction of positive entries off the diagonal for multigrid: a choice.
+_POSITIVE_FRACTION = 0.1
+
+
+def prepare(
+    rows: Int[Tensor, " entry"],
+    cols: Int[Tensor, " entry"],
+    values: Float[Tensor, " entry"],
+    size: int,
+    what: str = "the linear system",
+    *,
+    tolerance: float = DEFAULT_TOLERANCE,
+) -> SparseCholesky | Multigrid:
+    """Prepare a sparse symmetric positive definite matrix for any number of solves.
+
+    Multigrid serves more than 50,000 unknowns whose couplings are mostly negative, as those of
+    Laplacians are, and sparse Cholesky all others.
+
+    Args:
+        rows: Row of each entry; duplicate entries add up.
+        values: Of the entries; solutions are differentiable in them.
+        tolerance: Of multigrid: of the error, in the energy norm, relative.
+
+    Raises:
+        SingularSystemError: See :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky` and
+            :class:`~pimper_torch.ground.linalg.multigrid.Multigrid`.
+    """
+    if size > _CHOLESKY_UNKNOWNS and _like_a_laplacian(rows, cols, values):
+        return Multigrid(rows, cols, values, size, what, tolerance)
+    return SparseCholesky(rows, cols, values, size, what)
+
+
+def solutions(
+    rows: Int[Tensor, " entry"],
+    cols: Int[Tensor, " entry"],
+    values: Float[Tensor, " entry"],
+    *sides: Float[Tensor, "unknown ..."],
+    what: str = "the linear system",
+    tolerance: float = DEFAULT_TOLERANCE,
+) -> tuple[Float[Tensor, "unknown ..."], ...]:
+    """Solve for some right-hand sides, by a factor where multigrid does not converge.
+
+    Slivers among the faces of a mesh, and weights that differ by a factor of a million between
+    neighbours, may slow multigrid down.
+
+    Differentiable in ``values`` and in the sides.
+    """
+    size = len(sides[0])
+    prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
+    try:
+        return tuple(prepared.solve(side) for side in sides)
+    except SingularSystemError as error:
+        if isinstance(prepared, SparseCholesky):
+            raise
+        _by_factor(what, error)
+    factor = SparseCholesky(rows, cols, values, size, what)
+    return tuple(factor.solve(side) for side in sides)
+
+
+def solve_compressed(
+    matrix: csr_array,
+    sides: Float[Tensor, "unknown side"],
+    *,
+    what: str,
+    tolerance: float,
+    start: Float[Tensor, "unknown side"] | None = None,
+) -> Float[Tensor, "unknown side"]:
+    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""
+    from pimper_torch.ground.kernels import multigrid_levels as kernels
+
+    diagonal = torch.from_numpy(matrix.diagonal())
+    if len(sides) > _COMPILED_CHOLESKY_UNKNOWNS:
+        parts = over_rows(kernels.off_diagonal, len(sides), *parts_of(matrix))
+        positive, total = (sum(part) for part in zip(*parts, strict=True))
+        if positive <= _POSITIVE_FRACTION * total:
+            refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
+            try:
+                return solve_by_cycles(matrix, diagonal, sides, tolerance, what, start).values
+            except SingularSystemError as error:
+                _by_factor(what, error)
+    rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
+    index = torch.from_numpy(rows), torch.from_numpy(matrix.indices).long()
+    return SparseCholesky(*index, torch.from_numpy(matrix.data), len(sides), what).solve(sides)
+
+
+def _by_factor(what: str, error: SingularSystemError) -> None:
+    """Note that multigrid did not converge."""
+    done = "It is solved by a Cholesky factor instead, which takes more time and memory"
+    failure = Failure(stage="linalg", what="solver", name=what, reason=reason_of(error), done=done)
+    skipped(failure, error=error)
+
+
+def _like_a_laplacian(
+    rows: Int[Tensor, " entry"], cols: Int[Tensor, " entry"], values: Float[Tensor, " entry"]
+) -> bool:
+    off = values.detach()[rows != cols]
+    positive = float(total(torch.where(off > 0, off, 0)))
+    return positive <= _POSITIVE_FRACTION * float(total(off.abs()))

@@ -1,0 +1,217 @@
+"""The chain from coarse to fine: all facets together, each pass on the surface before."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import torch
+from torch import nn
+
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.pyramids import prepare
+from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.method.chains.chain import Chain, Step
+from pimper_torch.method.chains.photometric import Factorizing, Photometric, Sweeping, Warping
+from pimper_torch.method.chains.running import Running
+from pimper_torch.method.coarse.remesh import Remesh, RemeshConfig
+from pimper_torch.method.coarse.surface import CoarseSurface, CoarseSurfaceConfig
+from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.meshing.repair import Repair
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.warp import Warp, WarpConfig
+from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.method.photometry.gauge import FixGauge
+from pimper_torch.method.photometry.lights import thinned
+from pimper_torch.method.sfm.poses import one_view_a_pose
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.method.sweep.sweep import Sweep, SweepConfig
+from pimper_torch.priors.settled import settled
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    Mesh,
+    PatchSet,
+    PatchViews,
+    PhotometricPatches,
+    Silhouettes,
+    SparseScene,
+    Surface,
+    SweptPatches,
+    Views,
+)
+from pimper_torch.records.scene_parts import with_views
+from pimper_torch.runtime.config import Range, require, require_ranges
+from pimper_torch.runtime.failures import OnFailure
+from pimper_torch.runtime.memory import bytes_of, largest_problem
+from pimper_torch.runtime.reporting import Observer
+from pimper_torch.runtime.store import Store, opened
+
+# As many as a surface needs, as everywhere.
+_MIN_VIEWS = 3
+
+
+def held_apart(
+    scene: SparseScene, every: int, needed: Iterable[str] = ()
+) -> tuple[SparseScene, SparseScene | None]:
+    """Divide a scene into views that are used, and every n-th by name that is held out.
+
+    Args:
+        needed: Names, with their suffix or without, of views that are used in any case.
+
+    Returns:
+        Both with the whole cloud; the first is the scene itself where no view is held out.
+    """
+    names, stay = scene.views.names, set(needed)
+    ordered = sorted(range(len(names)), key=names.__getitem__)
+    chosen = ordered[every - 1 :: every] if every else []
+    held = [view for view in chosen if not stay & {names[view], names[view].rsplit(".", 1)[0]}]
+    if not held:
+        return scene, None
+    left = len(names) - len(held)
+    needs = f"a number that leaves {_MIN_VIEWS} views at least; it leaves {left}"
+    require(left >= _MIN_VIEWS, "hold_out", every, needs)
+    out = torch.zeros(len(names), dtype=torch.bool)
+    out[held] = True
+    return (
+        with_views(scene, ~out).replace(unregistered=scene.unregistered),
+        with_views(scene, out).replace(unregistered=()),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoarseToFineConfig:
+    """The settings of every stage of the chain from coarse to fine, in the order they run.
+
+    Attributes:
+        chain: Which chain these are the settings of.
+        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
+        max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
+            the first pass.
+        hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
+        scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
+        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
+        ``encoding``.
+    """
+
+    chain: ClassVar[str] = "coarse-to-fine"
+    on_failure: OnFailure = "skip"
+    max_memory: str = ""
+    hold_out: Annotated[int, Range(least=0, most=1_000_000)] = 0
+    scales: tuple[float, ...] = (0.25, 0.5, 1.0)
+    photographs: Encoding = field(default_factory=Encoding)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
+    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
+    light: FitLightConfig = field(default_factory=FitLightConfig)
+    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    fuse: FuseConfig = field(default_factory=FuseConfig)
+    remesh: RemeshConfig = field(default_factory=RemeshConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+
+    def __post_init__(self) -> None:
+        bytes_of(self.max_memory)
+        require_ranges(self)
+        require(self.hold_out != 1, "hold_out", self.hold_out, "0, or 2 at least")
+        # Photographs hold nothing between their pixels, and memory goes with the square.
+        sound = bool(self.scales) and all(0 < scale <= 4 for scale in self.scales)
+        require(sound, "scales", self.scales, "one at least, above 0 and at most 4 each")
+
+
+class CoarseToFine(Chain):
+    """A closed surface of what all views see, remeshed and fused again at every scale."""
+
+    def __init__(
+        self,
+        config: CoarseToFineConfig | None = None,
+        observer: Observer | None = None,
+        cache: Store | Path | str | None = None,
+        **stages: nn.Module,
+    ) -> None:
+        self.config = config = config or CoarseToFineConfig()
+        store = opened(cache)
+        super().__init__(observer, store, config.on_failure)
+        self.reconstruct = Reconstruct(config.reconstruct, store)
+        self.silhouettes = FindSilhouettes(config.silhouettes)
+        self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
+        self.coarse_surface: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = (
+            CoarseSurface(config.coarse_surface)
+        )
+        self.decompose = Decompose(config.decompose)
+        self.warp: Warping = Warp(config.warp)
+        self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
+        self.factorize: Factorizing = Factorize(config.factorize)
+        self.sweep: Sweeping = Sweep(config.sweep)
+        self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
+        self.fuse: Callable[..., Surface] = Fuse(config.fuse)
+        self.repair: Callable[[Surface], Surface] = Repair()
+        self.remesh: Callable[[SweptPatches, Surface, Contours], CoarseMesh] = Remesh(config.remesh)
+        self.extract = Extract(config.extract)
+        self._swap(stages)
+
+    def passes(
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
+    ) -> Iterator[Step]:
+        """Run the stages behind the coarse mesh once a scale."""
+        every = self.placed(run, views, sparse_model, mesh)
+        needed = (*self.references(), *self.needed)
+        placed, held_out = held_apart(every, self.config.hold_out, needed)
+        few = one_view_a_pose(placed, needed)
+        outlines = run(self.silhouettes, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        scene = settled(scene, silhouettes)
+        shown = scene if few.scene is placed else masked(few.scene, outlines)
+        contours = run(self.contours, outlines, shown.cameras)
+        coarse = run(self.coarse_surface, shown, contours, mesh)
+        if shown is not scene:
+            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
+        self.show(scene, coarse)
+        cameras, surface = scene.cameras, None
+        sources = run(prepare, scene.views, self.config.warp.saturation_level)
+        photometric = Photometric(self.warp, self.factorize, self.sweep)
+        by_blocks: tuple[float, ...] = ()
+        for scale, last in run.passes(self.config.scales):
+            patches = run(self.decompose, coarse, cameras, surface, scale)
+            if surface is None:
+                by_blocks = self._by_blocks(patches)
+            seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
+            light = run(self.light, seen)
+            del seen
+            heights = run(photometric, scene.views, cameras, patches, light, sources)
+            heights = heights.replace(photometric=run(self.gauge, heights.photometric))
+            if last:
+                del sources  # as much memory as the photographs themselves
+            surface = run(self.fuse, heights, contours, last, *by_blocks)
+            surface = run(self.repair, surface)
+            yield Step(
+                scale=scale,
+                last=last,
+                scene=scene,
+                held_out=held_out,
+                silhouettes=silhouettes,
+                heights=heights,
+                surface=surface,
+            )
+            if not last:
+                coarse = run(self.remesh, heights, surface, contours)
+
+    def _by_blocks(self, patches: PatchSet) -> tuple[float, ...]:
+        """Return how many vertices the fusion may solve for at once, if memory limits it."""
+        limit, scales = bytes_of(self.config.max_memory), self.config.scales
+        most = largest_problem(limit, patches, scales[0], scales[-1])
+        return () if math.isinf(most) else (most,)

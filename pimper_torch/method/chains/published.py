@@ -1,0 +1,143 @@
+"""The published chain: every facet by itself, then all joined."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from torch import nn
+
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.method.chains.chain import Chain, Step
+from pimper_torch.method.chains.photometric import Factorizing, Warping
+from pimper_torch.method.chains.running import Running
+from pimper_torch.method.coarse.surface import CoarseSurface, CoarseSurfaceConfig
+from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.warp import Warp, WarpConfig
+from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.method.photometry.gauge import FixGauge
+from pimper_torch.method.sfm.poses import one_view_a_pose
+from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.paper.align import Align, AlignConfig
+from pimper_torch.paper.integrate import Integrate
+from pimper_torch.paper.refine import Refine, RefineConfig
+from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.priors.settled import settled
+from pimper_torch.records import (
+    CoarseMesh,
+    DepthPatches,
+    Mesh,
+    PatchViews,
+    PhotometricPatches,
+    SparseScene,
+    Surface,
+    Views,
+)
+from pimper_torch.runtime.failures import OnFailure
+from pimper_torch.runtime.reporting import Observer
+from pimper_torch.runtime.store import Store, opened
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishedConfig:
+    """The settings of every stage of the published chain, in the order they run.
+
+    Attributes:
+        chain: Which chain these are the settings of.
+        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
+        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
+        ``encoding``.
+    """
+
+    chain: ClassVar[str] = "published"
+    on_failure: OnFailure = "skip"
+    photographs: Encoding = field(default_factory=Encoding)
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
+    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
+    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
+    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
+    light: FitLightConfig = field(default_factory=FitLightConfig)
+    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    extract: ExtractConfig = field(default_factory=ExtractConfig)
+
+
+class Published(Chain):
+    """Facets between points of the cloud, depth of each by its normals, then all joined.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
+    multi-view and multi-illumination images, 2015.
+    """
+
+    def __init__(
+        self,
+        config: PublishedConfig | None = None,
+        observer: Observer | None = None,
+        cache: Store | Path | str | None = None,
+        **stages: nn.Module,
+    ) -> None:
+        self.config = config = config or PublishedConfig()
+        store = opened(cache)
+        super().__init__(observer, store, config.on_failure)
+        self.reconstruct = Reconstruct(config.reconstruct, store)
+        self.silhouettes = FindSilhouettes(config.silhouettes)
+        self.triangulate: Callable[[SparseScene], CoarseMesh] = Triangulate(config.triangulate)
+        self.coarse_surface: Callable[[SparseScene, Contours, Mesh], CoarseMesh] = CoarseSurface(
+            config.coarse_surface
+        )
+        self.decompose = Decompose(config.decompose)
+        self.warp: Warping = Warp(config.warp)
+        self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
+        self.factorize: Factorizing = Factorize(config.factorize)
+        self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
+        self.integrate: Callable[[PhotometricPatches], DepthPatches] = Integrate()
+        self.align: Callable[[DepthPatches], DepthPatches] = Align(config.align)
+        self.refine: Callable[[DepthPatches], Surface] = Refine(config.refine)
+        self.extract = Extract(config.extract)
+        self._swap(stages)
+
+    def passes(
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
+    ) -> Iterator[Step]:
+        """Run once through the stages."""
+        placed = self.placed(run, views, sparse_model, mesh)
+        few = one_view_a_pose(placed, tuple(self.references()))
+        outlines = run(self.silhouettes, few.scene)
+        mesh = self.given_mesh(mesh, views, few.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        scene = settled(scene, silhouettes)
+        shown = scene if few.scene is placed else masked(few.scene, outlines)
+        if mesh is None:
+            coarse = run(self.triangulate, shown)
+        else:
+            contours = Contours.none(outlines, shown.cameras)
+            coarse = run(self.coarse_surface, shown, contours, mesh)
+        if shown is not scene:
+            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
+        self.show(scene, coarse)
+        patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
+        seen = run(self.warp, scene.views, scene.cameras, patches)
+        photometric = run(self.gauge, run(self.factorize, seen, run(self.light, seen)))
+        heights = run(self.align, run(self.integrate, photometric))
+        surface = run(self.refine, heights)
+        yield Step(
+            scale=1.0,
+            last=True,
+            scene=scene,
+            silhouettes=silhouettes,
+            heights=heights,
+            surface=surface,
+        )

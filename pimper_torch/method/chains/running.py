@@ -1,0 +1,104 @@
+"""Calls of a chain's stages: kept and reported."""
+
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ParamSpec, TypeVar
+
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+
+from pimper_torch.ground.kernels.compile import (
+    COARSE,
+    PHOTOMETRY,
+    SURFACE,
+    SWEEP,
+    all_compiled,
+    load,
+)
+from pimper_torch.records import Record
+from pimper_torch.runtime.errors import held
+from pimper_torch.runtime.journal import HASH, aside
+from pimper_torch.runtime.reporting import called
+from pimper_torch.runtime.reporting import stage as reported_stage
+from pimper_torch.runtime.store import Store, digest, kept
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Stages whose records are made in less time than they are read, and one that keeps its own.
+_NOT_KEPT = ("reconstruct", "contours", "prepare", "decompose", "warp", "gauge", "repair")
+
+# Kernels that a stage waits for in an installation's first run.
+_KERNELS: Mapping[str, Sequence[str]] = {
+    "silhouettes": COARSE,
+    "warp": PHOTOMETRY,
+    "photometry": SWEEP,
+    "fuse": SURFACE,
+}
+
+
+@dataclass(slots=True, kw_only=True)
+class Running:
+    """Calls the stages of a chain in one run: ``run(self.fuse, heights, contours)``.
+
+    A stage's record is that of an earlier run where the store has it, and is kept else, see
+    :func:`~pimper_torch.runtime.store.store`. A stage of another package is called every time, as
+    its code is not known, and so is one that gradients are asked of.
+
+    Attributes:
+        store: Where records are kept; nowhere without.
+        last: Whether this is the last pass. What stages of earlier ones warn of is told only where
+            they fail, as the last one warns of it, too.
+    """
+
+    names: Mapping[nn.Module, str]
+    store: Store | None
+    last: bool = True
+
+    def __call__(self, stage: Callable[P, R], *inputs: P.args, **named: P.kwargs) -> R:
+        """Return the record of a stage, or of a function."""
+        given = (*inputs, *named.values())
+        name = getattr(stage, "name", getattr(stage, "__name__", type(stage).__name__))
+        if isinstance(stage, nn.Module):
+            name = self.names.get(stage, name)
+        if name in _KERNELS and not all_compiled():
+            with reported_stage("compile"):
+                load(_KERNELS[name])
+        with nullcontext() if self.last else held():
+            return typing.cast(R, self._kept(name, stage, given))
+
+    def passes(self, scales: Sequence[float]) -> Iterator[tuple[float, bool]]:
+        """Walk through the scales of passes; yield each, and whether it is the last."""
+        for number, scale in enumerate(scales, start=1):
+            self.last = number == len(scales)
+            yield scale, self.last
+
+    def _kept(self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]) -> object:
+        """Find the record of a stage, or make it and keep it."""
+        make: Callable[[], Any] = partial(called, name, stage, *inputs)
+        cls = None if self.store is None or name in _NOT_KEPT else _returns(stage)
+        if cls is None:
+            return make()
+        with aside(HASH):
+            hashed = digest(stage, *inputs)
+        if hashed is None:
+            return make()
+        record, _ = kept(self.store, f"{name}-{hashed}", cls, make)
+        return _beside(record, inputs)
+
+
+def _returns(call: Callable[..., object]) -> type[Record] | None:
+    """Return the record that a call is annotated to return."""
+    function = call.forward if isinstance(call, nn.Module) else call
+    cls: Any = typing.get_type_hints(function).get("return")
+    return cls if isinstance(cls, type) and issubclass(cls, Record) else None
+
+
+def _beside(record: Record, inputs: tuple[object, ...]) -> Record:
+    """Put a record on the device of the inputs."""
+    records = [value for value in inputs if isinstance(value, Record)]
+    tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
+    return record.to(tensors[0].device) if tensors else record

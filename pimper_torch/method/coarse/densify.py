@@ -1,0 +1,429 @@
+"""Depth maps of all views from windows that match, coarse to fine."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, normalize
+
+from pimper_torch.ground.geometry.pixels import grid_from_pixels
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.coarse.window_matching import (
+    Matcher,
+    MatchingLevel,
+    Pairing,
+    Windows,
+    level_of,
+    pair,
+    shifted,
+)
+from pimper_torch.records import Record, SparseScene
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.failures import solved_or
+from pimper_torch.runtime.mapped import stacked, zeros
+from pimper_torch.runtime.memory import release_memory
+from pimper_torch.runtime.parallel import side_by_side
+
+# Views that a view is matched with. A choice.
+_NUM_SOURCES = 5
+
+# Fraction by which the whole range searched exceeds the points' inverse depths, on either side, as
+# the surface reaches beyond its sparse points.
+_RANGE_MARGIN = 0.15
+
+# Angle between rays that match best, the top of a bell curve: below about 5 degrees depth is poorly
+# determined, above about 25 windows look different.
+_BEST_ANGLE_DEG = 12.0
+
+# Of a valid depth: correlation of its windows; other views that agree, and their reprojection
+# error. Choices: two views seldom agree by chance; a pixel is what the finest step resolves.
+_MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
+
+# Steps between hypotheses, in pixels that they move by in the sources. Choices: correlation of
+# windows has a peak a pixel or two wide. Over the whole range; around a field from the coarser
+# resolution; around the best of either.
+_WHOLE_STEP, _NEAR_STEP, _LAST_STEP = 0.7, 0.8, 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DensifyConfig:
+    """The resolutions at which depth maps are searched.
+
+    Attributes:
+        coarsest_px: Longer side of the photographs, about, where the whole range of depths
+            is searched.
+        levels: How often the resolution doubles from there, that included.
+        max_hypotheses: Of the search of the whole range.
+    """
+
+    coarsest_px: Annotated[int, Range(least=32, most=65_535)] = 100
+    levels: Annotated[int, Range(least=1, most=16)] = 3
+    max_hypotheses: Annotated[int, Range(least=8, most=10_000)] = 160
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+    def factors(self, longest_px: int) -> tuple[int, ...]:
+        """Return by how much photographs of that size are reduced, the coarsest first."""
+        coarsest = max(1, round(longest_px / self.coarsest_px))
+        return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(self.levels)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class DepthMaps(Record):
+    """Depths of all views at one resolution.
+
+    Attributes:
+        factor: Pixels of the photographs along a side of one here.
+        agreed: How many other views agree; 0 where the windows do not match.
+        valid: True where enough of them agree, and the windows match.
+        step: Change of inverse depth that moves a pixel by one in the sources; one a view.
+        sources: The views each was matched with, -1 for none.
+    """
+
+    factor: int
+    level: MatchingLevel
+    inverse_depth: Float[Tensor, "view height width"]
+    agreed: Int[Tensor, "view height width"]
+    valid: Bool[Tensor, "view height width"]
+    step: Float[Tensor, " view"]
+    sources: Int[Tensor, "view source"]
+
+
+def depth_maps(
+    scene: SparseScene, points: Int[Tensor, " chosen"], config: DensifyConfig
+) -> tuple[DepthMaps, ...]:
+    """Search every view's depths: the whole range at low resolution, then near what was found.
+
+    Returns:
+        The maps of every resolution, the coarsest first.
+
+    Source: Schönberger et al., Pixelwise view selection for unstructured multi-view stereo, ECCV
+    2016, for windows, sources and consistency; planes are swept in place of random search.
+    """
+    maps: list[DepthMaps] = []
+    for factor in config.factors(max(scene.views.images.shape[-2:])):
+        level = level_of(scene, factor)
+        search = partial(_search, scene, points, level, config, maps[-1] if maps else None)
+        solve = partial(_search_or_nothing, search, scene.views.names, level)
+        # Small results among what threads free would keep their memory from being used again.
+        fields = zeros((2, *level.tone.shape), level.tone.dtype, level.tone.device)
+        found = []
+        for view, one in enumerate(side_by_side(solve, range(scene.cameras.num_views))):
+            fields[0, view], fields[1, view] = one.inverse_depth, one.score
+            found.append(one.replace(inverse_depth=fields[0, view], score=fields[1, view]))
+        maps.append(_checked(factor, level, fields, found))
+        release_memory()
+    return tuple(maps)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Found(Record):
+    inverse_depth: Float[Tensor, "height width"]
+    score: Float[Tensor, "height width"]
+    step: float
+    sources: Int[Tensor, " source"]
+
+
+def _search_or_nothing(
+    search: Callable[[int], _Found], names: Sequence[str], level: MatchingLevel, view: int
+) -> _Found:
+    blank = torch.zeros_like(level.tone[view])
+    none = torch.zeros(0, dtype=torch.long, device=blank.device)
+    return solved_or(
+        lambda: search(view),
+        lambda: _Found(inverse_depth=blank, score=blank, step=0.0, sources=none),
+        stage="coarse_surface",
+        name=f"depths of {names[view]}",
+        done="The coarse surface is found without these",
+    )
+
+
+def _search(
+    scene: SparseScene,
+    points: Int[Tensor, " chosen"],
+    level: MatchingLevel,
+    config: DensifyConfig,
+    before: DepthMaps | None,
+    view: int,
+) -> _Found:
+    sources = choose_sources(scene, points, view, _NUM_SOURCES)
+    here, cameras = points[scene.observed[points, view]], level.cameras
+    pixels, depth = project(
+        scene.points_world[here], cameras.cam_from_world[view], cameras.intrinsics[view]
+    )
+    within = ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
+    pixels, known = pixels[within], 1 / depth[within]
+    blank = torch.zeros_like(level.tone[view])
+    if len(sources) == 0 or len(known) < 3:
+        return _Found(inverse_depth=blank, score=blank, step=0.0, sources=sources)
+    pairing = pair(level, view, sources)
+    matcher = Matcher(level, pairing, Windows())
+    step = step_for_one_pixel(pairing, pixels, known)
+    if before is None:
+        found, score = _whole_range(matcher, pixels, known, blank, step, config.max_hypotheses)
+    else:
+        field = filled(before, view)
+        field = interpolate(field[None, None], blank.shape, mode="bilinear", align_corners=False)
+        found, score = _near(matcher, field[0, 0], step)
+    field = median3(found)
+    found, score = sweep(matcher, field, [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)])
+    return _Found(inverse_depth=found, score=score, step=step, sources=sources)
+
+
+def _whole_range(
+    matcher: Matcher,
+    pixels: Float[Tensor, "point 2"],
+    known: Float[Tensor, " point"],
+    blank: Float[Tensor, "height width"],
+    step: float,
+    max_hypotheses: int,
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Search planes parallel to the image, then offsets of a smooth surface through the points."""
+    low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
+    low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
+    low = max(low, 0.1 * high)
+    count = min(max_hypotheses, max(3, round((high - low) / (_WHOLE_STEP * step))))
+    found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
+    along = spanned(pixels, known, blank)
+    reach = min(10, count)
+    again, better = sweep(
+        matcher, along, [_WHOLE_STEP * step * rank for rank in range(-reach, reach + 1)]
+    )
+    return torch.where(better > score, again, found), torch.maximum(better, score)
+
+
+def _near(
+    matcher: Matcher, field: Float[Tensor, "height width"], step: float
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Search near a field, and near the larger and smaller depths on either side of its steps."""
+    offsets = [_NEAR_STEP * step * rank for rank in range(-3, 4)]
+    found, score = sweep(matcher, field, offsets)
+    for side in (_largest_around(field, 2), -_largest_around(-field, 2)):
+        again, better = sweep(matcher, side, offsets[2:-2])
+        found = torch.where(better > score, again, found)
+        score = torch.maximum(better, score)
+    return found, score
+
+
+def sweep(
+    matcher: Matcher, field: Float[Tensor, "height width"], offsets: Sequence[float]
+) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Find the best of some evenly spaced offsets of a field at every pixel.
+
+    Returns:
+        Inverse depth, between the offsets by the parabola through the best and those beside
+        it, and the best score.
+    """
+    smallest = torch.finfo(field.dtype).tiny
+    scores = matcher.scores(field, offsets)
+    score, best = scores.max(dim=0)
+    before = scores.gather(0, (best - 1).clamp_min(0)[None])[0]
+    after = scores.gather(0, (best + 1).clamp_max(len(offsets) - 1)[None])[0]
+    bend = before + after - 2 * score
+    inner = (best > 0) & (best < len(offsets) - 1) & (bend < 0)
+    shift = torch.where(inner, (before - after) / (2 * torch.where(inner, bend, -1)), 0)
+    spacing = offsets[1] - offsets[0] if len(offsets) > 1 else 0.0
+    at = field.new_tensor(offsets)[best] + spacing * shift.clamp(-0.5, 0.5)
+    return (field + at).clamp_min(smallest), score
+
+
+def _checked(
+    factor: int,
+    level: MatchingLevel,
+    fields: Float[Tensor, "2 view height width"],
+    found: Sequence[_Found],
+) -> DepthMaps:
+    """Find as valid the depths whose windows match and that other views agree with."""
+    inverse_depth, score = fields
+    sources = torch.full((len(found), _NUM_SOURCES), -1, device=score.device)
+    for view, one in enumerate(found):
+        sources[view, : len(one.sources)] = one.sources
+    good = (score >= _MIN_SCORE) & level.usable & (inverse_depth > 0)
+
+    def counted(view: int) -> Int[Tensor, "height width"]:
+        return agreeing(level, inverse_depth, good, view, found[view].sources, _MAX_ERROR_PX)
+
+    agreed = stacked(side_by_side(counted, range(len(found)), tracked=False), len(found))
+    return DepthMaps(
+        factor=factor,
+        level=level,
+        inverse_depth=inverse_depth,
+        agreed=agreed,
+        valid=good & (agreed >= _MIN_AGREEING),
+        step=score.new_tensor([one.step for one in found]),
+        sources=sources,
+    )
+
+
+def agreeing(
+    level: MatchingLevel,
+    inverse_depth: Float[Tensor, "view height width"],
+    good: Bool[Tensor, "view height width"],
+    view: int,
+    others: Int[Tensor, " other"],
+    max_error_px: float,
+) -> Int[Tensor, "height width"]:
+    """Count the views whose depths agree: there and back ends on the same pixel.
+
+    0 where the view's own depth is not good.
+    """
+    height, width = inverse_depth.shape[-2:]
+    count = torch.zeros_like(good[view], dtype=torch.long)
+    if len(others) == 0:
+        return count
+    chosen, known = good[view], inverse_depth[view][good[view]]
+    forth = pair(level, view, others)
+    pixels, ratio = forth.replace(ray=forth.ray[:, :, chosen]).look(known)
+    grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
+    there = nearest_pixels(inverse_depth[others], grid)
+    valid = nearest_pixels(good[others].to(there), grid) > 0.5
+    expected = known / ratio.clamp_min(1e-6)
+    # To first order, so that rounding to the source's nearest pixel does not count.
+    rate = _pixels_per_inverse_depth(level, view, others, pixels, there)
+    error = (there - expected).abs() * rate
+    count[chosen] = (valid & (ratio > 0) & (error <= max_error_px)).sum(dim=0)
+    return count
+
+
+def _pixels_per_inverse_depth(
+    level: MatchingLevel,
+    view: int,
+    others: Int[Tensor, " other"],
+    pixels: Float[Tensor, "other 2 point"],
+    inverse_depth: Float[Tensor, "other point"],
+) -> Float[Tensor, "other point"]:
+    """Differentiate the pixels in a view of other views' points by their inverse depth there."""
+    cameras = level.cameras
+    frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
+    relative = frames[view] @ torch.linalg.inv(frames[others])
+    rotation = intrinsics[view] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[others])
+    shift = (intrinsics[view] @ relative[:, :3, 3:])[..., 0].to(pixels)[:, :, None]
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
+    ray = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous)
+    at = ray + inverse_depth[:, None] * shift
+    depth = at[:, 2:].clamp_min(1e-6)
+    rate = (shift[:, :2] - at[:, :2] / depth * shift[:, 2:]) / depth
+    # The norm over an inner axis takes twenty times as long.
+    return torch.hypot(rate[:, 0], rate[:, 1])
+
+
+def filled(maps: DepthMaps, view: int) -> Float[Tensor, "height width"]:
+    """Fill a view's inverse depths where they are not valid.
+
+    First by the nearest of its sources' points, then smoothly from the neighbours.
+    """
+    field, known = maps.inverse_depth[view], maps.valid[view]
+    sources = maps.sources[view]
+    splat = torch.zeros_like(field)
+    for source in sources[sources >= 0].tolist():
+        splat = torch.maximum(splat, splatted(maps, source, view))
+    field = torch.where(known, field, splat)
+    return push_pull(field, known | (splat > 0))
+
+
+def splatted(maps: DepthMaps, source: int, view: int) -> Float[Tensor, "height width"]:
+    """Project one view's valid depths into another: the nearest of each pixel, 0 for none."""
+    one = torch.tensor([view], device=maps.valid.device)
+    pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
+    chosen = maps.valid[source] & (ratio[0] > 0)
+    height, width = chosen.shape
+    column, row = pixels[0][:, chosen].floor().long()
+    value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = (row * width + column)[inside]
+    flat = torch.zeros(height * width, dtype=value.dtype, device=value.device)
+    return flat.scatter_reduce(0, index, value[inside], "amax").reshape(height, width)
+
+
+def push_pull(
+    values: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
+) -> Float[Tensor, "height width"]:
+    """Fill holes smoothly from a pyramid of averages; known values stay.
+
+    Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.3.
+    """
+    weight = known.to(values)
+    if bool(known.all()) or not bool(known.any()) or min(values.shape) == 1:
+        return values if bool(known.any()) else torch.zeros_like(values)
+    stacked = torch.stack([values * weight, weight])[None]
+    total, fraction = avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0]
+    below = push_pull(total / fraction.clamp_min(1e-12), fraction > 0)
+    up = interpolate(below[None, None], values.shape, mode="bilinear", align_corners=False)
+    return torch.where(known, values, up[0, 0])
+
+
+def spanned(
+    pixels: Float[Tensor, "point 2"],
+    values: Float[Tensor, " point"],
+    like: Float[Tensor, "height width"],
+) -> Float[Tensor, "height width"]:
+    """Interpolate values smoothly from some pixels of an image to all."""
+    height, width = like.shape
+    column = pixels[:, 0].long().clamp(0, width - 1)
+    row = pixels[:, 1].long().clamp(0, height - 1)
+    known = torch.zeros_like(like).reshape(-1)
+    known = known.scatter_reduce(0, row * width + column, values.to(like), "amax")
+    known = known.reshape(height, width)
+    return push_pull(known, known > 0)
+
+
+def median3(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Take the median of every pixel and its eight neighbours."""
+    return torch.stack(shifted(values, 1, "replicate")).median(dim=0).values
+
+
+def _largest_around(
+    field: Float[Tensor, "height width"], radius: int
+) -> Float[Tensor, "height width"]:
+    return max_pool2d(field[None, None], 2 * radius + 1, 1, radius)[0, 0]
+
+
+def nearest_pixels(
+    maps: Float[Tensor, "other height width"], grid: Float[Tensor, "other point 2"]
+) -> Float[Tensor, "other point"]:
+    """Look maps up in the pixel that each place lies in."""
+    return grid_sample(maps[:, None], grid[:, None], mode="nearest", align_corners=False)[:, 0, 0]
+
+
+def choose_sources(
+    scene: SparseScene, points: Int[Tensor, " chosen"], view: int, count: int
+) -> Int[Tensor, " source"]:
+    """Choose the views to match a view with by shared points and the angles at them.
+
+    Returns:
+        The best first; fewer than ``count`` if the others share nothing.
+    """
+    observed = scene.observed[points]
+    here = observed[:, view]
+    points_world, shared = scene.points_world[points[here]], observed[here]
+    rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
+    angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
+    away = angle - _BEST_ANGLE_DEG
+    value = torch.exp(-(away / torch.where(away < 0, 4.0, 12.0)).square() / 2)
+    score = (value * shared).sum(dim=0)
+    score[view] = 0
+    order = score.argsort(descending=True)[:count]
+    return order[score[order] > 0]
+
+
+def step_for_one_pixel(
+    pairing: Pairing, pixels: Float[Tensor, "point 2"], inverse_depth: Float[Tensor, " point"]
+) -> float:
+    """Return the change of inverse depth that moves points by one pixel in the sources.
+
+    The median over points and sources: cameras round an object have about the same base.
+    """
+    height, width = pairing.ray.shape[-2:]
+    column = pixels[:, 0].long().clamp(0, width - 1)
+    row = pixels[:, 1].long().clamp(0, height - 1)
+    there = pairing.replace(ray=pairing.ray[:, :, row, column])
+    change = 0.01 * inverse_depth.median()
+    before, after = (there.look(inverse_depth + sign * change)[0] for sign in (-1, 1))
+    moved = (after - before).norm(dim=1).median()
+    return float(2 * change / moved.clamp_min(1e-6))

@@ -1,0 +1,251 @@
+"""The coarse surface: points where there is texture, contours at silhouettes, smooth between."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.pixels import crop_intrinsics
+from pimper_torch.ground.geometry.poisson import poisson_surface
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.method.coarse import trim
+from pimper_torch.method.coarse.densify import DensifyConfig
+from pimper_torch.method.coarse.oriented import (
+    OrientedPoints,
+    matched_cloud,
+    no_points,
+    pixel_size_at,
+)
+from pimper_torch.method.coarse.window_matching import level_of
+from pimper_torch.records import Cameras, ContourPoints, Record, Silhouettes, SparseScene
+from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.mapped import by_view, each, zeros
+
+# Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
+# those of the surface through points and contours (rims) that benchmarks/README.md measures:
+# the finest grid of the cloud; how far points and surface may lie outside the visual hull; how
+# near a face is to the points or contour points that support it.
+POINT_PX, TOLERANCE_PX, REACH_PX = 1.0, 4.0, 4.0
+
+# Barycentric coordinates, times 6, of the points of a facet that vote for its support.
+_VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class FineSurface(Record):
+    """The surface before it is simplified to facets.
+
+    Attributes:
+        support: Of each, a value of :class:`~pimper_torch.records.Support`.
+        pixel: Size of a pixel of the finest depth maps there, scene units.
+    """
+
+    vertices_world: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+    support: Int[Tensor, " face"]
+    pixel: float
+
+    def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
+        """Assign facets the support that this surface has nearest to most of their points."""
+        centre = self.vertices_world[self.faces].mean(dim=1)
+        points = torch.einsum("pk,fkc->fpc", corners.new_tensor(_VOTES) / 6, corners)
+        tree = cKDTree(centre.detach().cpu().numpy())
+        _, nearest = tree.query(points.flatten(0, 1).detach().cpu().numpy())
+        found = self.support[torch.from_numpy(nearest).to(self.support.device)]
+        return found.reshape(len(corners), len(_VOTES)).mode(dim=1).values
+
+
+def fine_surface(
+    scene: SparseScene,
+    reliable: Int[Tensor, " reliable"],
+    contours: Contours,
+    densify: DensifyConfig,
+    config: trim.FineSurfaceConfig,
+) -> FineSurface:
+    """Put a surface through matched points and contours, smooth where there are neither.
+
+    It is closed except where no view sees it, and where views look into an opening. Where
+    silhouettes constrain nothing, faces without points have to be near to some, and
+    illuminated in two views.
+
+    Args:
+        reliable: Points of the cloud inside the visual hull; an object without texture has none.
+        contours: Rays and visual hull of the silhouettes.
+
+    Raises:
+        ReconstructionError: Silhouettes and photographs support no surface.
+    """
+    part = cropped(scene, contours.silhouettes)
+    centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
+    cloud, maps = no_points(centre), None
+    if len(reliable) >= 16 or not contours.confine:
+        found, maps, pixel = matched_cloud(part, reliable, densify, POINT_PX)
+        near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
+        leave_out("coarse.matched", ~near, at=found.points_world)
+        cloud = found.take(near)
+        level = maps.level
+    else:
+        factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
+        pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
+    vertices, faces, contour = closed_surface(cloud, contours, pixel)
+    reach = REACH_PX * pixel
+    counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)
+    centres = vertices[faces].mean(dim=1)
+    support = trim.supports(centres, cloud, contour, counts, reach)
+    inside = contours.hull.holds(centres, TOLERANCE_PX * pixel)
+    leave_out("coarse.outside", ~inside, at=centres)
+    if not contours.confine:
+        near = trim.near_points(faces, centres, cloud, support, counts, pixel)
+        leave_out("coarse.far", inside & ~near, at=centres)
+        inside &= near
+    fraction = trim.min_fraction(contours)
+    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
+    if not bool(kept.any()):
+        raise ReconstructionError(
+            f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
+            "silhouettes. Look at the masks, leave them out, or give a mesh of your own."
+        )
+    used, faces = torch.unique(faces[kept], return_inverse=True)
+    return FineSurface(
+        vertices_world=vertices[used], faces=faces, support=support[kept], pixel=pixel
+    )
+
+
+def closed_surface(
+    cloud: OrientedPoints, contours: Contours, pixel: float
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], ContourPoints]:
+    """Put a closed surface through points, tangent to the rays through the silhouettes.
+
+    Where each ray touches it follows from the surface, and the surface from where rays touch
+    it: they are found in turn, from the points on. Parts that no camera sees do not count:
+    behind an object seen from one side the hull is deep, and the surface fills it.
+
+    Returns:
+        Vertices, faces, and the contour points that the surface goes through.
+    """
+    points, normals = cloud.points_world, cloud.normals_world
+    # The first time on the points, then each time on the surface before.
+    for _ in range(3):
+        touched = contours.touching(points, normals)
+        contour = OrientedPoints(
+            points_world=touched.points_world.to(cloud.points_world),
+            normals_world=touched.normals_world.to(cloud.points_world),
+            noise=touched.variance.sqrt().to(cloud.noise),
+        )
+        if len(cloud.points_world) + len(touched.ray) < 16:
+            raise ReconstructionError(
+                f"coarse mesh: {len(cloud.points_world)} points were matched inside the "
+                f"silhouettes, and {len(touched.ray)} rays touch the surface there; some hundreds "
+                "are needed. Take photographs that overlap more, look at the masks, or give a "
+                "mesh of your own."
+            )
+        # Points are denser than contours: without these an octree's cell is two of their grid.
+        cell = (trim.CELL_PX if len(touched.ray) else 2 * POINT_PX) * pixel
+        vertices, faces = poisson(OrientedPoints.cat([cloud, contour]), cell)
+        if not len(touched.ray):
+            break
+        normals = vertex_normals(vertices, faces)
+        front = visible_vertices(vertices, faces, normals, contours.cameras, trim.CELL_PX * pixel)
+        points, normals = vertices[front], normals[front]
+    return vertices, faces, touched
+
+
+def visible_vertices(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    normals: Float[Tensor, "vertex 3"],
+    cameras: Cameras,
+    tolerance: float,
+) -> Bool[Tensor, " vertex"]:
+    """Find the vertices that face a camera and are not occluded.
+
+    Args:
+        tolerance: A surface closer than this in front of a vertex does not occlude it.
+    """
+    caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
+    for center in cameras.centers_world.to(vertices):
+        towards = normalize(center - vertices, dim=1)
+        facing = ((towards * normals).sum(dim=1) > 0.1) & ~found
+        found[facing] = ~caster.occluded(vertices[facing], center, tolerance)
+    return found
+
+
+def poisson(
+    cloud: OrientedPoints, cell: float
+) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Put a closed surface through points with outward normals.
+
+    Args:
+        cell: Side of the octree's cells, scene units.
+    """
+    points = cloud.points_world
+    # COLMAP works in single precision: a cloud far from the origin is brought there.
+    centre = points.median(dim=0).values
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
+    # 1024 cells along a side bound the octree's memory.
+    depth = min(10, round(math.log2(extent / cell)))
+    vertices, faces = poisson_surface(
+        points - centre, cloud.normals_world, depth=depth, point_weight=1.0
+    )
+    return vertices.to(points) + centre, faces.to(points.device)
+
+
+def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
+    """Cut every photograph to its silhouette's bounding box, and mask it and what hides it.
+
+    The photographs share one raster: the largest box's. Views without a silhouette keep their
+    left upper corner, masked. Cameras follow; priors are left out, as their maps cover whole
+    photographs; observations keep their pixels, which are those of the photographs before
+    undistortion.
+
+    Args:
+        silhouettes: Of all views; unreliable ones mask their photographs too. Silhouettes that
+            constrain nothing give the scene as it is.
+    """
+    if silhouettes.source == "everything":
+        return scene
+    boxes = _boxes(silhouettes, scene.cameras.sizes_px)
+    low = boxes[:, 0]
+    size = boxes[:, 1] - low
+    width, height = size.amax(dim=0).tolist()
+    views, masks = scene.views, silhouettes.shown
+    images = zeros(
+        (*views.images.shape[:2], height, width), views.images.dtype, views.images.device
+    )
+    shown = zeros((views.num_views, height, width), torch.bool, images.device)
+    leave_out("coarse.cropping", by_view(lambda one, mask: one & ~mask, views.inside, masks))
+    intrinsics = scene.cameras.intrinsics.clone()
+    for view, (image, mask) in enumerate(each(views.images, masks)):
+        (left, top), (w, h) = low[view].tolist(), size[view].tolist()
+        rows, columns = slice(top, top + h), slice(left, left + w)
+        images[view, :, :h, :w] = image[:, rows, columns]
+        shown[view, :h, :w] = mask[rows, columns]
+        intrinsics[view] = crop_intrinsics(intrinsics[view], float(left), float(top))
+    return scene.replace(
+        views=views.replace(images=images, masks=shown, sizes_px=size, priors=()),
+        cameras=scene.cameras.replace(intrinsics=intrinsics, sizes_px=size),
+    )
+
+
+def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
+    """Return the corners of boxes round the silhouettes, first inside, then outside."""
+    masks = silhouettes.masks
+    ends = []
+    for axis in range(2):  # columns, then rows
+        along = by_view(lambda mask, axis=axis: mask.any(dim=axis), masks)
+        index = torch.arange(along.shape[1], device=along.device)
+        first = torch.where(along, index, along.shape[1]).amin(dim=1) - 8
+        last = torch.where(along, index, -1).amax(dim=1) + 9
+        ends.append(torch.stack([first, last], dim=1))
+    boxes = torch.stack(ends, dim=2)
+    empty = ~along.any(dim=1)
+    boxes = torch.where(empty[:, None, None], boxes.new_tensor([[0, 0], [1, 1]]), boxes)
+    limit = sizes_px.to(boxes)[:, None]
+    return torch.minimum(boxes.clamp_min(0), limit)

@@ -1,0 +1,336 @@
+"""Remeshing: facets that the surface departs from are split, unseen ones dropped."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, unit_face_normals
+from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
+from pimper_torch.ground.geometry.visual_hull import Hull
+from pimper_torch.ground.linalg.sums import total
+from pimper_torch.method.coarse import splitting
+from pimper_torch.method.coarse.trim import enclosed_holes
+from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.stage import Stage
+
+# Barycentric coordinate below which a subdivided mesh vertex lies on an edge: subdivided meshes
+# have far fewer than a million parts.
+_ON_EDGE = 1e-6
+
+# A facet whose corners would move stays where its area falls below this fraction, or its longest
+# side grows so many times: it collapses, or has an outlier for a corner. Choices.
+_MIN_AREA, _MAX_STRETCH = 0.05, 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemeshConfig:
+    """Which facets are split, and which dropped.
+
+    Attributes:
+        max_departure: Distance, in samples, that nine in ten of a facet's subdivided mesh vertices
+            may lie off its plane.
+        max_spread_deg: Root mean square angle of the surface's normals within a facet.
+        min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
+            never split.
+        max_facets: The worst facets are split first, as long as there are no more than so many
+            afterwards.
+        max_hole: Facets without data stay when neighbours enclose them and they have no more
+            than this fraction of the mesh's area together.
+    """
+
+    max_departure: Annotated[float, Range(above=0)] = 2.0
+    max_spread_deg: Annotated[float, Range(above=0, most=180)] = 12.0
+    min_samples: Annotated[float, Range(above=0, most=1e9)] = 12.0
+    max_facets: Annotated[int, Range(least=1, most=1_000_000)] = 5000
+    max_hole: Annotated[float, Range(least=0, below=1)] = 0.02
+
+    def __post_init__(self) -> None:
+        require_ranges(self, "remesh")
+
+
+class Remesh(Stage):
+    """Fit the coarse mesh to a surface. See :func:`remesh`."""
+
+    def __init__(self, config: RemeshConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RemeshConfig()
+
+    def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
+        """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
+
+        Lengths count in samples of these patches; the residual is their photometry's. Inside the
+        silhouettes' visual hull all facets stay, seen or not: the coarse surface is closed as far
+        as it should be, and facets outside the hull are dropped. Without a hull a facet that two
+        views see has data, illuminated or not.
+        """
+        patches, mesh = swept.patches, swept.patches.coarse.mesh
+        residual = surface.information.new_full((patches.num_patches,), torch.nan)
+        seen = torch.full_like(residual, contours.confine, dtype=torch.bool)
+        for templates, found, heights in zip(
+            patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
+        ):
+            known = torch.where(found.determined, found.convergence.residual, torch.nan)
+            residual[templates.facet] = known.detach().to(residual)
+            seen[templates.facet] |= heights.num_views >= 2
+        inside = within(contours.hull, surface, patches.num_patches)
+        leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
+        return remesh(
+            patches.coarse,
+            surface,
+            float(patches.buckets[0].spacing[0].detach()),
+            self.config,
+            residual=residual,
+            seen=seen,
+            inside=inside,
+        )
+
+
+def remesh(
+    coarse: CoarseMesh,
+    surface: Surface,
+    spacing: float,
+    config: RemeshConfig | None = None,
+    *,
+    residual: Float[Tensor, " facet"] | None = None,
+    seen: Bool[Tensor, " facet"] | None = None,
+    inside: Bool[Tensor, " facet"] | None = None,
+) -> CoarseMesh:
+    """Fit the coarse mesh to the surface that was reconstructed on it.
+
+    Every facet is split in four at most, neighbours are cut so that the mesh stays conforming
+    (see :mod:`~pimper_torch.method.coarse.splitting`), and all vertices, old and new, move onto the
+    surface. Where that would fold, flatten or stretch a facet, its vertices stay on the old
+    mesh.
+
+    Args:
+        coarse: The facets that ``surface`` is the subdivided mesh of.
+        surface: Subdivided mesh vertices on shared edges shared.
+        spacing: Of the samples that the next templates will have, scene units: the unit of the
+            settings.
+        residual: Of the photometry, one a facet, in any unit; NaN for none.
+        seen: True for facets that have data even where the surface has no support.
+        inside: False for facets outside the object, which are dropped even with data.
+
+    Returns:
+        The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
+        cloud follow :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
+        dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
+
+    A surface without support anywhere drops no facet. Vertices and normals are differentiable in
+    the surface's and the old mesh's; which facets are split, dropped or moved is constant.
+    """
+    config = config or RemeshConfig()
+    _require_subdivision(coarse, surface)
+    old = coarse.mesh.vertices_world
+    faces = coarse.mesh.faces
+    edges, face_edge = face_edges(faces)
+    corners, centres = _on_surface(old, faces, edges, face_edge, surface)
+    with torch.no_grad():
+        kept = _with_data(old, faces, surface, seen, config.max_hole)
+        leave_out("remesh.data", ~kept, at=(old, faces))
+        if inside is not None and bool((kept & inside).any()):
+            kept = kept & inside
+        severity = _severity(corners, faces, surface, spacing, residual, config)
+        side = _side(corners, faces) / spacing
+        small = (side < config.min_samples) | ~kept
+        marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
+        split = splitting.split_edges(old, faces, marked)
+    flat = torch.cat([old, old[edges[split.halved]].mean(dim=1)])
+    onto = torch.cat([corners, centres[split.halved]])
+    child_kept = kept[split.parent]
+    positions = _without_folds(flat, onto, split.faces[child_kept])
+    source, new_faces = vertex_fans(split.faces[child_kept])
+    index = torch.full_like(split.parent, -1)
+    index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
+    mesh = Mesh(vertices_world=positions[source], faces=new_faces)
+    mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
+    return splitting.with_points(coarse, mesh, split, index, source)
+
+
+def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
+    count = len(coarse.mesh.faces)
+    found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
+    if found == 0 or found > count:
+        raise InputError(
+            f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
+            "surface that was made on this mesh. Hand over the two of the same round."
+        )
+
+
+def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
+    """Find facets with a vertex of the surface inside the hull, or without own vertices."""
+    inside = hull.holds(surface.vertices_world.detach())
+    outside = torch.bincount(surface.facet[~inside], minlength=count)
+    return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
+
+
+def _on_surface(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    edges: Int[Tensor, "edge 2"],
+    face_edge: Int[Tensor, "face 3"],
+    surface: Surface,
+) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "edge 3"]]:
+    """Find vertices and midpoints of edges on the surface; these interpolate along the edge."""
+    zeros = surface.barycentric < _ON_EDGE
+    count = zeros.sum(dim=1)
+    (at,) = torch.nonzero(count == 2, as_tuple=True)
+    corner = surface.barycentric[at].argmax(dim=1, keepdim=True)
+    name = faces[surface.facet[at]].gather(1, corner)[:, 0]
+    moved = vertices.clone()
+    moved[name] = surface.vertices_world[at].to(moved)
+
+    (on,) = torch.nonzero(count == 1, as_tuple=True)
+    facet, opposite = surface.facet[on], zeros[on].long().argmax(dim=1, keepdim=True)
+    edge = face_edge[facet].gather(1, opposite)[:, 0]
+    far_slot = (faces[facet] == edges[edge, 1, None]).long().argmax(dim=1, keepdim=True)
+    along = surface.barycentric[on].gather(1, far_slot)[:, 0]
+    below, above = along <= 0.5, along >= 0.5
+    low = along.new_zeros(len(edges)).scatter_reduce(0, edge[below], along[below], "amax")
+    high = along.new_ones(len(edges)).scatter_reduce(0, edge[above], along[above], "amin")
+    start, end = moved[edges[:, 0]], moved[edges[:, 1]]
+    cut = surface.vertices_world[on].to(moved)
+    first, last = below & (along == low[edge]), above & (along == high[edge])
+    start[edge[first]], end[edge[last]] = cut[first], cut[last]
+    gap = high - low
+    fraction = torch.where(gap > 0, (0.5 - low) / torch.where(gap > 0, gap, 1), 0)[:, None]
+    return moved, (1 - fraction) * start + fraction * end
+
+
+def _with_data(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    surface: Surface,
+    seen: Bool[Tensor, " face"] | None,
+    max_hole: float,
+) -> Bool[Tensor, " face"]:
+    """Find facets with data, and small holes that those enclose."""
+    everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
+    supported = surface.supported
+    inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
+    if not bool(supported.any()):
+        return everything
+    inside = torch.bincount(surface.facet[inner], minlength=len(faces))
+    known = torch.bincount(surface.facet[inner & supported], minlength=len(faces)) > 0
+    # A facet too small to have vertices inside has data when all its corners have.
+    at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & supported
+    slot = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
+    at_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
+    at_vertex[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True
+    known = torch.where(inside > 0, known, at_vertex[faces].all(dim=1))
+    if seen is not None:
+        known = known | seen
+    if not bool(known.any()):
+        return everything
+    area = face_normals(vertices, faces).norm(dim=1) / 2
+    return known | enclosed_holes(vertices, faces, known, max_hole * float(total(area)))
+
+
+def _severity(
+    corners: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    surface: Surface,
+    spacing: float,
+    residual: Float[Tensor, " face"] | None,
+    config: RemeshConfig,
+) -> Float[Tensor, " face"]:
+    """Return the largest ratio of each facet's measures to their limits."""
+    limit = config.max_departure * spacing
+    worst = departures(corners, faces, surface) / limit
+    spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
+    worst = torch.maximum(worst, spread.to(worst))
+    if residual is not None:
+        typical = residual.nanmedian()
+        relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
+        worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
+    return worst
+
+
+def departures(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
+) -> Float[Tensor, " face"]:
+    """Return the 90th percentile of the surface's distances from each facet's plane."""
+    normals = unit_face_normals(vertices, faces)
+    centre = vertices[faces].mean(dim=1)
+    offset = surface.vertices_world.to(vertices) - centre[surface.facet]
+    distance = (offset * normals[surface.facet]).sum(dim=1).abs()
+    order = distance.argsort()
+    order = order[surface.facet[order].argsort(stable=True)]
+    count = torch.bincount(surface.facet, minlength=len(faces))
+    rank = (0.9 * (count - 1).clamp_min(0)).ceil().long()
+    last = (count.cumsum(dim=0) - count + rank).clamp_max(len(order) - 1)
+    return torch.where(count > 0, distance[order[last]], 0)
+
+
+def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
+    """Return the root mean square angle between the surface's normals and their facet's mean."""
+    weight = splitting.normal_weights(surface.information)
+    total = weight.new_zeros(count, 3)
+    total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
+    mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
+    length = total.norm(dim=1) / torch.where(mass > 0, mass, 1)
+    # Of small angles a from the mean, 1 - cos(a) is a^2 / 2.
+    return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
+
+
+def _side(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, " face"]:
+    """Return the side of the equilateral triangle of each facet's area."""
+    return (2 / 3**0.5 * face_normals(vertices, faces).norm(dim=1)).sqrt()
+
+
+def _worst_first(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    severity: Float[Tensor, " face"],
+    small: Bool[Tensor, " face"],
+    kept: Bool[Tensor, " face"],
+    max_facets: int,
+) -> Bool[Tensor, " edge"]:
+    """Find the edges of as many of the worst facets as the limit allows, by bisection."""
+    _, face_edge = face_edges(faces)
+    wanted = torch.where(small, 0, severity)
+    order = wanted.argsort(descending=True, stable=True)
+    most, least = int((wanted > 1).sum()), 0
+
+    def marks(count: int) -> Bool[Tensor, " edge"]:
+        chosen = torch.zeros_like(small)
+        chosen[order[:count]] = True
+        return splitting.mark_edges(vertices, faces, chosen, small)
+
+    def facets(marked: Bool[Tensor, " edge"]) -> int:
+        return int((1 + marked[face_edge].sum(dim=1))[kept].sum())
+
+    found = marks(most)
+    if facets(found) <= max_facets:
+        return found
+    while most - least > 1:
+        centre = (most + least) // 2
+        least, most = (centre, most) if facets(marks(centre)) <= max_facets else (least, centre)
+    return marks(least)
+
+
+def _without_folds(
+    flat: Float[Tensor, "vertex 3"], onto: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> Float[Tensor, "vertex 3"]:
+    """Move vertices onto the surface, except where that folds, flattens or stretches facets."""
+    before = face_normals(flat, faces)
+    size = before.square().sum(dim=1)
+    longest = _MAX_STRETCH * side_lengths(flat[faces]).amax(dim=1)
+    moving = onto.isfinite().all(dim=1)
+    while True:
+        moved = torch.where(moving[:, None], onto, flat)
+        along = (face_normals(moved, faces) * before).sum(dim=1)
+        bad = (along <= _MIN_AREA * size) | (side_lengths(moved[faces]).amax(dim=1) > longest)
+        bad &= moving[faces].any(dim=1)
+        if not bool(bad.any()):
+            return moved
+        moving[faces[bad].flatten()] = False

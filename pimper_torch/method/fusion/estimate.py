@@ -1,0 +1,258 @@
+r"""Least squares over terms of several kinds, whose noise is estimated along with the solution.
+
+Every kind claims variances that are right up to one factor. The factor is what its squared
+residuals show, robustly, over what they should show: of ``m`` equations,
+their redundancy :math:`m - \mathrm{tr}(A_k A^{-1})` remains, with :math:`A_k` what the kind adds to
+the matrix of the solution. Outliers lose weight by Cauchy's function as the factors settle.
+
+Source: Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979, for
+the factors; Hutchinson, A stochastic estimator of the trace, 1989, for the trace.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.kernels.arrays import as_array
+from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.ground.linalg.least_squares import compressed_equations, normal_equations
+from pimper_torch.ground.linalg.prepared import SingularSystemError
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, robust_variance
+from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.linalg.systems import solutions, solve_compressed
+from pimper_torch.method.fusion.equations import Equations
+from pimper_torch.records import Failure, Record
+from pimper_torch.runtime.failures import reason_of, skipped
+
+# Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a
+# spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
+_ACCURATE, _ESTIMATING, _EXACT = 1e-6, 1e-4, 1e-8
+
+# No source claims more than twice its true standard error: residuals of a kind that outweighs all
+# others vanish, which would raise its weight without bound.
+_MIN_FACTOR = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Fused(Record):
+    """The heights, the noise factor of each kind of terms, and the last system.
+
+    Attributes:
+        factors: What the variances that each kind claims were multiplied by.
+        weights: Of every equation of each kind; outliers have less than 1.
+        damping: Information of the heights that vertices start at.
+    """
+
+    heights: Float[Tensor, " vertex"]
+    factors: tuple[Float[Tensor, ""], ...]
+    kinds: tuple[Equations, ...]
+    weights: tuple[Float[Tensor, " _"], ...]
+    damping: Float[Tensor, " vertex"]
+
+    def matrix(
+        self,
+    ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
+        """Return rows, columns and values of the matrix that was solved last."""
+        start = torch.zeros_like(self.damping)
+        return _system(self.kinds, self.weights, self.factors, start, self.damping)[0]
+
+
+def fuse_terms(
+    kinds: Sequence[Equations],
+    start: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
+    iterations: int,
+    factors: Sequence[Float[Tensor, ""]] | None = None,
+) -> Fused:
+    """Solve, estimate the noise, and solve again.
+
+    Args:
+        kinds: Of terms; those without equations are skipped.
+        start: Heights that vertices keep without other terms.
+        factors: Of the noise, where they are known.
+
+    Differentiable in targets, coefficients, information, damping and start, through the weights and
+    the factors too: every solve answers by the implicit function. That takes as many more solves
+    as there were, once gradients are asked for.
+
+    Where the equations have no solution, heights are those of the solve before, or ``start``, and
+    that is told (:func:`~pimper_torch.runtime.failures.skipped`).
+    """
+    one = torch.ones((), dtype=torch.float64, device=start.device)
+    found = [one for _ in kinds] if factors is None else list(factors)
+    weights = [torch.ones_like(kind.information).double() for kind in kinds]
+    generator = torch.Generator().manual_seed(0)  # of signs: any will do
+    probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
+    probe = probe.double().to(start.device)
+    heights: Tensor | None = None
+    try:
+        for _ in range(iterations - 1):
+            heights, answer = _solved(
+                kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
+            )
+            for index, kind in enumerate(kinds):
+                if not kind.evaluated or len(kind.targets) == 0:
+                    continue
+                square, used = _evaluated(kind, weights[index], heights, probe, answer)
+                redundancy = 1 - used / found[index] / total(weights[index])
+                # Its estimate by random signs may be negative.
+                square = square / redundancy.clamp_min(0.05)
+                if factors is None:
+                    # The factor's standard error is then below 0.2 %.
+                    found[index] = noise_factor(square[:: max(1, len(square) // 500_000)])
+                weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
+        (heights,) = _solved(
+            kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
+        )
+    except SingularSystemError as error:
+        _kept(error)
+    return Fused(
+        heights=start.double() if heights is None else heights,
+        factors=tuple(found),
+        kinds=tuple(kinds),
+        weights=tuple(weights),
+        damping=damping,
+    )
+
+
+def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " vertex"]) -> Fused:
+    """Solve once more, for terms with common errors, with the weights that a solve has found.
+
+    Residuals from vertex to vertex do not show what normals err by together: slopes seem to have
+    less noise than they claim, and the points that contradict them more. So slopes have a factor of
+    1 at least here, and all others of 1 at most.
+
+    Args:
+        kinds: The same terms, in order; only information and correlation may differ.
+        start: Heights that vertices keep without other terms.
+
+    Differentiable as :func:`fuse_terms`, through the weights and factors too. Where the equations
+    have no solution, the heights are those of the solve before.
+    """
+    factors = tuple(
+        factor.clamp_max(1) if kind.unknowns.shape[1] == 1 else factor.clamp_min(1)
+        for kind, factor in zip(kinds, fused.factors, strict=True)
+    )
+    heights = fused.heights
+    try:
+        (heights,) = _solved(
+            kinds, fused.weights, factors, start, fused.damping, guess=heights, tolerance=_ACCURATE
+        )
+    except SingularSystemError as error:
+        _kept(error)
+    return fused.replace(heights=heights, factors=factors, kinds=tuple(kinds))
+
+
+def _kept(error: SingularSystemError) -> None:
+    """Note that a solve failed."""
+    failure = Failure(
+        stage="fuse",
+        what="solver",
+        name="the fusion",
+        reason=reason_of(error),
+        done="The surface is the one before that solve: of the solve before, or of the patches",
+    )
+    skipped(failure, error=error)
+
+
+def _solved(
+    kinds: Sequence[Equations],
+    weights: Sequence[Float[Tensor, " _"]],
+    factors: Sequence[Float[Tensor, ""]],
+    start: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
+    *more: Float[Tensor, " vertex"],
+    guess: Float[Tensor, " vertex"] | None,
+    tolerance: float,
+) -> tuple[Float[Tensor, " vertex"], ...]:
+    """Solve for the heights, and for more right-hand sides of the same matrix."""
+    parts = [part for kind in kinds for part in (kind.coefficients, kind.targets, kind.information)]
+    if not compiled_for(start, damping, *parts, *weights, *factors):
+        entries, rhs = _system(kinds, weights, factors, start, damping)
+        return solutions(*entries, rhs, *more, what="the fusion", tolerance=_EXACT)
+    terms = [
+        (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
+        for kind, weight, factor in zip(kinds, weights, factors, strict=True)
+    ]
+    matrix, rhs = compressed_equations(terms, damping, start)
+    near = None
+    if guess is not None:
+        near = torch.stack([guess, *(torch.zeros_like(guess) for _ in more)], dim=1)
+    sides = torch.stack([rhs, *more], dim=1)
+    found = solve_compressed(matrix, sides, what="the fusion", tolerance=tolerance, start=near)
+    return found.unbind(dim=1)
+
+
+def _evaluated(
+    kind: Equations,
+    weight: Float[Tensor, " equation"],
+    heights: Float[Tensor, " vertex"],
+    probe: Float[Tensor, " vertex"],
+    answer: Float[Tensor, " vertex"],
+) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
+    """Return squared residuals over the claimed variance, and the number of equations used up."""
+    parts = kind.coefficients, kind.targets, kind.information, kind.correlated
+    if compiled_for(*parts, weight, heights, answer):
+        from pimper_torch.ground.kernels import normal_equations as kernels
+
+        square = torch.empty_like(weight)
+        real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
+        arrays = [as_array(kind.unknowns), *(as_array(part, real) for part in parts)]
+        arrays += [as_array(each) for each in (weight, heights, probe, answer, square)]
+        evaluate: Any = kernels.judge
+        return square, torch.tensor(evaluate(*arrays), dtype=torch.float64)
+    square = kind.information.double() * kind.residual(heights).square() * kind.correlated
+    used = weight * kind.information * _sum(kind, probe) * _sum(kind, answer)
+    return square, total(used)
+
+
+def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
+    """Estimate the variance of Gaussian noise from its squares, robustly. Differentiable.
+
+    Args:
+        square: Of residuals, in units of the variance that is claimed, over the fraction of the
+            equations that the solution leaves over.
+
+    >>> noise = torch.randn(10000, generator=torch.Generator().manual_seed(1))
+    >>> bool(abs(noise_factor(4 * noise.double().square()) - 4) < 0.2)
+    True
+    """
+    everything = torch.ones_like(square, dtype=torch.bool)
+    return robust_variance(square, everything).clamp_min(_MIN_FACTOR)
+
+
+def _sum(kind: Equations, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+    return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
+
+
+def _system(
+    kinds: Sequence[Equations],
+    weights: Sequence[Float[Tensor, " _"]],
+    factors: Sequence[Float[Tensor, ""]],
+    start: Float[Tensor, " vertex"],
+    damping: Float[Tensor, " vertex"],
+) -> tuple[
+    tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
+    Float[Tensor, " vertex"],
+]:
+    """Return rows, columns and values of the matrix, and the right-hand side."""
+    everything = torch.arange(len(start), device=start.device)
+    rows, cols, values = [everything], [everything], [damping.double()]
+    rhs = damping.double() * start.double()
+    for kind, weight, factor in zip(kinds, weights, factors, strict=True):
+        row, col, value, right = normal_equations(
+            kind.unknowns,
+            kind.coefficients.double(),
+            kind.targets.double(),
+            weight * kind.information.double() / factor,
+            len(start),
+        )
+        rows.append(row)
+        cols.append(col)
+        values.append(value)
+        rhs = rhs + right
+    return (torch.cat(rows), torch.cat(cols), torch.cat(values)), rhs

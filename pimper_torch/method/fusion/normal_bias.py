@@ -1,0 +1,157 @@
+"""Errors that the terms of a facet have in common, as its light is fitted facet by facet.
+
+Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
+every facet, blended between facets, is taken out of the normals. Swept heights are found in the
+same light: their common error is not taken out, but its variance is given. Detail is solved for
+with independent errors, the coarse shape with common errors, and both are put together.
+
+Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
+precise 3D geometry, SIGGRAPH 2005, for the idea; facets, and functions linear on them,
+in place of a smoothing kernel are ours.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.geometry.subdivision import Subdivision
+from pimper_torch.ground.linalg.systems import prepare
+from pimper_torch.method.fusion.equations import Common, Equations
+from pimper_torch.records import Record
+
+# Median of the squared length of a vector of two components of unit Gaussian noise.
+MEDIAN_OF_TILT = 2 * math.log(2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NormalBias(Record):
+    """The mean difference of normals on every facet.
+
+    Attributes:
+        tilt: To be added to the normals; world.
+    """
+
+    tilt: Float[Tensor, "facet 3"]
+    count: Float[Tensor, " facet"]
+    known: Bool[Tensor, " facet"]
+
+    def variance(self) -> Float[Tensor, ""]:
+        """Return the variance of a tilt, robustly, for normals that still have theirs."""
+        return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
+
+    def at(
+        self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]
+    ) -> Float[Tensor, "vertex 3"]:
+        """Blend the tilts over the subdivided mesh, continuous across facets."""
+        size = int(facets.max()) + 1
+        corner = facets.flatten()
+        weight = self.count.repeat_interleave(3)
+        total = weight.new_zeros(size).index_add(0, corner, weight).clamp_min(1e-12)
+        summed = self.tilt.new_zeros(size, 3).index_add(
+            0, corner, (self.count[:, None] * self.tilt).repeat_interleave(3, dim=0)
+        )
+        return subdivision.interpolate(summed / total[:, None], facets)
+
+
+def normal_bias(
+    subdivision: Subdivision,
+    facets: Int[Tensor, "facet 3"],
+    normals: Float[Tensor, "vertex 3"],
+    shape: Float[Tensor, "vertex 3"],
+    known: Bool[Tensor, " vertex"],
+    most: float = 0.25,
+) -> NormalBias:
+    """Compare normals with those of a shape, facet by facet.
+
+    Args:
+        normals: Photometric, unit.
+        shape: Of the surface, unit.
+        most: Larger differences, as across a cliff, are cut to so many radians.
+
+    Differentiable.
+    """
+    difference = torch.where(known[:, None], shape - normals, 0)
+    size = difference.norm(dim=-1, keepdim=True)
+    difference = difference * (most / size.clamp_min(most))
+    one = known.to(difference)
+    count = one.new_zeros(len(facets)).index_add(0, subdivision.facet, one)
+    summed = difference.new_zeros(len(facets), 3)
+    summed = summed.index_add(0, subdivision.facet, difference)
+    return NormalBias(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
+
+
+def common_variance(
+    found: Equations,
+    heights: Float[Tensor, " vertex"],
+    facet: Int[Tensor, " vertex"],
+    otherwise: Int[Tensor, " term"],
+) -> Float[Tensor, ""]:
+    """Return the variance of the error that swept heights of one facet have in common.
+
+    Args:
+        found: The heights; one equation has one unknown.
+        heights: Of the surface, to which swept heights should have contributed little.
+        otherwise: Facets where the surface is known by other terms, which alone are evaluated.
+
+    Differentiable.
+    """
+    vertex = found.unknowns[:, 0]
+    size = int(facet.max()) + 1
+    off = found.residual(heights)
+    weight = found.information.to(off)
+    total = off.new_zeros(size).index_add(0, facet[vertex], weight)
+    mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
+    used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)
+    square = (mean[used] / total[used]).square()
+    # The median of the square of unit Gaussian noise.
+    return square.median() / 0.4549 if len(square) > 0 else off.new_zeros(())
+
+
+def common(
+    variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], known: Bool[Tensor, " vertex"]
+) -> Common:
+    """Return the error that the known vertices of each facet have in common."""
+    count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
+    return Common(variance=variance, count=count[facet].to(variance))
+
+
+class CoarsePart:
+    """Gives the continuous function linear on every facet that is nearest to values."""
+
+    def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:
+        self._subdivision, self._facets = subdivision, facets
+        self._size = int(facets.max()) + 1
+        fraction = subdivision.barycentric.double()
+        rows, cols, entries = [], [], []
+        for one in range(3):
+            for other in range(3):
+                rows.append(facets[:, one])
+                cols.append(facets[:, other])
+                product = fraction[:, one] * fraction[:, other]
+                sums = product.new_zeros(len(facets)).index_add(0, subdivision.facet, product)
+                entries.append(sums)
+        each = torch.arange(self._size, device=facets.device)
+        # It only keeps corners without a vertex from being singular.
+        damping = torch.full_like(each, 1e-3, dtype=fraction.dtype)
+        self._normal = prepare(
+            torch.cat([each, *rows]),
+            torch.cat([each, *cols]),
+            torch.cat([damping, *entries]),
+            self._size,
+            "the fusion's coarse shape",
+        )
+
+    def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
+        """Return it at the subdivided mesh's vertices, in one column or several. Differentiable."""
+        columns = values.double().reshape(len(values), -1)
+        side = columns.new_zeros(self._size, columns.shape[1])
+        for corner in range(3):
+            fraction = self._subdivision.barycentric[:, corner, None].double()
+            side = side.index_add(
+                0, self._facets[self._subdivision.facet, corner], fraction * columns
+            )
+        at = self._normal.solve(side)
+        return self._subdivision.interpolate(at, self._facets).to(values).reshape(values.shape)

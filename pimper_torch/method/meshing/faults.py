@@ -1,0 +1,148 @@
+"""Defective faces: stretched, overturned, folded; and connected components of vertices."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.geometry import topology
+from pimper_torch.ground.geometry.surfaces import (
+    face_normals,
+    side_lengths,
+    unit_face_normals,
+    vertex_normals,
+)
+
+# Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
+# edges of a box or of thin bones it is a right angle, give or take the noise of small faces.
+_FOLD = math.radians(110.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Faults:
+    """Criteria for defective faces of a surface, for any position of its vertices.
+
+    At a fold a surface turns back across one edge; where it bends, however far in all, it takes
+    several. Overturned faces without a fold round their component are on a facet that bends far.
+
+    Attributes:
+        along: Mean normal of each face's facet, of any length.
+        longest: Longest side of a sound face, scene units.
+    """
+
+    faces: Int[Tensor, "face 3"]
+    along: Float[Tensor, "face 3"]
+    longest: Float[Tensor, ""]
+
+    def broken(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Find faces stretched, on both sides of a fold, or overturned where a fold bounds them."""
+        return self.stretched(vertices) | self._folded(vertices)
+
+    def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
+        """Restrict to some of the faces; also list their vertices, which they index from 0."""
+        used, corners = torch.unique(self.faces[chosen], return_inverse=True)
+        return Faults(faces=corners, along=self.along[chosen], longest=self.longest), used
+
+    def stretched(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Find faces with a side that is too long."""
+        return side_lengths(vertices[self.faces]).amax(dim=1) > self.longest
+
+    def overturned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Find faces turned by more than 90 degrees from the mean normal of their facet."""
+        return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
+
+    def folded_over(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        """Find overturned faces where a fold bounds their component."""
+        return self._folded(vertices) & self.overturned(vertices)
+
+    def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+        normals, overturned = unit_face_normals(vertices, self.faces), self.overturned(vertices)
+        near = self._near_folds(vertices, normals, overturned).nonzero()[:, 0]
+        pairs = near[topology.face_pairs(self.faces[near])[0]]
+        one, other = pairs.unbind(dim=1)
+        fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(_FOLD)
+        found = torch.zeros_like(overturned)
+        found[pairs[fold].flatten()] = True
+        (index,) = torch.nonzero(overturned, as_tuple=True)
+        rank = overturned.cumsum(dim=0) - 1
+        label = topology.graph_components(rank[pairs[overturned[pairs].all(dim=1)]], len(index))
+        bounded = torch.zeros_like(index, dtype=torch.bool)
+        bounded[label[found[index]]] = True
+        found[index[bounded[label]]] = True
+        return found
+
+    def _near_folds(
+        self,
+        vertices: Float[Tensor, "vertex 3"],
+        normals: Float[Tensor, "face 3"],
+        overturned: Bool[Tensor, " face"],
+    ) -> Bool[Tensor, " face"]:
+        """Find the faces round vertices of overturned faces, and round those that may have a fold.
+
+        Two faces whose normals are within half a fold of any axis have no fold between them, so
+        that neighbours are looked for among few faces.
+        """
+        axis = vertex_normals(vertices, self.faces)
+        near = topology.corners_of(self.faces, overturned, len(vertices))
+        for corner in self.faces.unbind(dim=1):
+            # Rounding of a cosine in float32: faces that it adds change nothing.
+            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + 1e-3
+            near[corner[bent]] = True
+        return near[self.faces].any(dim=1)
+
+
+def faults(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    facet: Int[Tensor, " vertex"],
+    max_stretch: float,
+) -> Faults:
+    """Take the criteria for defective faces from a surface as it is.
+
+    Args:
+        facet: Of each vertex; a face belongs to the facet of most of its vertices.
+        max_stretch: Longest side, in multiples of the median.
+    """
+    return Faults(
+        faces=faces,
+        along=facet_means(vertices, faces, facet),
+        longest=max_stretch * side_lengths(vertices[faces]).median(),
+    )
+
+
+def facet_means(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], facet: Int[Tensor, " vertex"]
+) -> Float[Tensor, "face 3"]:
+    """Assign each face the mean normal of its facet, weighted by area, of any length."""
+    one, other, last = facet[faces].unbind(dim=1)
+    owner = torch.where(other == last, other, one)
+    normals = face_normals(vertices, faces)
+    return normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)[owner]
+
+
+def small_groups(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    among: Bool[Tensor, " vertex"],
+    max_extent: Float[Tensor, ""],
+) -> Bool[Tensor, " vertex"]:
+    """Find the vertices ``among`` whose connected component is small.
+
+    Args:
+        max_extent: Diagonal of a component's bounding box.
+    """
+    label = topology.vertex_components(faces, among)
+    count = int(label.max()) + 1 if len(label) else 0
+    index = label[:, None].expand_as(vertices)
+    like = vertices.new_zeros(count, 3)
+    high = like.scatter_reduce(0, index, vertices, "amax", include_self=False)
+    low = like.scatter_reduce(0, index, vertices, "amin", include_self=False)
+    small = (high - low).norm(dim=-1) <= max_extent
+    return among & small[label]
+
+
+def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+    """Return the diagonal of the points' bounding box."""
+    return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

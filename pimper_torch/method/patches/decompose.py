@@ -1,0 +1,246 @@
+"""Decomposition: every facet of the coarse mesh becomes a patch with a template."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import rigid, transform
+from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
+from pimper_torch.method.patches.transfer import transfer
+from pimper_torch.method.patches.view_choice import view_blocks
+from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
+from pimper_torch.runtime.config import Range, require_ranges
+from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.runtime.failures import skipped_patches
+from pimper_torch.runtime.memory import recomputed
+from pimper_torch.runtime.stage import Stage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecomposeConfig:
+    """Spacing of a facet's samples, and their reach over its edges.
+
+    Attributes:
+        samples_per_pixel: Template samples per pixel of the reference view; the paper's
+            zeta, made independent of the scene's unit.
+        overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
+        num_views: Largest number of views of a facet. Where more face one, each is seen in its best
+            ones, spread in direction, which it shares with a block of facets.
+        max_samples: Of all facets in all views that they face, ``num_views`` at most: where there
+            would be more, samples lie further apart. Bounds time and memory; infinite for no limit.
+        bucket_entries: Samples times views of templates that are batched together: few enough
+            for a processor's cache.
+    """
+
+    samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
+    overlap_samples: Annotated[float, Range(least=1, most=65_535)] = 2.0  # the widest photograph
+    num_views: Annotated[int, Range(least=3, most=100_000)] = 40
+    max_samples: Annotated[float, Range(least=1)] = 4.5e7
+    bucket_entries: Annotated[int, Range(least=1, most=100_000_000)] = 300_000  # 100 bytes each
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+class Decompose(Stage):
+    """Assign every facet a frame, an enlarged triangle and a raster."""
+
+    def __init__(self, config: DecomposeConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or DecomposeConfig()
+
+    def forward(
+        self,
+        coarse: CoarseMesh,
+        cameras: Cameras,
+        surface: Surface | None = None,
+        scale: float = 1.0,
+    ) -> PatchSet:
+        """Decompose a coarse mesh.
+
+        The spacing of the samples of all templates is the same: one over ``samples_per_pixel``
+        times ``scale`` pixels of the reference view at the median depth of the mesh, or further
+        where ``max_samples`` asks for it.
+
+        Args:
+            surface: What is transferred to the templates; without, they are flat.
+            scale: Of the photographs, 1 for their own size.
+
+        Raises:
+            ReconstructionError: A mesh without facets.
+        """
+        coarse = with_area(coarse)
+        vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
+        if len(faces) == 0:
+            raise ReconstructionError(
+                "the coarse mesh has 0 facets, and at least one is needed. Relax the filters "
+                "of `triangulate`, or bring a mesh of your own."
+            )
+        patch_from_world = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
+        corners = transform(patch_from_world, vertices[faces])[..., :2]
+        density = self.config.samples_per_pixel * scale
+        spacing = sample_spacing(vertices, cameras, coarse.reference, density)
+        area = face_normals(vertices, faces).norm(dim=-1) / 2
+        limit = self.config.num_views
+        faced = views_facing(vertices, faces, cameras)
+        warped = (area * faced.clamp_max(limit)).sum()
+        spacing = torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
+        enlarged = enlarge(corners, self.config.overlap_samples * spacing)
+        # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
+        reach = 2 * self.config.overlap_samples * spacing
+        low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
+        high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
+        sides = ((high - low) / spacing).ceil().long() + 1
+        blocks = [
+            (torch.arange(len(faces), device=faces.device), faced.new_ones(cameras.num_views))
+        ]
+        if bool((faced > limit).any()):
+            blocks = view_blocks(coarse.mesh, cameras, spacing, limit)
+        frames = patch_from_world, corners, enlarged, low, spacing
+        buckets = tuple(
+            _templates(some[facets], raster, views > 0, *frames)
+            for some, views in blocks
+            for facets, raster in group_by_size(
+                sides[some], max(1, self.config.bucket_entries // int(views.sum()))
+            )
+        )
+        patches = PatchSet(coarse=coarse, buckets=buckets)
+        return patches if surface is None else transfer(patches, surface.mesh)
+
+
+def with_area(coarse: CoarseMesh) -> CoarseMesh:
+    """Leave out facets without area, on which no template can stand."""
+    mesh, points = coarse.mesh, coarse.points
+    kept = (face_normals(mesh.vertices_world.detach(), mesh.faces) != 0).any(dim=1)
+    if bool(kept.all()):
+        return coarse
+    reason, done = "its facet has no area", "These facets are left out of the coarse mesh"
+    skipped_patches("decompose", (~kept).nonzero()[:, 0], reason, done)
+    if points is not None:
+        points = points.take(kept[points.facet].nonzero()[:, 0])
+        points = points.replace(facet=(kept.long().cumsum(dim=0) - 1)[points.facet])
+    return coarse.replace(
+        mesh=mesh.replace(faces=mesh.faces[kept]),
+        points=points,
+        support=None if coarse.support is None else coarse.support[kept],
+    )
+
+
+def facet_frames(
+    vertices: Float[Tensor, "vertex 3"],
+    faces: Int[Tensor, "face 3"],
+    cam_from_world: Float[Tensor, "4 4"],
+) -> Float[Tensor, "face 4 4"]:
+    """Return ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
+
+    z is the inward normal; x is the reference camera's x made orthogonal to it, so that a
+    facet that faces the camera appears in its template as in the image.
+    """
+    z = -unit_face_normals(vertices, faces)
+    x_cam, y_cam = cam_from_world[0, :3].expand_as(z), cam_from_world[1, :3].expand_as(z)
+    # Near the camera's own x axis the projection degenerates, and y serves instead.
+    side = torch.where(((x_cam * z).sum(-1).abs() < 0.99)[:, None], x_cam, y_cam)
+    x = normalize(side - (side * z).sum(-1, keepdim=True) * z, dim=-1)
+    rotation = torch.stack([x, torch.linalg.cross(z, x), z], dim=-2)
+    centroid = vertices[faces].mean(dim=1)
+    return rigid(rotation, -(rotation @ centroid[..., None])[..., 0])
+
+
+def sample_spacing(
+    vertices: Float[Tensor, "vertex 3"], cameras: Cameras, reference: int, samples_per_pixel: float
+) -> Float[Tensor, ""]:
+    """Return the scene units that one sample spans: 1/zeta."""
+    intrinsics = cameras.intrinsics[reference]
+    _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
+    focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()
+    return depth.median() / focal / samples_per_pixel
+
+
+def views_facing(
+    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], cameras: Cameras
+) -> Int[Tensor, " face"]:
+    """Count, for each facet, the views that it faces and that have its centre in their frame."""
+    centre, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
+    pixels, depth = project(centre[None], cameras.cam_from_world, cameras.intrinsics)
+    towards = cameras.centers_world[:, None] - centre
+    framed = ((pixels >= 0) & (pixels <= cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
+    return (framed & ((towards * normals).sum(dim=-1) > 0)).sum(dim=0)
+
+
+def enlarge(
+    corners: Float[Tensor, "patch 3 2"], distance: Float[Tensor, ""]
+) -> Float[Tensor, "patch 3 2"]:
+    """Move every edge outward by ``distance``, parallel to itself.
+
+    The new triangle is the old one scaled about its incentre by ``1 + distance / inradius``.
+
+    >>> enlarge(torch.tensor([[[0.0, 0], [1, 0], [0, 1]]]), torch.tensor(0.1))[0, 0]
+    tensor([-0.1000, -0.1000])
+    """
+    opposite = (corners.roll(-1, dims=1) - corners.roll(-2, dims=1)).norm(dim=-1)
+    perimeter = opposite.sum(dim=1)
+    incenter = (opposite[..., None] * corners).sum(dim=1) / perimeter[:, None]
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    inradius = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / perimeter
+    scale = 1 + distance / inradius
+    return incenter[:, None] + scale[:, None, None] * (corners - incenter[:, None])
+
+
+def group_by_size(
+    sides: Int[Tensor, "patch 2"], bucket_samples: int
+) -> list[tuple[Int[Tensor, " bucket"], tuple[int, int]]]:
+    """Batch templates of like size.
+
+    Args:
+        sides: Width and height each template needs.
+        bucket_samples: Limit for a bucket; a template larger than that is a bucket alone.
+
+    Returns:
+        Facets and (height, width) of each bucket.
+    """
+    # Sizes in steps of a third of an octave: padding adds little, and buckets stay few.
+    keys = (2 ** ((sides.double().log2() * 3).ceil() / 3)).ceil().long()
+    groups: dict[tuple[int, int], list[int]] = {}
+    for facet, (width, height) in enumerate(keys.tolist()):
+        groups.setdefault((height, width), []).append(facet)
+    buckets: list[tuple[Int[Tensor, " bucket"], tuple[int, int]]] = []
+    for members in (groups[key] for key in sorted(groups)):
+        facets = torch.tensor(members, device=sides.device)
+        width, height = (int(side) for side in sides[facets].amax(dim=0))
+        count = max(1, bucket_samples // (width * height))
+        starts = range(0, len(facets), count)
+        buckets += [(facets[start : start + count], (height, width)) for start in starts]
+    return buckets
+
+
+def _templates(
+    facets: Int[Tensor, " bucket"],
+    raster: tuple[int, int],
+    views: Bool[Tensor, " view"],
+    patch_from_world: Float[Tensor, "face 4 4"],
+    corners: Float[Tensor, "face 3 2"],
+    enlarged: Float[Tensor, "face 3 2"],
+    low: Float[Tensor, "face 2"],
+    spacing: Float[Tensor, ""],
+) -> Templates:
+    height, width = raster
+    grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
+    positions = low[facets, None, None] + grid
+    barycentric = recomputed(barycentric_2d, positions, corners[facets, None, None])
+    within = barycentric_2d(positions.detach(), enlarged.detach()[facets, None, None])
+    return Templates(
+        facet=facets,
+        patch_from_world=patch_from_world[facets],
+        origin=low[facets],
+        spacing=spacing.expand(len(facets)),
+        depth=torch.zeros_like(barycentric[..., 0]),
+        barycentric=barycentric,
+        inside=(within >= 0).all(dim=-1),
+        views=None if bool(views.all()) else views,
+    )

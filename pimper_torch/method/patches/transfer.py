@@ -1,0 +1,107 @@
+"""A surface transferred to templates: views are registered on it, not on the facets' planes."""
+
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.ground.geometry.visibility import Hits, RayCaster, ray_caster
+from pimper_torch.records import Mesh, PatchSet, Templates
+from pimper_torch.runtime.memory import recomputed
+from pimper_torch.runtime.parallel import side_by_side
+
+
+def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
+    """Transfer the depth and the normals of a surface to every template.
+
+    A sample's point is where its line along the facet's normal meets the surface, facing as
+    the facet does, nearest to the facet's plane. Samples without one, or with one further off
+    than half the template's extent, are no longer ``inside``.
+
+    Differentiable in the surface's vertices and normals and in the templates' frames; which face
+    a line meets is constant.
+    """
+    normals = surface.normals_world
+    if normals is None:
+        normals = vertex_normals(surface.vertices_world, surface.faces)
+    one = partial(_transferred, surface, normals, ray_caster(surface))
+    buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
+    return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
+
+
+def _transferred(
+    surface: Mesh, normals: Float[Tensor, "vertex 3"], caster: RayCaster, templates: Templates
+) -> Templates:
+    with torch.no_grad():
+        # A little further, so that rounding does not decide.
+        hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
+    return recomputed(_on_surface, surface, normals, templates, hits, met)
+
+
+def _lines(
+    templates: Templates,
+) -> tuple[Float[Tensor, "patch sample 3"], Float[Tensor, "patch sample 3"]]:
+    """Return places on the facets' planes, and the way inward through them; world."""
+    world_from_patch = invert_rigid(templates.patch_from_world)
+    flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
+    positions = transform(world_from_patch, flat.flatten(1, 2))
+    return positions, world_from_patch[:, None, :3, 2].expand_as(positions)
+
+
+def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
+    return 0.5 * templates.spacing[:, None] * max(templates.depth.shape[1:])
+
+
+def _on_surface(
+    surface: Mesh,
+    normals: Float[Tensor, "vertex 3"],
+    templates: Templates,
+    hits: Hits,
+    met: Bool[Tensor, "patch sample"],
+) -> Templates:
+    """Put samples where their lines meet given faces of a surface."""
+    positions, inward = _lines(templates)
+    hits = hits.refined(surface.vertices_world, surface.faces, positions, inward)
+    found = hits.interpolate(surface.vertices_world, surface.faces)
+    depth = transform(templates.patch_from_world, found)[..., 2]
+    rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
+    met = met & (depth.abs() <= _reach(templates))
+    raster = templates.depth.shape
+    return templates.replace(
+        depth=torch.where(met, depth, 0).reshape(raster),
+        normals_patch=normalize(
+            torch.where(met[..., None], rotated, rotated.new_tensor([0, 0, -1])), dim=-1
+        ).reshape(*raster, 3),
+        inside=templates.inside & met.reshape(raster),
+    )
+
+
+def _nearest(
+    caster: RayCaster,
+    positions: Float[Tensor, "patch sample 3"],
+    inward: Float[Tensor, "patch sample 3"],
+    surface: Mesh,
+    reach: Float[Tensor, "patch 1"],
+) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
+    """Cast to both sides, and take the nearer hit of a face that looks outward."""
+    below, above = caster.cast(positions, inward, reach), caster.cast(positions, -inward, reach)
+
+    def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
+        met = surface.faces[hits.face.clamp_min(0).flatten()]
+        outward = face_normals(surface.vertices_world, met).reshape(inward.shape)
+        return (hits.face >= 0) & ((outward * inward).sum(dim=-1) < 0)
+
+    one, other = looking_out(below), looking_out(above)
+    first = one & (~other | (below.distance <= above.distance))
+    return (
+        Hits(
+            face=torch.where(first, below.face, above.face),
+            distance=torch.where(first, below.distance, above.distance),
+            barycentric=torch.where(first[..., None], below.barycentric, above.barycentric),
+        ),
+        one | other,
+    )

@@ -1,0 +1,377 @@
+"""Registration: every view resampled on every template, the matrices J and D."""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import interpolate, normalize
+
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.pyramids import (
+    PriorMaps,
+    Sources,
+    centers_in_patches,
+    image_from_patch,
+    kernel_geometry,
+    look_up,
+    prepare,
+    pyramid_level,
+)
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
+from pimper_torch.ground.kernels.arrays import (
+    FractionRows,
+    PictureRows,
+    Projection,
+    Samples,
+    as_array,
+    pulled_back,
+)
+from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.method.patches.template_priors import merged
+from pimper_torch.records import (
+    Cameras,
+    Observations,
+    PatchPriors,
+    PatchSet,
+    PatchViews,
+    Templates,
+    Views,
+)
+from pimper_torch.runtime.config import Range, require, require_ranges
+from pimper_torch.runtime.failures import over_patches
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.parallel import side_by_side
+from pimper_torch.runtime.stage import Stage
+
+_Array = NDArray[Any]
+# Arguments of the kernel.
+_Call = tuple[PictureRows, FractionRows, _Array, Projection, Samples, _Array, _Array, float, float]
+
+
+def resampled(
+    cameras: Cameras,
+    sources: Sources,
+    templates: Templates,
+    rows: Int[Tensor, " view"],
+    min_facing: float,
+    dark_level: float,
+) -> Observations:
+    """Resample views on a bucket of templates, without occlusion.
+
+    Pixels are computed in float64; images are looked up in float32. Differentiable once.
+
+    Args:
+        rows: Where each camera's photograph is among the sources.
+        min_facing: Cosine of the steepest angle between a normal and the way to the camera.
+        dark_level: Radiance at or below which a sample is missing.
+    """
+    outward = templates.normals_patch
+    if outward is None:
+        outward = templates.depth.new_tensor([0, 0, -1]).expand(*templates.depth.shape, 3)
+    images, projection = sources.images, image_from_patch(cameras, templates.patch_from_world)
+    centers = centers_in_patches(cameras, templates.patch_from_world)
+    geometry = kernel_geometry(rows, templates, outward, projection, centers)
+    call = images.pictures, sources.unusable.fractions, as_array(images.table), *geometry
+    limits = as_array(cameras.sizes_px), as_array(templates.inside), min_facing, dark_level
+    radiance, valid = _Resampled.apply(  # type: ignore[no-untyped-call]
+        (*call, *limits),
+        images.finest.shape[1],
+        images.finest.flatten(1),
+        images.coarser,
+        projection.flatten(0, 1),
+        templates.origin,
+        templates.spacing,
+        templates.depth,
+    )
+    return Observations(radiance=radiance, valid=valid)
+
+
+class _Resampled(torch.autograd.Function):
+    """Samples as a function of pictures and geometry, by a kernel and its adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, call: _Call, channels: int, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the samples, and which of them are valid."""
+        from pimper_torch.ground.kernels import resampling
+
+        projection, depth = call[3], inputs[-1]
+        num_patches, *raster = depth.shape
+        radiance = torch.empty(num_patches, len(projection.rows), channels, *raster)
+        valid = torch.empty(num_patches, len(projection.rows), *raster, dtype=torch.bool)
+        resampling.register(*call, as_array(radiance), as_array(valid))
+        ctx.call = call
+        ctx.save_for_backward(valid, *inputs)
+        ctx.mark_non_differentiable(valid)
+        return radiance, valid
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Return gradients of pictures and geometry."""
+        from pimper_torch.ground.kernels import resampling_adjoint as adjoint
+
+        valid, *inputs = ctx.saved_tensors
+        pictures, _, levels, projection, samples, *_ = ctx.call
+        call = pictures, levels, projection, samples, as_array(valid), as_array(on_radiance)
+        of_pictures = any(ctx.needs_input_grad[2:4])
+
+        def add_to(*found: _Array) -> None:
+            adjoint.pull_back(*call, int(of_pictures), adjoint.ViewGradients(*found))
+
+        return None, None, *pulled_back(add_to, inputs, of_pictures)
+
+
+def occluded(
+    valid: Bool[Tensor, "patch view height width"],
+    cameras: Cameras,
+    caster: RayCaster,
+    templates: Templates,
+    stride: int,
+) -> Bool[Tensor, "patch view height width"]:
+    """Find samples that a surface occludes; a constant to autograd.
+
+    One ray for every ``stride`` samples either way, from the camera to just before the surface,
+    where one of these samples is valid; all of a bucket at once.
+    """
+    middle = slice(stride // 2, None, stride)
+    sparse = templates.points_patch.detach()[:, middle, middle].double()
+    if sparse.numel() == 0:
+        return torch.zeros_like(valid)
+    world_from_patch = invert_rigid(templates.patch_from_world.detach().double())
+    points = transform(world_from_patch, sparse.flatten(1, 2)).reshape(sparse.shape)
+    rows, columns = (
+        _nearest_site(sites, samples).to(valid.device)
+        for sites, samples in zip(sparse.shape[1:3], valid.shape[2:], strict=True)
+    )
+    shape = *valid.shape[:2], len(points[0]), valid.shape[3]
+    near = valid.new_zeros(shape).index_add_(2, rows, valid)
+    near = near.new_zeros(*near.shape[:3], points.shape[2]).index_add_(3, columns, near)
+    patch, view, row, column = near.nonzero(as_tuple=True)
+    starts = cameras.centers_world.detach().double()[view]
+    directions = points[patch, row, column] - starts
+    length = directions.norm(dim=1)
+    # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
+    reach = (length - 4 * stride * templates.spacing.detach()[patch]).clamp_min(0)
+    near[patch, view, row, column] = caster.blocked(starts, directions / length[:, None], reach)
+    return near[:, :, rows][..., columns]
+
+
+def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
+    """Return the site nearest to each of a row of samples."""
+    index = torch.arange(sites, dtype=torch.float32)[None, None]
+    return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarpConfig:
+    """Which samples a view is allowed to contribute.
+
+    Attributes:
+        dark_level: Radiance at or below which a sample is missing; 1 is saturation.
+        saturation_level: Radiance at or above which a pixel of any channel is missing.
+        max_tilt_deg: A facet turned further from a view is not used there.
+        occlusion_stride: Samples between the rays that test for occlusion.
+    """
+
+    dark_level: Annotated[float, Range(least=0, below=1)] = 0.01
+    saturation_level: float = SATURATED
+    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
+    occlusion_stride: Annotated[int, Range(least=1, most=65_535)] = 4
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        require(
+            self.saturation_level > self.dark_level,
+            "saturation_level",
+            self.saturation_level,
+            f"above dark_level {self.dark_level}",
+        )
+
+
+class Warp(Stage):
+    """Resample all views on all templates.
+
+    Perspective-correct, because each sample's own 3D point is projected; anti-aliased,
+    because the level of an image pyramid is chosen by the pixels that a sample covers.
+    Missing: outside the frame or the mask, grazing or back-facing, behind another facet,
+    too dark, saturated, not finite.
+
+    Differentiable in the images and in the templates' depth; what is missing is a constant.
+    """
+
+    def __init__(self, config: WarpConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or WarpConfig()
+
+    def forward(
+        self, views: Views, cameras: Cameras, patches: PatchSet, sources: Sources | None = None
+    ) -> PatchViews:
+        """Return J and D of every patch.
+
+        Args:
+            patches: All, or some buckets of them.
+            sources: Pyramids as :func:`~pimper_torch.ground.geometry.pyramids.prepare` builds them;
+                built here where not given.
+        """
+        sources = sources or prepare(views, self.config.saturation_level)
+        caster = ray_caster(patches.surface or patches.coarse.mesh)
+        one = partial(self._registered, views.images.shape[1], cameras, sources, caster)
+        return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
+
+    def _registered(
+        self,
+        channels: int,
+        cameras: Cameras,
+        sources: Sources,
+        caster: RayCaster,
+        templates: Templates,
+    ) -> Observations:
+        """Register a bucket; patches that cannot be have no valid sample."""
+        rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
+        if sources.lights is not None:
+            sources = sources.replace(lights=templates.own(sources.lights))
+
+        def lost(some: slice) -> Observations:
+            raster = templates.take(some).depth
+            shape = len(raster), cameras.num_views, channels, *raster.shape[1:]
+            radiance = raster.new_zeros(shape, dtype=sources.images.finest.dtype)
+            valid = radiance[:, :, 0] > 0
+            unseen = [
+                (maps, Observations(radiance=radiance[:, maps.view], valid=valid[:, maps.view]))
+                for maps, _ in _maps_of(sources, rows)
+            ]
+            priors: PatchPriors | None = None
+            if unseen or sources.lights is not None:
+                priors = merged(unseen, valid, cameras, templates.take(some), sources.lights)
+            return Observations(radiance=radiance, valid=valid, priors=priors)
+
+        found = over_patches(
+            lambda some: self._register(cameras, sources, caster, rows, templates.take(some)),
+            templates.facet,
+            "warp",
+            lost,
+            "These patches have no samples, as if no view showed them",
+        )
+        total = int(templates.inside.sum()) * cameras.num_views
+        leave_out("warp", total - int(found.valid.count_nonzero()), total=total)
+        centers = cameras.centers_world.to(templates.patch_from_world)
+        viewers = transform(
+            templates.patch_from_world, centers.expand(len(templates.facet), -1, -1)
+        )
+        return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
+
+    def _register(
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        caster: RayCaster,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+    ) -> Observations:
+        found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
+        guesses = [
+            (maps, self._resampled(maps.cameras(cameras), maps.maps, own, templates, -math.inf))
+            for maps, own in _maps_of(sources, rows)
+        ]
+        shown = found.valid
+        for maps, guess in guesses:
+            shown = shown.index_add(1, maps.view, guess.valid)
+        stride = self.config.occlusion_stride
+        hidden = occluded(shown, cameras, caster, templates, stride)
+        found.radiance.masked_fill_(hidden[:, :, None], 0)
+        priors: PatchPriors | None = None
+        if guesses or sources.lights is not None:
+            priors = merged(guesses, hidden, cameras, templates, sources.lights)
+        return found.replace(valid=found.valid & ~hidden, priors=priors)
+
+    def _resampled(
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+        dark_level: float,
+    ) -> Observations:
+        """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
+        images = sources.images.finest
+        if images.dtype == torch.float32 and compiled_for(images.detach()):
+            steepest = math.cos(math.radians(self.config.max_tilt_deg))
+            return resampled(cameras, sources, templates, rows, steepest, dark_level)
+        return self._reference(cameras, sources, rows, templates, dark_level)
+
+    def _reference(
+        self,
+        cameras: Cameras,
+        sources: Sources,
+        rows: Int[Tensor, " view"],
+        templates: Templates,
+        dark_level: float,
+    ) -> Observations:
+        world_from_patch = invert_rigid(templates.patch_from_world)
+        num, height, width = templates.depth.shape
+        points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
+        points_world = points.reshape(num, height, width, 3)
+        outward = -world_from_patch[:, None, None, :3, 2].expand_as(points_world)
+        if templates.normals_patch is not None:
+            transferred = templates.normals_patch.detach().reshape(num, -1, 3)
+            outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
+        seen = [
+            self._seen_by(view, row, templates, points_world, outward, cameras, sources, dark_level)
+            for view, row in enumerate(rows.tolist())
+        ]
+        return Observations(
+            radiance=torch.stack([radiance for radiance, _ in seen], dim=1),
+            valid=torch.stack([valid for _, valid in seen], dim=1),
+        )
+
+    def _seen_by(
+        self,
+        view: int,
+        row: int,
+        templates: Templates,
+        points_world: Float[Tensor, "patch height width 3"],
+        outward: Float[Tensor, "patch height width 3"],
+        cameras: Cameras,
+        sources: Sources,
+        dark_level: float,
+    ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
+        center = cameras.centers_world[view]
+        facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
+        steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
+        pixels, depth = project(
+            points_world.reshape(-1, 3), cameras.cam_from_world[view], cameras.intrinsics[view]
+        )
+        pixels = pixels.reshape(*points_world.shape[:-1], 2)
+        wanted = templates.inside & (facing > steepest) & (depth.reshape(facing.shape) > 0)
+        if not wanted.any():
+            finest = sources.images.finest
+            return finest.new_zeros(len(facing), finest.shape[1], *facing.shape[1:]), wanted
+        level = pyramid_level(pixels)
+        # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
+        margin = 0.5 * 2 ** level.detach()[..., None]
+        size = cameras.sizes_px[view].to(pixels)
+        within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
+        wanted = wanted & within
+        found = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
+        fractions = [fraction.to(found) for fraction in sources.unusable.levels(row)]
+        lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
+        usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
+        radiance = found.new_zeros(*wanted.shape, found.shape[1])
+        radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
+        valid = torch.zeros_like(wanted).index_put((wanted,), usable)
+        return radiance * valid[:, None], valid
+
+
+def _maps_of(
+    sources: Sources, rows: Int[Tensor, " view"]
+) -> list[tuple[PriorMaps, Int[Tensor, " map"]]]:
+    """List the guessed maps of some views, where there are any, and their rows."""
+    return [(maps, own) for maps, own in (each.of(rows) for each in sources.priors) if len(own)]

@@ -1,0 +1,105 @@
+r"""Augmented Lagrangian factorization: BALM.
+
+``N`` is split in two: ``S``, free, fits the data, and ``N`` is on the manifold. Multipliers ``U``
+and a growing penalty :math:`\mu` make them equal,
+
+.. math::
+
+    \lVert \sqrt W (J - L S) \rVert^2 + \mu \lVert S - N + U \rVert^2,
+
+and each step has a closed form: a small linear system per sample for ``S``, the projection onto
+the manifold for ``N``, a small linear system per view for ``L``. Missing entries have weight 0;
+robust weights multiply the others.
+
+Source: Del Bue, Xavier, Agapito & Paladini, Bilinear modelling via augmented Lagrange
+multipliers, PAMI 34(8), 2012.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.linalg.robust import Squares
+from pimper_torch.method.photometry.bilinear import (
+    REWEIGHT_EVERY,
+    RUNNING,
+    Bilinear,
+    Factors,
+    State,
+    equations_of_samples,
+    equations_of_views,
+    iterate,
+    keep_scale,
+    robust_weights,
+)
+from pimper_torch.method.photometry.quadratics import diagonal, solve_packed
+from pimper_torch.records import StopCause
+
+# The penalty starts at this fraction of the mean eigenvalue of a sample's data term, and grows by
+# the factor below in each step up to the cap. A stiff penalty couples lights and shading, and
+# convergence is slow: of 0.01 to 0.3, this start needed the fewest steps to a residual of 1e-8
+# with 60 % of the entries missing.
+PENALTY_START = 0.03
+PENALTY_GROWTH = 1.01
+PENALTY_CAP = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(State):
+    multiplier: Float[Tensor, "patch rank sample"]
+
+
+def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
+    """Factorize a batch of patches by augmented Lagrangian.
+
+    Args:
+        tolerance: A patch has converged when both the last change of its shading vectors and
+            their distance from the manifold are below this fraction of their length.
+
+    Returns:
+        Factors with ``N`` exactly on the manifold. Lights without ``regularization`` keep their
+        initial scale. A patch without data keeps its initial values.
+
+    Constant to autograd. Patches are independent.
+    """
+
+    def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
+        state, change = _step(work, state, step)
+        done = (change <= tolerance) & (step >= REWEIGHT_EVERY)
+        return state, torch.where(done, int(StopCause.CONVERGED), RUNNING)
+
+    with torch.no_grad():
+        start = _State(
+            lights=problem.lights,
+            shading=problem.shading,
+            multiplier=torch.zeros_like(problem.shading),
+            weight=robust_weights(problem, problem.lights, problem.shading),
+        )
+        return iterate(problem, start, advance, max_iterations)
+
+
+def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Tensor, " patch"]]:
+    weight = state.weight
+    if step and step % REWEIGHT_EVERY == 0 and not isinstance(problem.loss, Squares):
+        weight = robust_weights(problem, state.lights, state.shading)
+    A, b = equations_of_samples(problem, state.lights, weight)
+    rank = state.lights.shape[2]
+    # The trace of L^T W L, the data term of a sample.
+    trace = (weight * state.lights.square().sum(dim=2, keepdim=True)).sum(dim=1)
+    seen = trace > 0
+    fraction = min(PENALTY_START * PENALTY_GROWTH**step, PENALTY_CAP)
+    penalty = fraction * trace.sum(dim=1) / (rank * seen.sum(dim=1)).clamp_min(1)
+    penalty = penalty.clamp_min(torch.finfo(A.dtype).tiny ** 0.5)[:, None, None]
+    A[:, diagonal(rank)] += penalty
+    free = solve_packed(A, b + penalty * (state.shading - state.multiplier))
+    shading = problem.manifold.project((free + state.multiplier).mT).mT
+    multiplier = state.multiplier + free - shading
+    lights = solve_packed(*equations_of_views(problem, free, weight)).mT
+    size = shading.norm(dim=(1, 2)).clamp_min(torch.finfo(A.dtype).tiny ** 0.5)
+    change = (shading - state.shading).norm(dim=(1, 2)).maximum((free - shading).norm(dim=(1, 2)))
+    scaled, shading = keep_scale(problem, state.lights, lights, shading)
+    _, multiplier = keep_scale(problem, state.lights, lights, multiplier)
+    found = _State(lights=scaled, shading=shading, multiplier=multiplier, weight=weight)
+    return found, change / size

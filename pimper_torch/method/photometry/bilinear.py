@@ -1,0 +1,357 @@
+r"""The bilinear problem that every solver takes: lights and shading vectors from radiance.
+
+.. math::
+
+    \min_{L, N} \sum_{fk} D_{fk}\, \phi(J_{fk} - l_f^\top n_k)
+    + \sum_f c_f \lVert l_f - \bar l_f \rVert^2
+    + \sum_k n_k^\top P_k n_k
+    \quad \text{with } n_k \in \mathcal M
+
+for every patch of a batch, with ``M`` the photometric manifold of some order of lighting and
+:math:`\phi` a loss. With ``c = 0``, ``P = 0``, squares and the cone this is the published
+problem; with a linear manifold it is low-rank factorization with missing data.
+
+A solver is a function of such a problem, a maximum number of iterations and a tolerance, and
+iterates a batch of patches until each has stopped (:func:`iterate`).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.kernels.twin_constants import MAX_STEP, MIN_DEVIATION
+from pimper_torch.ground.linalg.robust import Loss, Squares, robust_deviation
+from pimper_torch.method.photometry.cone import Cone, Manifold
+from pimper_torch.method.photometry.quadratics import (
+    PackedCholesky,
+    apply_packed,
+    combination,
+    congruence,
+    coordinates,
+    diagonal,
+    dot,
+    outer,
+)
+from pimper_torch.records import Convergence, Record, StopCause
+
+# Steps between updates of the robust weights: they change slowly, and the scale of the residuals
+# costs as much as a step.
+REWEIGHT_EVERY = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Bilinear(Record):
+    """A batch of factorization problems, the samples of each patch flattened and padded.
+
+    Attributes:
+        radiance: ``J``, zero where missing.
+        weight: ``D``: how much each entry counts; 0 where missing.
+        anchor: What the lights are pulled to.
+        shading: Where ``N`` starts, columns on the manifold.
+        regularization: ``c_f`` per view.
+        prior: ``P``, packed: what else is known of the shading vectors, such as normals they
+            should not bend away from (:meth:`Cone.bend
+            <pimper_torch.method.photometry.cone.Cone.normal_prior>`); ``None`` for none.
+        manifold: What shading vectors can be.
+        loss: What residuals cost, their deviation estimated patch by patch.
+        stride: The deviation is taken over every so many samples.
+    """
+
+    radiance: Float[Tensor, "patch view sample"]
+    weight: Float[Tensor, "patch view sample"]
+    lights: Float[Tensor, "patch view rank"]
+    anchor: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    regularization: Float[Tensor, "patch view"]
+    prior: Float[Tensor, "patch packed sample"] | None = None
+    manifold: Manifold = Cone()  # noqa: RUF009 - frozen
+    loss: Loss = Squares()  # noqa: RUF009 - frozen
+    stride: int = 1
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether gradients of the solution are required."""
+        data = (self.radiance, self.weight, self.anchor, self.regularization, self.prior)
+        return any(part is not None and part.requires_grad for part in data)
+
+    @property
+    def has_kernel(self) -> bool:
+        """Whether compiled kernels know its manifold and loss."""
+        return isinstance(self.manifold, Cone) and self.loss.code is not None
+
+    @property
+    def dense_prior(self) -> Float[Tensor, "patch packed sample"]:
+        """``P``, zero where there is none, as kernels take it."""
+        patches, _, samples = self.radiance.shape
+        return self.radiance.new_zeros(patches, 10, samples) if self.prior is None else self.prior
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Factors(Record):
+    """The solution.
+
+    Attributes:
+        lights: ``L``.
+        shading: ``N``, columns on the manifold.
+        weight: ``D`` times the final robust weights.
+    """
+
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+    convergence: Convergence
+
+
+Solver = Callable[[Bilinear, int, float], Factors]
+
+
+def robust_weights(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch view sample"]:
+    """Return ``D`` times the loss's weights at the current residuals."""
+    if isinstance(problem.loss, Squares):
+        return problem.weight
+    residual = problem.radiance - lights @ shading
+    deviation = residual_deviation(problem, residual)
+    return problem.weight * problem.loss.weights(residual, deviation[:, None, None])
+
+
+def equations_of_samples(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    weight: Float[Tensor, "patch view sample"],
+) -> tuple[Float[Tensor, "patch packed sample"], Float[Tensor, "patch rank sample"]]:
+    """Assemble the normal equations for every sample's shading vector, lights given."""
+    packed = outer(lights.mT) @ weight
+    if problem.prior is not None:
+        packed = packed + problem.prior
+    return packed, lights.mT @ (weight * problem.radiance)
+
+
+def equations_of_views(
+    problem: Bilinear,
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
+    """Assemble the normal equations for every view's light, its prior included."""
+    packed = (weight @ outer(shading).mT).mT.clone()
+    packed[:, diagonal(shading.shape[1])] += problem.regularization[:, None, :]
+    rhs = (weight * problem.radiance) @ shading.mT + problem.regularization[
+        ..., None
+    ] * problem.anchor
+    return packed, rhs.mT
+
+
+def curvature_of_views(
+    shading: Float[Tensor, "patch rank sample"], weight: Float[Tensor, "patch view sample"]
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Return the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
+    batch, views, rank = len(weight), weight.shape[1], shading.shape[1]
+    products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
+    blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
+    whole = shading.new_zeros(batch, views, rank, views, rank)
+    index = torch.arange(views, device=shading.device)
+    whole[:, index, :, index] = blocks.transpose(0, 1)
+    return whole.reshape(batch, views * rank, views * rank)
+
+
+def evaluate(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
+    """Return the objective, its robust weights given, and minus half its gradient by the lights."""
+    residual = problem.radiance - lights @ shading
+    weighted = weight * residual
+    cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
+    difference = lights - problem.anchor
+    cost = cost + (problem.regularization * difference.square().sum(dim=2)).sum(dim=1)
+    if problem.prior is not None:
+        penalty = shading * apply_packed(problem.prior, shading)
+        cost = cost + penalty.sum(dim=(1, 2))
+    return cost, weighted @ shading.mT - problem.regularization[..., None] * difference
+
+
+def update_shading(
+    problem: Bilinear,
+    packed: Float[Tensor, "patch packed sample"],
+    rhs: Float[Tensor, "patch rank sample"],
+    shading: Float[Tensor, "patch rank sample"],
+    steps: int = 1,
+) -> Float[Tensor, "patch rank sample"]:
+    r"""Minimize :math:`s^\top A s - 2 b^\top s` over every sample's shading vector on the manifold.
+
+    By Gauss-Newton steps along the tangents, of bounded length; a step that does not lower the
+    objective is rejected. On a linear manifold the first step is exact.
+    """
+    if problem.manifold.flat:
+        return PackedCholesky(packed, shading.shape[1]).solve(rhs)
+    image = apply_packed(packed, shading)
+    value = dot(shading, image - 2 * rhs)
+    for step in range(steps):
+        moved = tangent_step(problem.manifold, packed, rhs - image, shading)
+        reached = apply_packed(packed, moved)
+        after = dot(moved, reached - 2 * rhs)
+        # The last steps lower the objective by less than its rounding.
+        better = (after <= value + 8 * torch.finfo(value.dtype).eps * value.abs())[:, None]
+        shading = torch.where(better, moved, shading)
+        if step + 1 < steps:
+            image = torch.where(better, reached, image)
+            value = torch.where(better[:, 0], after, value)
+    return shading
+
+
+def tangent_step(
+    manifold: Manifold,
+    packed: Float[Tensor, "patch packed sample"],
+    slope: Float[Tensor, "patch rank sample"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, "patch rank sample"]:
+    r"""Take the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the manifold's tangents.
+
+    Args:
+        manifold: Whose tangents are ``B``.
+        packed: ``A``.
+        slope: ``r = b - A s``.
+        shading: ``s``.
+    """
+    columns = manifold.tangents(shading)
+    descent = coordinates(columns, slope)
+    step = PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
+    length = dot(step, step).detach().sqrt()[:, None]
+    limit = MAX_STEP * manifold.split(shading.mT)[0].detach()[:, None]
+    step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
+    return manifold.retract((shading + combination(columns, step)).mT).mT
+
+
+def curvature_along(
+    columns: list[Tensor], packed: Float[Tensor, "patch packed sample"]
+) -> Float[Tensor, "patch smaller sample"]:
+    """Return ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
+    curvature = congruence(packed, columns)
+    slot = diagonal(len(columns))
+    curvature[:, slot] += 1e-9 * curvature[:, slot].sum(dim=1, keepdim=True)
+    return curvature
+
+
+def keep_scale(
+    problem: Bilinear,
+    before: Float[Tensor, "patch view rank"],
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
+    """Normalize lights without regularization to their former size; rescale shading inversely."""
+    old, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
+    unanchored = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (old > 0)
+    factor = torch.where(unanchored, (old / torch.where(size > 0, size, 1)).sqrt(), 1)[
+        :, None, None
+    ]
+    return lights * factor, shading / factor
+
+
+def root_mean_square(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+) -> Float[Tensor, " patch"]:
+    """Return each patch's weighted root mean square residual; 0 without data."""
+    residual = problem.radiance - lights @ shading
+    count = problem.weight.sum(dim=(1, 2))
+    mean = (problem.weight * residual**2).sum(dim=(1, 2)) / torch.where(count > 0, count, 1)
+    return torch.where(mean > 0, torch.where(mean > 0, mean, 1).sqrt(), 0)
+
+
+def residual_deviation(
+    problem: Bilinear, residual: Float[Tensor, "patch view sample"]
+) -> Float[Tensor, " patch"]:
+    """Estimate the standard deviation of each patch's residuals, robustly."""
+    subset = residual[:, :, :: problem.stride].flatten(1)
+    seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
+    count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
+    level = problem.radiance.abs().sum(dim=(1, 2)) / count
+    return robust_deviation(subset, seen).maximum(MIN_DEVIATION * level)
+
+
+# In place of a cause, for a patch that has not stopped.
+RUNNING = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class State(Record):
+    """Iteration state shared by all solvers, batched over patches.
+
+    Attributes:
+        lights: ``L``.
+        shading: ``N``, columns on the manifold.
+        weight: Of each entry, robust weights included.
+    """
+
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    weight: Float[Tensor, "patch view sample"]
+
+
+AnyState = TypeVar("AnyState", bound=State)
+
+
+def iterate(
+    problem: Bilinear,
+    state: AnyState,
+    advance: Callable[[Bilinear, AnyState, int], tuple[AnyState, Int[Tensor, " patch"]]],
+    max_iterations: int,
+) -> Factors:
+    """Iterate until every patch has stopped; those that have leave the batch.
+
+    Args:
+        advance: One step of the remaining patches: from problem, state and index of the step
+            to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
+
+    Returns:
+        Every patch's last lights, shading and weights, its number of steps, and its stop cause.
+    """
+    whole = problem
+    patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
+    taken = torch.full_like(patches, max_iterations)
+    causes = torch.full_like(patches, int(StopCause.LIMIT))
+    running = torch.ones_like(patches, dtype=torch.bool)
+    names = [field.name for field in dataclasses.fields(state)]
+    final = state.replace(**{name: getattr(state, name).clone() for name in names})
+    for step in range(max_iterations):
+        state, cause = advance(problem, state, step)
+        ended = running & (cause != RUNNING)
+        _store(final, state, names, patches, ended)
+        taken[patches[ended]] = step + 1
+        causes[patches[ended]] = cause[ended]
+        running = running & ~ended
+        if not bool(running.any()):
+            break
+        # Patches that have stopped leave a batch by quarters: copying the rest costs about a step.
+        if float((~running).double().mean()) >= 0.25:
+            keep = running.nonzero()[:, 0]
+            state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
+            running = running[keep]
+    _store(final, state, names, patches, running)
+    has_data = whole.weight.sum(dim=(1, 2)) > 0
+    convergence = Convergence(
+        iterations=taken,
+        residual=root_mean_square(whole, final.lights, final.shading),
+        cause=torch.where(has_data, causes, int(StopCause.EMPTY)),
+    )
+    return Factors(
+        lights=final.lights, shading=final.shading, weight=final.weight, convergence=convergence
+    )
+
+
+def _store(
+    final: Record, state: Record, names: list[str], patches: Int[Tensor, " patch"], rows: Tensor
+) -> None:
+    for name in names:
+        getattr(final, name)[patches[rows]] = getattr(state, name)[rows]

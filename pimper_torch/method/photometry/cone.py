@@ -1,0 +1,190 @@
+r"""Photometric manifolds: the sets of possible shading vectors. First-order light has a cone.
+
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
+albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, whose ambiguity is
+a scaled Lorentz transformation. It is a cone of light in four dimensions: the time axis is albedo,
+the space axes the normal. Other orders of light, and low-rank matrices, are in
+:mod:`pimper_torch.single_view.factorization.low_rank`.
+
+Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.method.photometry.light_field import harmonics
+
+
+def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    r"""Replace each shading vector by the nearest one a Lambertian surface can produce.
+
+    Albedo :math:`\rho` and unit normal :math:`n` reach the images only as
+    :math:`(b_0, b) = (\rho, \rho n)`, which ties :math:`b_0` to :math:`\lVert b \rVert`.
+    Factorization ignores the tie; this restores it in the least-squares sense, with
+    :math:`\rho = \max(0, b_0 + \lVert b \rVert) / 2` and :math:`n = b / \lVert b \rVert`.
+
+    Args:
+        shading: ``(b_0, b_x, b_y, b_z)`` in the patch frame; albedo in image units, up
+            to the scale all patches share.
+
+    Returns:
+        Vectors on the cone. One without direction (``b = 0``), or nearest to the apex,
+        becomes zero: that pixel has no normal, and the caller masks it.
+
+    Differentiable except at ``b = 0`` and ``b_0 = -|b|``; masked vectors get zero gradient.
+
+    Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007, for the tie; the closed form
+    is ours, checked in ``test_cone.py``.
+
+    >>> project_to_cone(torch.tensor([1.0, 0.0, 0.0, -3.0]))
+    tensor([ 2.,  0.,  0., -2.])
+    """
+    scalar, *vector = shading.unbind(dim=-1)
+    length, directed = _length(vector)
+    albedo = torch.where(directed, (scalar + length).clamp_min(0) / 2, 0)
+    ratio = albedo / length
+    return _vectors([albedo, *(torch.where(directed, part, 0) * ratio for part in vector)])
+
+
+def split_shading(
+    shading: Float[Tensor, "*batch 4"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    """Read albedo and unit normal off vectors on the cone.
+
+    A vector without direction gives the normal zero. Differentiable away from the apex.
+    """
+    albedo, *vector = shading.unbind(dim=-1)
+    length, directed = _length(vector)
+    return albedo, _vectors([torch.where(directed, part / length, 0) for part in vector])
+
+
+def tangents(
+    normals: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+    """Return two unit vectors that span, with each unit normal, a right-handed frame.
+
+    Continuous except where ``n_z`` changes sign, which viewer-facing normals never do.
+
+    Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6(1), 2017.
+    """
+    x, y, z = normals.unbind(dim=-1)
+    sign = torch.where(z >= 0, 1.0, -1.0).to(normals.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = _vectors([1 + sign * x * x * a, sign * b, -sign * x])
+    second = _vectors([b, sign + y * y * a, -y])
+    return first, second
+
+
+def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
+    r"""Span the tangent space of the cone at each column :math:`\rho (1, n)`.
+
+    Returns:
+        Three arrays of columns: :math:`(1, n)`, which changes albedo, and
+        :math:`(0, t_1), (0, t_2)`, which rotate the normal by :math:`1/\rho` radians per unit.
+    """
+    _, normal = split_shading(shading.mT)
+    first, second = tangents(normal)
+    zero = torch.zeros_like(first[..., 0])
+    return [
+        torch.stack([zero + 1, *normal.unbind(dim=-1)], dim=-2),
+        torch.stack([zero, *first.unbind(dim=-1)], dim=-2),
+        torch.stack([zero, *second.unbind(dim=-1)], dim=-2),
+    ]
+
+
+def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+    """Return lengths, 1 for zero vectors, and which vectors are not zero.
+
+    So are vectors whose directions have no derivative in the dtype's range: of 3e-10 and less in
+    single precision.
+    """
+    x, y, z = vector
+    square = x * x + y * y + z * z
+    directed = square > torch.finfo(square.dtype).tiny ** 0.5
+    # The root has no gradient at zero.
+    return torch.where(directed, square, 1).sqrt(), directed
+
+
+def _vectors(parts: list[Tensor]) -> Float[Tensor, "..."]:
+    """Stack components on the last axis, each contiguous, for products with lights."""
+    return torch.stack(parts, dim=-2).mT if parts[0].ndim else torch.stack(parts)
+
+
+@runtime_checkable
+class Manifold(Protocol):
+    """A set of possible shading vectors."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is the whole space, so that normal equations give the minimum."""
+
+    def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Return the nearest vector of the manifold."""
+
+    def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+        """Map the end of a small step along the tangents back to the manifold."""
+
+    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
+        """Span the tangent space at each column."""
+
+    def curvature(
+        self,
+        shading: Float[Tensor, "*batch rank sample"],
+        slope: Float[Tensor, "*batch rank sample"],
+    ) -> Float[Tensor, "*batch sample tangent tangent"]:
+        r"""Return :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
+
+        It is the manifold's part of the second derivatives of a function with gradient ``g``.
+        """
+
+    def split(
+        self, shading: Float[Tensor, "*batch rank"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Return albedo and unit normal of the vectors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cone:
+    r"""First-order lighting: :math:`\rho (1, n)`."""
+
+    rank: ClassVar[int] = 4
+    flat: ClassVar[bool] = False
+
+    project = retract = staticmethod(project_to_cone)
+    tangents = staticmethod(tangent_columns)
+    split = staticmethod(split_shading)
+
+    def curvature(
+        self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
+    ) -> Float[Tensor, "*batch sample 3 3"]:
+        r"""Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
+        albedo, normal = self.split(shading.mT)
+        first, second = tangents(normal)
+        along, on_first, on_second = (
+            (slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)
+        )
+        zero = torch.zeros_like(albedo)
+        rows = [[zero, on_first, on_second], [on_first, -along, zero], [on_second, zero, -along]]
+        matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+        return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
+
+    def join(
+        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 4"]:
+        """Return the vectors of albedo and normal."""
+        return albedo[..., None] * harmonics(normals)
+
+    def normal_prior(
+        self, normals: Float[Tensor, "*batch 3 sample"]
+    ) -> Float[Tensor, "*batch 10 sample"]:
+        r"""Return penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
+        n = normals
+        one, zero = torch.ones_like(n[..., 0, :]), torch.zeros_like(n[..., 0, :])
+        x, y, z = n.unbind(dim=-2)
+        rows = [(n * n).sum(dim=-2), -x, -y, -z, one, zero, zero, one, zero, one]
+        return torch.stack(rows, dim=-2)

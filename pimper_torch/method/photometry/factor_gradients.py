@@ -1,0 +1,372 @@
+r"""Gradients of factorizations by the implicit function theorem.
+
+A solution satisfies :math:`\nabla E(x; \theta) = 0`, so that with the Hessian ``H``
+
+.. math:: \frac{dx}{d\theta} = -H^{-1} \frac{\partial \nabla E}{\partial \theta},
+
+whatever the solver. One Newton step with constant ``H`` has this derivative, and length zero.
+``H`` is exact: it includes the curvature of the manifold, of the loss and of the product of
+lights and shading, and the dependence of robust weights on the residuals' deviation. Samples are
+eliminated, as in :mod:`~pimper_torch.method.photometry.variable_projection`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pimper_torch.ground.kernels.arrays import as_array
+from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.ground.linalg.robust import Squares, with_slope
+from pimper_torch.method.photometry.bilinear import (
+    Bilinear,
+    Factors,
+    curvature_of_views,
+    residual_deviation,
+    robust_weights,
+    root_mean_square,
+)
+from pimper_torch.method.photometry.quadratics import (
+    apply_packed,
+    combination,
+    coordinates,
+    outer,
+    unpacked,
+)
+from pimper_torch.records import Record
+
+# The step of the lights, over these, that ends Newton's method: a choice.
+_CLOSE = 1e-11
+
+
+def differentiable(problem: Bilinear, factors: Factors) -> Factors:
+    r"""Make a solution differentiable in its data.
+
+    Newton's method first refines the solution to rounding, as the implicit function theorem
+    holds at the optimum alone. A patch whose gradient it does not reduce keeps its solution.
+
+    Args:
+        problem: Gradients reach its ``radiance``, ``weight``, ``anchor``, ``regularization`` and
+            ``prior``.
+        factors: Its solution, near enough to a minimum that the Hessian is positive definite.
+
+    Returns:
+        Lights, shading, weights and residuals at the optimum, with gradients, those through the
+        robust weights and their scale included.
+
+    Checked against the solvers in ``test_factor_gradients.py``. The Hessian is in float64. Where
+    the solver is compiled, so are refinement and adjoint
+    (:mod:`~pimper_torch.ground.kernels.factor_adjoint`), which is differentiable once.
+    """
+    if problem.has_kernel and compiled_for(problem.radiance.detach()):
+        data = problem.radiance, problem.weight, problem.anchor, problem.regularization
+        lights, shading, weight, residual = _Compiled.apply(  # type: ignore[no-untyped-call]
+            problem.detach(), factors, *data, problem.dense_prior
+        )
+        convergence = factors.convergence.replace(residual=residual)
+        return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
+    factors = _newton_refined(problem, factors)
+    L, N = factors.lights.detach().double(), factors.shading.detach().double()
+    hessian = _hessian(problem, L, N)
+    step = _newton_step(problem, hessian)
+    moved = combination(hessian.columns, step.along_tangents)
+    lights = factors.lights.detach() + (step.lights - step.lights.detach()).to(factors.lights)
+    shading = factors.shading.detach() + (moved - moved.detach()).to(factors.shading)
+    convergence = factors.convergence
+    return factors.replace(
+        lights=lights,
+        shading=shading,
+        weight=robust_weights(problem, lights, shading),
+        convergence=convergence.replace(residual=root_mean_square(problem, lights, shading)),
+    )
+
+
+class _Compiled(torch.autograd.Function):
+    """Solution of a problem, as a function of its data, by the kernel and its adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Refine the solution; return lights, shading, weights and residuals."""
+        from pimper_torch.ground.kernels import factor_adjoint
+
+        code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
+        assert code is not None  # the caller asks
+        radiance = data[0].detach().double()
+        found = (
+            factors.lights.detach().to(torch.float64, copy=True).contiguous(),
+            factors.shading.detach().to(torch.float64, copy=True).contiguous(),
+            torch.zeros_like(radiance, memory_format=torch.contiguous_format),
+            radiance.new_zeros(len(radiance)),
+        )
+        given = factor_adjoint.FactorData(*(as_array(each, torch.float64) for each in data))
+        solution = factor_adjoint.FactorSolution(*map(as_array, found))
+        factor_adjoint.refine(given, code, scale, stride, solution)
+        ctx.loss = code, scale, stride
+        ctx.save_for_backward(*found[:2], *data)
+        lights, shading, weight, residual = (each.to(data[0]) for each in found)
+        return lights, shading, weight, residual
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        """Return gradients of the data."""
+        from pimper_torch.ground.kernels import factor_adjoint
+
+        lights, shading, *data = ctx.saved_tensors
+        code, scale, stride = ctx.loss
+        contiguous, exact = torch.contiguous_format, torch.float64
+        found = [torch.zeros_like(each, dtype=exact, memory_format=contiguous) for each in data]
+        factor_adjoint.pull_back(
+            factor_adjoint.FactorData(*(as_array(each, exact) for each in data)),
+            code,
+            scale,
+            stride,
+            as_array(lights),
+            as_array(shading),
+            factor_adjoint.FactorSolution(*(as_array(each, exact) for each in cotangents)),
+            factor_adjoint.FactorData(*map(as_array, found)),
+        )
+        return None, None, *(each.to(data[0]) for each in found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class FactorStep(Record):
+    """A step of all unknowns: of the lights, and of the samples along their tangents."""
+
+    lights: Float[Tensor, "patch view rank"]
+    along_tangents: Float[Tensor, "patch tangent sample"]
+
+    def moved(self, factor: Float[Tensor, " patch"], other: "FactorStep") -> "FactorStep":
+        """Add a multiple of another step."""
+        return FactorStep(
+            lights=self.lights + factor[:, None, None] * other.lights,
+            along_tangents=self.along_tangents + factor[:, None, None] * other.along_tangents,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Hessian(Record):
+    """Half the second derivatives of the objective, constant, samples eliminated.
+
+    Attributes:
+        columns: The manifold's tangents there.
+        loss_curvature: The loss's second derivative at each entry, weighted.
+        weighted_residual: Of each entry.
+        inverse: Of the diagonal blocks of the samples.
+        schur: The Schur complement, of the lights.
+    """
+
+    lights: Float[Tensor, "patch view rank"]
+    shading: Float[Tensor, "patch rank sample"]
+    columns: tuple[Float[Tensor, "patch rank sample"], ...]
+    loss_curvature: Float[Tensor, "patch view sample"]
+    weighted_residual: Float[Tensor, "patch view sample"]
+    inverse: Float[Tensor, "patch sample tangent tangent"]
+    schur: Float[Tensor, "patch unknown unknown"]
+
+
+@torch.no_grad()
+def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
+    """Take Newton steps, patch by patch, as long as they reduce the gradient's norm."""
+    L, N = factors.lights.double(), factors.shading.double()
+    size = _gradient_size(problem, L, N)
+    fraction, step = torch.ones_like(size), _newton_step(problem, _hessian(problem, L, N))
+    for _ in range(30):
+        moved = combination(problem.manifold.tangents(N), step.along_tangents)
+        part = fraction[:, None, None]
+        lights = L + part * step.lights
+        shading = problem.manifold.retract((N + part * moved).mT).mT
+        after = _gradient_size(problem, lights, shading)
+        better = after < size
+        at_rest = part[:, 0, 0] * step.lights.norm(dim=(1, 2)) <= _CLOSE * L.norm(dim=(1, 2))
+        fraction = torch.where(better, (2 * fraction).clamp_max(1), fraction / 2)
+        keep = better[:, None, None]
+        L, N = torch.where(keep, lights, L), torch.where(keep, shading, N)
+        size = torch.where(better, after, size)
+        if bool((at_rest | (fraction < 1e-3)).all()):
+            break
+        if bool(better.any()):
+            step = _newton_step(problem, _hessian(problem, L, N))
+    return factors.replace(lights=L.to(factors.lights), shading=N.to(factors.shading))
+
+
+def _gradient_size(
+    problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
+) -> Float[Tensor, " patch"]:
+    on_lights, on_samples = _gradient(problem, L, N, problem.manifold.tangents(N))
+    return on_lights.square().sum(dim=(1, 2)) + on_samples.square().sum(dim=(1, 2))
+
+
+def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
+    r"""Return Newton's step; differentiable in the data, the Hessian constant.
+
+    The scale of the robust weights is a multiple of the residuals' deviation :math:`d`, which
+    adds a rank-one term to the Hessian: the gradient's derivative by :math:`d` times the
+    derivative of :math:`d` by the unknowns. It is inverted by the Sherman-Morrison formula.
+    """
+    at = hessian.lights, hessian.shading, hessian.columns
+    step = _solved(hessian, *_gradient(problem, *at))
+    if isinstance(problem.loss, Squares):
+        return step
+    with torch.no_grad():
+        deviation_slope, slopes = _by_deviation(problem, hessian)
+        deviation_step = _solved(hessian, *slopes)
+        remainder = 1 - _change_of(deviation_slope, hessian, deviation_step)
+    return step.moved(_change_of(deviation_slope, hessian, step) / remainder, deviation_step)
+
+
+def _solved(
+    hessian: Hessian,
+    on_lights: Float[Tensor, "patch view rank"],
+    on_samples: Float[Tensor, "patch tangent sample"],
+) -> FactorStep:
+    """Apply the Hessian's inverse, samples eliminated."""
+    inner = _apply(hessian.inverse, on_samples)
+    slope = on_lights - _apply_mixed(hessian, inner)
+    flat = slope.reshape(len(slope), -1, 1)
+    lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
+    return FactorStep(
+        lights=lights,
+        along_tangents=inner - _apply(hessian.inverse, _apply_mixed_transpose(hessian, lights)),
+    )
+
+
+def _by_deviation(
+    problem: Bilinear, hessian: Hessian
+) -> tuple[
+    Float[Tensor, "patch view sample"],
+    tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]],
+]:
+    """Return the deviation's derivatives by the residuals, and the gradient's by the deviation."""
+    residual = problem.radiance.double() - hessian.lights @ hessian.shading
+    deviation, deviation_slope = with_slope(partial(residual_deviation, problem), residual)
+    # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
+    deviation = deviation[:, None, None].clamp_min(1e-300)
+    weighted_residual = (hessian.weighted_residual - hessian.loss_curvature * residual) / deviation
+    return deviation_slope, (
+        weighted_residual @ hessian.shading.mT,
+        coordinates(hessian.columns, hessian.lights.mT @ weighted_residual),
+    )
+
+
+def _change_of(
+    deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: FactorStep
+) -> Float[Tensor, " patch"]:
+    """Return the directional derivative of the deviation along a step."""
+    samples = step.lights @ hessian.shading
+    samples = samples + hessian.lights @ combination(hessian.columns, step.along_tangents)
+    return -(deviation_slope * samples).sum(dim=(1, 2))
+
+
+@torch.no_grad()
+def _hessian(
+    problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
+) -> Hessian:
+    weight, radiance = problem.weight.double(), problem.radiance.double()
+    residual = radiance - L @ N
+    deviation = residual_deviation(problem, residual)[:, None, None]
+    weighted_residual = weight * problem.loss.weights(residual, deviation) * residual
+    loss_curvature = weight * problem.loss.curvatures(residual, deviation)
+    columns = tuple(problem.manifold.tangents(N))
+    packed, slope = outer(L.mT) @ loss_curvature, -(L.mT @ weighted_residual)
+    if problem.prior is not None:
+        prior = problem.prior.double()
+        packed, slope = packed + prior, slope + apply_packed(prior, N)
+    A, B = unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
+    own = B.mT @ A @ B + problem.manifold.curvature(N, slope)
+    diagonal = own.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
+    eye = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
+    # A sample without data does not move.
+    moves = (diagonal > 0)[..., None, None]
+    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, own, eye)).inverse, 0)
+    found = Hessian(
+        lights=L,
+        shading=N,
+        columns=columns,
+        loss_curvature=loss_curvature,
+        weighted_residual=weighted_residual,
+        inverse=inverse,
+        schur=L.new_zeros(len(L), 0, 0),
+    )
+    return found.replace(schur=_schur(problem, found))
+
+
+def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
+    L, N = hessian.lights, hessian.shading
+    batch, views, rank = L.shape
+    total = curvature_of_views(N, hessian.loss_curvature)
+    regularization = problem.regularization.double()[..., None].expand(-1, -1, rank).flatten(1)
+    total = total + torch.diag_embed(regularization)
+    mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
+    size = max(1, 10_000_000 // (batch * views * rank * len(hessian.columns)))
+    for first in range(0, N.shape[2], size):
+        part = slice(first, first + size)
+        mixed = torch.stack(
+            [
+                (hessian.loss_curvature[..., part] * (L @ column[..., part]))[:, :, None]
+                * N[:, None, :, part]
+                - hessian.weighted_residual[:, :, None, part] * column[:, None, :, part]
+                for column in hessian.columns
+            ],
+            dim=-1,
+        ).flatten(1, 2)
+        total = total - mixed.flatten(2) @ (
+            (mixed[..., None, :] @ hessian.inverse[:, None, part])[..., 0, :].flatten(2).mT
+        )
+    # Undetermined directions, as Lorentz transformations of free lights, do not move.
+    ridge = 1e-10 * mean.clamp_min(1e-300)
+    return total + torch.diag_embed(ridge[:, None].expand(-1, views * rank))
+
+
+def _gradient(
+    problem: Bilinear,
+    L: Float[Tensor, "patch view rank"],
+    N: Float[Tensor, "patch rank sample"],
+    columns: Sequence[Float[Tensor, "patch rank sample"]],
+) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
+    """Return minus half the gradient by lights and samples, as a function of the data."""
+    residual = problem.radiance.double() - L @ N
+    deviation = residual_deviation(problem, residual)[:, None, None]
+    weighted_residual = (
+        problem.weight.double() * problem.loss.weights(residual, deviation) * residual
+    )
+    difference = L - problem.anchor.double()
+    on_lights = weighted_residual @ N.mT - problem.regularization.double()[..., None] * difference
+    ambient = L.mT @ weighted_residual
+    if problem.prior is not None:
+        ambient = ambient - apply_packed(problem.prior.double(), N)
+    return on_lights, coordinates(columns, ambient)
+
+
+def _apply_mixed(
+    hessian: Hessian, along_tangents: Float[Tensor, "patch tangent sample"]
+) -> Float[Tensor, "patch view rank"]:
+    """Apply the mixed block to steps of the samples."""
+    moved = combination(hessian.columns, along_tangents)
+    return (
+        hessian.loss_curvature * (hessian.lights @ moved)
+    ) @ hessian.shading.mT - hessian.weighted_residual @ moved.mT
+
+
+def _apply_mixed_transpose(
+    hessian: Hessian, step: Float[Tensor, "patch view rank"]
+) -> Float[Tensor, "patch tangent sample"]:
+    """Apply its transpose to steps of the lights."""
+    ambient = hessian.lights.mT @ (hessian.loss_curvature * (step @ hessian.shading)) - (
+        step.mT @ hessian.weighted_residual
+    )
+    return coordinates(hessian.columns, ambient)
+
+
+def _apply(
+    inverse: Float[Tensor, "patch sample tangent tangent"],
+    vectors: Float[Tensor, "patch tangent sample"],
+) -> Float[Tensor, "patch tangent sample"]:
+    return (inverse @ vectors.mT[..., None])[..., 0].mT

@@ -1,0 +1,60 @@
+"""The factor that albedo and lights of the whole scene share."""
+
+import math
+
+import torch
+
+from pimper_torch.method.photometry.factorize import FactorizeConfig
+from pimper_torch.method.photometry.status import warn_of_undetermined
+from pimper_torch.records import PatchStatus, PhotometricPatches
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.stage import Stage
+
+
+class FixGauge(Stage):
+    """Set the 99th percentile of gray albedo to 1, over all patches.
+
+    Of the samples whose normals light determines, where there are any. Warns of patches whose light
+    determines no normals. Differentiable.
+
+    Args:
+        config: Of the factorization, whose limits the warning names.
+    """
+
+    def __init__(self, config: FactorizeConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or FactorizeConfig()
+
+    def forward(self, solved: PhotometricPatches) -> PhotometricPatches:
+        """Divide albedo by it, and multiply lights.
+
+        Args:
+            solved: Of all patches.
+        """
+        config = self.config
+        status = torch.cat([bucket.status for bucket in solved.buckets])
+        mesh, facet = solved.patches.coarse.mesh, [one.facet for one in solved.patches.buckets]
+        undetermined = status != int(PatchStatus.DETERMINED)
+        at = mesh.vertices_world, mesh.faces[torch.cat(facet)]
+        leave_out("photometry.undetermined", undetermined, at=at)
+        warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
+        return _in_gauge(solved)
+
+
+def _in_gauge(solved: PhotometricPatches) -> PhotometricPatches:
+    determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
+    gray = torch.cat(
+        [
+            bucket.albedo.mean(dim=-1)[bucket.valid if determined else bucket.observed]
+            for bucket in solved.buckets
+        ]
+    )
+    if len(gray) == 0:
+        return solved
+    bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
+    factor = torch.where(bright > 0, bright, 1)
+    buckets = tuple(
+        bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
+        for bucket in solved.buckets
+    )
+    return solved.replace(buckets=buckets)

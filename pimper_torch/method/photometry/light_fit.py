@@ -1,0 +1,247 @@
+"""Lights and albedo fitted jointly to radiance under known normals.
+
+By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the Schur complement,
+with Cauchy's loss; gradients by the implicit function theorem at the optimum.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from pimper_torch.ground.kernels.twin_constants import MIN_DEVIATION
+from pimper_torch.ground.linalg.robust import with_slope
+from pimper_torch.method.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
+
+# A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
+# is the limit of iterations and the fraction where gradients are required, from which Newton's
+# method converges to rounding (`tests/photometry/test_factor_gradients.py`).
+_MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
+
+# Newton's steps at most, the smallest fraction of one in the line search, and the step, over the
+# unknowns, that ends them: choices; near the solution every step doubles the correct digits.
+_NEWTON_STEPS, _MIN_STEP, _CLOSE = 12, 0.05, 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightFit:
+    """Fitted lights and albedo."""
+
+    model: LightModel
+    lights: Float[Tensor, "view parameter"]
+    albedo: Float[Tensor, " sample"]
+
+    def misfit(
+        self, samples: ImageSamples, some: Bool[Tensor, "sample view"]
+    ) -> Float[Tensor, " view"]:
+        """Return the median residual of some samples, in brightnesses of their views.
+
+        NaN in views that have none of them.
+        """
+        residual = samples.radiance - self.albedo[:, None] * self.model.shade(self.lights)
+        relative = residual.abs() / samples.level.clamp_min(1e-300)
+        missing = torch.where(some, relative.clamp_min(MIN_DEVIATION), torch.nan)
+        return missing.nanmedian(dim=0).values
+
+
+def fit_lights(
+    model: LightModel,
+    samples: ImageSamples,
+    iterations: int,
+    start: tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]] | None = None,
+) -> LightFit:
+    """Fit a model's lights and the samples' albedo; a constant to autograd.
+
+    Where gradients are required, it iterates to convergence: see :func:`with_gradients`.
+
+    Args:
+        iterations: At most, where no gradients are required.
+        start: Lights and albedo; by default, see :meth:`LightModel.initialize`.
+    """
+    limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
+    with torch.no_grad():
+        lights, albedo = start or model.initialize(samples)
+        lights, albedo = _minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
+    return LightFit(model=model, lights=lights, albedo=albedo)
+
+
+def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
+    parts = (samples.radiance, *model.geometry())
+    return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+
+
+def _minimize(
+    model: LightModel,
+    samples: ImageSamples,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+    limit: int,
+    min_gain: float,
+) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+    """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
+    from pimper_torch.ground.kernels.lights_and_albedo import TILE, fit
+
+    count, device = len(albedo), albedo.device
+    lights, found = lights.cpu().clone(memory_format=torch.contiguous_format), albedo.cpu()
+    padding = (0, -count % TILE)
+    known, radiance, seen = (
+        pad(each.detach().mT.to(found), padding).contiguous().numpy()
+        for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
+    )
+    found, level = pad(found, padding), samples.level.detach().cpu()
+    fit(
+        known,
+        radiance,
+        seen,
+        level.numpy(),
+        1 / MIN_DISTANCE,
+        limit,
+        min_gain,
+        lights.numpy(),
+        found.numpy(),
+    )
+    return lights.to(device), found[:count].to(device)
+
+
+def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
+    """Make the fit differentiable in photographs and geometry, if gradients are required.
+
+    By the implicit function theorem, at the nearest stationary point: a Newton step from there, of
+    constant derivatives, has length zero and the gradient. Light and albedo share a free factor:
+    the largest parameter of the lights is fixed, and so are parameters at a bound or without data.
+    """
+    if not _requires_grad(found.model, samples):
+        return found
+    model = found.model
+    with torch.no_grad():
+        fixed = ~model.inside_bounds(found.lights)
+        largest = torch.where(fixed, 0, found.lights.abs()).argmax()
+        fixed = fixed.flatten().index_fill(0, largest, value=True).reshape(fixed.shape)
+        lights, albedo, solve = found.lights, found.albedo, None
+        on_lights, on_albedo = _descent(model, samples, lights, albedo)
+        fraction = 1.0
+        for _ in range(_NEWTON_STEPS):
+            solve = solve or _newton_matrix(model, samples, lights, albedo, fixed)
+            by_lights, by_albedo = solve(on_lights, on_albedo)
+            trial = lights + fraction * by_lights, albedo + fraction * by_albedo
+            after = _descent(model, samples, *trial)
+            # In units of the unknowns, as bounds and missing data leave some of the gradient.
+            if _length(solve(*after)) < _length((by_lights, by_albedo)):
+                (lights, albedo), (on_lights, on_albedo) = trial, after
+                solve, fraction = None, min(1.0, 2 * fraction)
+                if _length((by_lights, by_albedo)) <= _CLOSE * _length((lights, albedo)):
+                    break
+            elif (fraction := fraction / 2) < _MIN_STEP:
+                break
+        solve = solve or _newton_matrix(model, samples, lights, albedo, fixed)
+    by_lights, by_albedo = solve(*_descent(model, samples, lights, albedo))
+    return LightFit(
+        model=model,
+        lights=lights + (by_lights - by_lights.detach()),
+        albedo=albedo + (by_albedo - by_albedo.detach()),
+    )
+
+
+Unknowns = tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]
+
+
+def _length(step: Unknowns) -> float:
+    return math.hypot(*(float(part.norm()) for part in step))
+
+
+def _descent(
+    model: LightModel,
+    samples: ImageSamples,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+) -> Unknowns:
+    """Return minus half the gradient of the objective."""
+    shading = model.shade(lights)
+    residual = samples.residual(albedo, shading)
+    weighted = samples.weights(residual, samples.scale(residual)) * residual
+    by_lights = torch.einsum("sv,s,svp->vp", weighted, albedo, model.jacobian(lights))
+    return by_lights, (weighted * shading).sum(dim=1)
+
+
+def _newton_matrix(
+    model: LightModel,
+    samples: ImageSamples,
+    lights: Float[Tensor, "view parameter"],
+    albedo: Float[Tensor, " sample"],
+    fixed: Bool[Tensor, "view parameter"],
+) -> Callable[[Tensor, Tensor], Unknowns]:
+    """Factor the exact derivative of :func:`_descent`, negative; albedos are eliminated (Schur).
+
+    Each view's scale depends on its residuals, which adds a matrix of a rank of one a view
+    (Woodbury's formula).
+
+    Args:
+        fixed: Parameters that do not move.
+
+    Returns:
+        Newton's step by right-hand sides of lights and albedos, differentiable in these.
+    """
+    num_views, size = lights.shape
+    shading, jacobian = model.shade(lights), model.jacobian(lights)
+    residual = samples.residual(albedo, shading)
+    scale, by_residual = with_slope(samples.scale, residual)
+    weight = samples.weights(residual, scale)
+    weighted, bend = weight * residual, weight * (2 * weight - 1)
+    slope = albedo[:, None, None] * jacobian
+    blocks = (bend[..., None] * slope).permute(1, 2, 0) @ slope.transpose(0, 1)
+    blocks = blocks - _second_derivatives(model, lights, weighted * albedo[:, None])
+    own = (bend * shading**2).sum(dim=1)
+    cross = ((bend * shading)[..., None] * slope - weighted[..., None] * jacobian).flatten(1)
+    # A weight depends on the residual over the scale alone.
+    by_scale = (weighted - bend * residual) / torch.where(scale > 0, scale, 1)
+    sides = []
+    for field in (by_scale, by_residual):
+        on_view = torch.einsum("sv,svp->vp", field, slope)
+        by_view = torch.diag_embed(on_view.mT).movedim(0, 1)
+        sides.append((by_view.flatten(0, 1), field * shading))
+    known = (bend * shading.square()).abs().sum(dim=1)
+    free = ~fixed & (blocks.diagonal(dim1=1, dim2=2).abs() > 0)
+    moves, samples_move = free.flatten()[:, None], (own > 1e-9 * known)[:, None]
+    cross = torch.where(samples_move & moves.mT, cross, 0)
+    inverse = torch.where(samples_move[:, 0], 1 / torch.where(samples_move[:, 0], own, 1), 0)
+    whole = blocks.new_zeros(num_views, size, num_views, size)
+    whole[torch.arange(num_views), :, torch.arange(num_views)] = blocks
+    schur = whole.flatten(2).flatten(0, 1) - cross.mT @ (inverse[:, None] * cross)
+    ridge = 1e-12 * torch.diag(schur.diagonal().abs())
+    schur = torch.where(moves & moves.mT, schur + ridge, torch.eye(len(schur)).to(schur))
+    factor = torch.linalg.lu_factor(schur)
+
+    def apply(on_lights: Tensor, on_albedo: Tensor) -> tuple[Tensor, Tensor]:
+        on_lights, on_albedo = torch.where(moves, on_lights, 0), inverse[:, None] * on_albedo
+        step = torch.linalg.lu_solve(*factor, on_lights - cross.mT @ on_albedo)
+        return step, on_albedo - inverse[:, None] * (cross @ step)
+
+    (q_lights, q_albedo), (p_lights, p_albedo) = sides
+    y_lights, y_albedo = apply(q_lights, q_albedo)
+    p_lights, p_albedo = torch.where(moves, p_lights, 0), torch.where(samples_move, p_albedo, 0)
+    small = torch.eye(num_views).to(schur) + p_lights.mT @ y_lights + p_albedo.mT @ y_albedo
+
+    def solve(on_lights: Tensor, on_albedo: Tensor) -> Unknowns:
+        step, others = apply(on_lights.reshape(-1, 1), on_albedo[:, None])
+        factors = torch.linalg.solve(small, p_lights.mT @ step + p_albedo.mT @ others)
+        step, others = step - y_lights @ factors, others - y_albedo @ factors
+        return step.reshape(num_views, size), others[:, 0]
+
+    return solve
+
+
+def _second_derivatives(
+    model: LightModel, lights: Float[Tensor, "view parameter"], weight: Float[Tensor, "sample view"]
+) -> Float[Tensor, "view parameter parameter"]:
+    """Sum the second derivatives of the samples' shading, by each view's parameters."""
+    if model.normals is None:
+        return lights.new_zeros(*lights.shape, lights.shape[1])
+    with torch.enable_grad():
+        at = lights.detach().requires_grad_()
+        summed = torch.einsum("sv,svp->pv", weight, model.jacobian(at)).sum(dim=1)
+        rows = [torch.autograd.grad(each, at, retain_graph=True)[0] for each in summed]
+    return torch.stack(rows, dim=1)

@@ -1,0 +1,293 @@
+r"""Damped variable projection: shading eliminated, Gauss-Newton on the lights.
+
+With :math:`N(L)` the optimal shading vectors for the lights, :math:`f(L) = \lVert \sqrt W (J - L
+N(L)) \rVert^2` has far fewer unknowns and local minima than the joint problem. Its
+Gauss-Newton matrix, in Ruhe and Wedin's second approximation, is
+
+.. math:: H = \sum_k (n_k n_k^\top) \otimes
+          (W_k - W_k L B_k (B_k^\top L^\top W_k L B_k)^{-1} B_k^\top L^\top W_k)
+
+for samples k, with ``B`` the tangents of their manifold: all directions in low-rank
+factorization, three on the photometric cone. The ambiguity of the factorization (an invertible
+matrix, a Lorentz transformation) is its null space, which the damping regularizes.
+
+Source: Ruhe & Wedin, SIAM Review 22(3), 1980; Okatani, Yoshida & Deguchi, ICCV 2011; Hong &
+Fitzgibbon, ICCV 2015. Its use on the tangents of the cone is ours.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.ground.kernels.arrays import as_array
+from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.ground.kernels.twin_constants import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    INITIAL_DAMPING,
+    SHADING_STEPS,
+    ZERO_ROUNDINGS,
+)
+from pimper_torch.ground.linalg.robust import Squares
+from pimper_torch.method.photometry.bilinear import (
+    RUNNING,
+    Bilinear,
+    Factors,
+    State,
+    curvature_of_views,
+    equations_of_samples,
+    evaluate,
+    iterate,
+    keep_scale,
+    robust_weights,
+    update_shading,
+)
+from pimper_torch.method.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
+from pimper_torch.records import Convergence, StopCause
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _State(State):
+    energy: Float[Tensor, " patch"]
+    cost: Float[Tensor, " patch"]
+    slope: Float[Tensor, "patch view rank"]
+    curvature: Float[Tensor, "patch unknown unknown"]
+    damping: Float[Tensor, " patch"]
+    small: Int[Tensor, " patch"]
+
+
+def solve_variable_projection(
+    problem: Bilinear,
+    max_iterations: int = 300,
+    tolerance: float = 1e-9,
+    *,
+    small_steps: int = 3,
+    curvature_samples: int | None = None,
+) -> Factors:
+    """Factorize a batch of patches by damped variable projection.
+
+    Args:
+        problem: With its initial values. Low-rank factorization uses the lights only, which must
+            be of full rank.
+        tolerance: A step that lowers a patch's objective by less than this fraction is small.
+        small_steps: A patch has converged after so many small steps in a row: one alone may be
+            followed by longer ones.
+        curvature_samples: The Gauss-Newton matrix, most of the work, is summed over about so
+            many samples of a patch, or over all if ``None``. It changes the steps, but not the
+            minimum.
+
+    Returns:
+        A local minimum: initialize well, or restart. Low-rank lights without regularization are
+        orthonormal, and others keep their initial norm.
+
+    Constant to autograd. Patches are independent. First-order light in float32 is
+    solved by a compiled kernel (:mod:`pimper_torch.ground.kernels.factorization`), with the same
+    result up to rounding; there, samples without weight keep their initial values.
+    """
+    kernel = problem.has_kernel and problem.radiance.dtype == torch.float32
+    if kernel and compiled_for(problem.radiance):
+        return _solve_by_kernel(problem, max_iterations, tolerance, small_steps, curvature_samples)
+
+    def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
+        return _step(work, state, tolerance, small_steps, curvature_samples)
+
+    with torch.no_grad():
+        state = _start(problem, curvature_samples)
+        return iterate(problem, state, advance, max_iterations)
+
+
+def curvature_of_lights(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+    samples: int | None = None,
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Return the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
+
+    Args:
+        problem: Gives manifold, regularization and prior.
+        samples: Sum over about so many, evenly spaced, in place of all.
+    """
+    rank = lights.shape[2]
+    stride = max(1, shading.shape[2] // samples) if samples else 1
+    shading, weight = shading[:, :, ::stride], weight[:, :, ::stride]
+    subset = problem.replace(
+        radiance=problem.radiance[:, :, ::stride],
+        weight=weight,
+        shading=shading,
+        prior=None if problem.prior is None else problem.prior[:, :, ::stride],
+    )
+    per_view = curvature_of_views(shading, weight)
+    normal = per_view - _eliminated(_whitened(subset, lights, shading, weight), shading)
+    regularization = problem.regularization[..., None].expand(-1, -1, rank).flatten(1)
+    return stride * normal + torch.diag_embed(regularization)
+
+
+def _step(
+    problem: Bilinear,
+    state: _State,
+    tolerance: float,
+    small_steps: int,
+    curvature_samples: int | None,
+) -> tuple[_State, Int[Tensor, " patch"]]:
+    moved = state.lights + _damped_step(state)
+    shading = state.shading
+    if _is_free(problem):
+        moved = torch.linalg.qr(moved).Q
+    else:
+        moved, shading = keep_scale(problem, state.lights, moved, shading)
+    equations = equations_of_samples(problem, moved, state.weight)
+    shading = update_shading(problem, *equations, shading, SHADING_STEPS)
+    after, slope = evaluate(problem, moved, shading, state.weight)
+    better = after < state.cost
+    gain = (state.cost - after) / state.cost.clamp_min(torch.finfo(after.dtype).tiny)
+    small = torch.where(gain < tolerance, state.small + 1, 0)
+    small = torch.where(better, small, state.small)
+    limit = torch.finfo(after.dtype).eps
+    damping = state.damping * torch.where(better, DAMPING_DECREASE, DAMPING_INCREASE).to(after)
+    exact = state.cost <= (ZERO_ROUNDINGS * limit) ** 2 * state.energy
+    stalled = (damping > 1 / limit) & ~exact
+    state = state.replace(small=small, damping=damping.clamp_min(limit))
+    if bool(better.any()):
+        keep = better[:, None, None]
+        state = state.replace(
+            lights=torch.where(keep, moved, state.lights),
+            shading=torch.where(keep, shading, state.shading),
+            cost=torch.where(better, after, state.cost),
+            slope=torch.where(keep, slope, state.slope),
+        )
+        state = _with_robust_weights(problem, state)
+        state = state.replace(curvature=_curvature(problem, state, curvature_samples))
+    cause = torch.where(stalled, int(StopCause.STALLED), RUNNING)
+    return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
+
+
+def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
+    lights = torch.linalg.qr(problem.lights).Q if _is_free(problem) else problem.lights
+    weight = robust_weights(problem, lights, problem.shading)
+    equations = equations_of_samples(problem, lights, weight)
+    shading = update_shading(problem, *equations, problem.shading, SHADING_STEPS)
+    cost, slope = evaluate(problem, lights, shading, weight)
+    seen = (weight * problem.radiance).flatten(1)
+    state = _State(
+        lights=lights,
+        shading=shading,
+        weight=weight,
+        energy=torch.linalg.vecdot(seen, problem.radiance.flatten(1)),
+        cost=cost,
+        slope=slope,
+        curvature=lights.new_zeros(len(lights), 0, 0),
+        damping=torch.full_like(cost, INITIAL_DAMPING),
+        small=torch.zeros_like(cost).long(),
+    )
+    return state.replace(curvature=_curvature(problem, state, curvature_samples))
+
+
+def _curvature(
+    problem: Bilinear, state: _State, samples: int | None
+) -> Float[Tensor, "patch unknown unknown"]:
+    return curvature_of_lights(problem, state.lights, state.shading, state.weight, samples)
+
+
+def _with_robust_weights(problem: Bilinear, state: _State) -> _State:
+    """Update the robust weights, and evaluate the objective with them."""
+    if isinstance(problem.loss, Squares):
+        return state
+    weight = robust_weights(problem, state.lights, state.shading)
+    cost, slope = evaluate(problem, state.lights, state.shading, weight)
+    return state.replace(weight=weight, cost=cost, slope=slope)
+
+
+def _whitened(
+    problem: Bilinear,
+    lights: Float[Tensor, "patch view rank"],
+    shading: Float[Tensor, "patch rank sample"],
+    weight: Float[Tensor, "patch view sample"],
+) -> list[Float[Tensor, "patch view sample"]]:
+    """Return ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
+    packed, _ = equations_of_samples(problem, lights, weight)
+    if problem.manifold.flat:
+        slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
+    else:
+        columns = problem.manifold.tangents(shading)
+        packed = congruence(packed, columns)
+        slopes = [(lights @ column) * weight for column in columns]
+    white = PackedCholesky(packed[:, None], len(slopes)).whiten(slopes)
+    return [rows.to(lights) for rows in white]
+
+
+def _eliminated(
+    white: list[Float[Tensor, "patch view sample"]], shading: Float[Tensor, "patch rank sample"]
+) -> Float[Tensor, "patch unknown unknown"]:
+    """Sum the samples' Schur terms ``(n n^T) (x) (white^T white)``.
+
+    Products of views come first, then the matrix product with ``n n^T``: several times less
+    arithmetic than Kronecker products.
+    """
+    batch, views, samples = white[0].shape
+    rank = shading.shape[1]
+    pairs = outer(shading)
+    blocks = shading.new_zeros(batch, views, views, pairs.shape[1])
+    group = max(1, 100_000 // (views * samples))
+    for view in range(0, views, group):
+        some = slice(view, view + group)
+        factors = [(rows[:, some, None], rows[:, None, view:]) for rows in white]
+        shared = torch.mul(*factors[0])
+        for factor in factors[1:]:
+            shared.addcmul_(*factor)
+        summed = shared.flatten(1, 2) @ pairs.mT
+        blocks[:, some, view:] = summed.reshape(*shared.shape[:3], -1)
+    upper = unpacked(blocks.flatten(1, 2).mT, rank).reshape(batch, views, views, rank, rank)
+    upper = upper.transpose(2, 3).reshape(batch, views * rank, views * rank)
+    view_of = torch.arange(views * rank, device=shading.device) // rank
+    return torch.where(view_of[:, None] <= view_of, upper, upper.mT)
+
+
+def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
+    """Return the damped Gauss-Newton step."""
+    normal = state.curvature.double()
+    diagonals = normal.diagonal(dim1=1, dim2=2)
+    ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)
+    damped = normal + torch.diag_embed(ridge.expand_as(diagonals))
+    rhs = state.slope.double().flatten(1)[..., None]
+    return torch.linalg.solve(damped, rhs).reshape(state.slope.shape).to(state.slope)
+
+
+def _is_free(problem: Bilinear) -> bool:
+    """Return whether the ambiguity is any invertible matrix."""
+    return problem.manifold.flat and not bool((problem.regularization > 0).any())
+
+
+def _solve_by_kernel(
+    problem: Bilinear,
+    max_iterations: int,
+    tolerance: float,
+    small_steps: int,
+    curvature_samples: int | None,
+) -> Factors:
+    from pimper_torch.ground.kernels import factorization
+
+    J, code = problem.radiance, problem.loss.code
+    assert code is not None  # the caller asks
+    lights, shading = (
+        each.detach().clone(memory_format=torch.contiguous_format)
+        for each in (problem.lights, problem.shading)
+    )
+    weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
+    taken = torch.zeros(len(J), dtype=torch.int64)
+    cause = torch.zeros_like(taken)
+    data = J, problem.weight, problem.anchor, problem.regularization, problem.dense_prior
+    results = lights, shading, weight, taken, residual, cause
+    factorization.solve_on_cone(
+        factorization.ConeProblem(*map(as_array, data)),
+        code,
+        problem.loss.scale,
+        problem.stride,
+        factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
+        factorization.ConeSolution(*(each.numpy() for each in results)),
+    )
+    convergence = Convergence(iterations=taken, residual=residual, cause=cause)
+    return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)

@@ -1,0 +1,185 @@
+"""COLMAP's models: of cameras, and of what they see."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.geometry.lens_models import camera_of, distort, lens_of
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.model_files import read_files, sound_model
+from pimper_torch.runtime.errors import OutputError
+
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+)
+"""COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
+
+
+def read_model(folder: Path) -> SparseModel:
+    """Read a COLMAP model, text or binary.
+
+    Raises:
+        InputError: The folder holds no model, one that is cut short or of another format, or one of
+            which more than half is broken. A :class:`~pimper_torch.runtime.errors.PimperWarning`
+            counts what was broken and left out.
+    """
+    return sound_model(read_files(folder), folder)
+
+
+def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: Path) -> None:
+    """Write a model as COLMAP's binary files.
+
+    Args:
+        folder: Made if it does not exist; files of those names in it are replaced.
+    """
+    with quiet():
+        reconstruction = reconstruction_of(model, colors)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            reconstruction.write_binary(str(folder))
+        except (ValueError, RuntimeError, OSError) as error:
+            why = f" ({error.strerror})" if isinstance(error, OSError) else ""
+            raise OutputError(
+                f"The sparse model cannot be written to {folder}{why}. Choose a folder that exists "
+                "and may be written."
+            ) from error
+
+
+def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_of
+    """Read COLMAP's own model; views by their ids, points by theirs."""
+    image_ids = sorted(reconstruction.reg_image_ids())
+    number = {image_id: index for index, image_id in enumerate(image_ids)}
+    images = [reconstruction.image(image_id) for image_id in image_ids]
+    pixels = {
+        image_id: [point.xy for point in image.points2D]
+        for image_id, image in zip(image_ids, images, strict=True)
+    }
+    points, tracks, places = [], [], []
+    for index, point_id in enumerate(sorted(reconstruction.point3D_ids())):
+        point = reconstruction.point3D(point_id)
+        points.append(point.xyz)
+        for element in point.track.elements:
+            tracks.append((index, number[element.image_id]))
+            places.append(pixels[element.image_id][element.point2D_idx])
+    track = torch.tensor(tracks, dtype=torch.long).reshape(-1, 2)
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(images), 1, 4))
+    return SparseModel(
+        names=tuple(image.name for image in images),
+        lenses=tuple(lens_of(reconstruction.camera(image.camera_id)) for image in images),
+        cam_from_world=torch.from_numpy(np.concatenate([poses, bottom], axis=1)),
+        points_world=torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3)),
+        observation_point=track[:, 0],
+        observation_view=track[:, 1],
+        observation_pixels=torch.from_numpy(np.array(places, dtype=np.float64).reshape(-1, 2)),
+    )
+
+
+def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see camera_of
+    """Make COLMAP's own model; its ids keep the order of views and points."""
+    pycolmap = loaded()
+
+    reconstruction = pycolmap.Reconstruction()
+    for lens in {lens.camera: lens for lens in model.lenses}.values():
+        reconstruction.add_camera_with_trivial_rig(camera_of(lens))
+    view, pixels = model.observation_view.numpy(), model.observation_pixels.numpy()
+    position = np.empty(len(view), dtype=np.int64)  # of each observation in its image
+    for index, (name, lens) in enumerate(zip(model.names, model.lenses, strict=True)):
+        here = np.flatnonzero(view == index)
+        position[here] = np.arange(len(here))
+        image = pycolmap.Image(
+            name=name, keypoints=pixels[here], camera_id=lens.camera, image_id=index + 1
+        )
+        pose = pycolmap.Rigid3d(model.cam_from_world[index, :3].numpy())
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    order = np.argsort(model.observation_point.numpy(), kind="stable")
+    starts = np.searchsorted(
+        model.observation_point.numpy()[order], np.arange(len(model.points_world) + 1)
+    )
+    black = torch.zeros(len(model.points_world), 3, dtype=torch.uint8)
+    rgb = (black if colors is None else colors.cpu()).numpy()
+    for index, xyz in enumerate(model.points_world.numpy()):
+        track = pycolmap.Track()
+        for observation in order[starts[index] : starts[index + 1]]:
+            track.add_element(int(view[observation]) + 1, int(position[observation]))
+        reconstruction.add_point3D(xyz, track, rgb[index])
+    reconstruction.update_point_3d_errors()
+    return reconstruction
+
+
+def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
+    """Return the distance between where a point is seen and where it should be, in pixels.
+
+    Infinite for a point that a camera sees from behind.
+    """
+    residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
+    for index, lens in enumerate(model.lenses):
+        here = torch.nonzero(model.observation_view == index)[:, 0]
+        points = model.points_world[model.observation_point[here]]
+        expected = distort(lens, transform(model.cam_from_world[index], points))
+        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
+        residual[here] = distance.nan_to_num(nan=torch.inf)
+    return residual
+
+
+def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
+    """Average :func:`observation_errors` over each point's track."""
+    total = torch.zeros_like(model.points_world[:, 0])
+    total = total.index_add(0, model.observation_point, observation_errors(model))
+    count = torch.bincount(model.observation_point, minlength=len(total))
+    return total / count.clamp_min(1)
+
+
+def bundle(
+    model: SparseModel, scale_px: float, *, cameras: bool = True, tolerance: float = 1e-6
+) -> SparseModel:
+    """Adjust poses, lenses and points to the observations, robustly.
+
+    Principal points stay; focal lengths and distortions are adjusted, one set a lens. On one
+    thread, so that the same observations give the same bits.
+
+    Args:
+        scale_px: Residual at which Cauchy's weight is a half.
+
+    Returns:
+        Views, points and observations in their old order.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale_px
+    options.ceres.solver_options.max_num_iterations = 100
+    options.ceres.solver_options.function_tolerance = tolerance
+    options.ceres.solver_options.num_threads = 1
+    with quiet():
+        reconstruction = reconstruction_of(model)
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            config.add_image(image_id)
+            if not cameras:
+                image = reconstruction.image(image_id)
+                config.set_constant_rig_from_world_pose(image.frame_id)
+                config.set_constant_cam_intrinsics(image.camera_id)
+        if cameras:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    return model_of(reconstruction).replace(
+        background_from_view=model.background_from_view, series=model.series
+    )

@@ -1,0 +1,173 @@
+"""A COLMAP model, or a file of cameras, that the photographs come with."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from pimper_torch.doors.camera_files.read_cameras import read_cameras
+from pimper_torch.ground.geometry.lens_models import rescale_lens
+from pimper_torch.method.sfm import colmap
+from pimper_torch.method.sfm.conventions.resized_pictures import (
+    REACHES,
+    Ways,
+    changed_views,
+    choose_turned,
+    points_tell,
+    possible_crops,
+    possible_turns,
+    tell_crop,
+    tell_turned,
+)
+from pimper_torch.method.sfm.lenses import turned_lens, turned_pixels, turned_pose, turned_size
+from pimper_torch.method.sfm.model import SparseModel, match_names
+from pimper_torch.method.sfm.model_files import largest_model
+from pimper_torch.records import Views
+from pimper_torch.runtime.errors import InputError, ReconstructionError, some
+from pimper_torch.runtime.file_names import match_files
+
+
+def existing_ways(views: Views, path: Path) -> Ways:
+    """Read cameras and put them in the photographs' order, sizes and orientations.
+
+    Args:
+        views: Matched by file name; cameras may have been made from photographs of another size,
+            and from the pixels that files store where EXIF turns them.
+        path: Folder of a COLMAP model, or of several in folders, of which the
+            largest is read; or a file of cameras, see
+            :func:`~pimper_torch.doors.camera_files.read_cameras.read_cameras`.
+
+    Raises:
+        ReconstructionError: There are cameras of fewer than 3 of the photographs.
+        InputError: They do not belong to the photographs, or cannot be read.
+    """
+    path = largest_model(path)
+    where = place(path)
+    read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
+    model = match_names(read, views.names, where, views.folder)
+    if model.num_views < 3:
+        raise ReconstructionError(
+            f"{where} holds {model.num_views} of {views.num_views} "
+            f"photographs ({', '.join(model.names)}); at least 3 are needed. Use a model that "
+            "holds more of them, or leave it out to run structure from motion."
+        )
+    shown = taken(views, model)
+    sizes = []  # before photographs were shrunk on reading, as the pictures lie
+    for view, lens in enumerate(model.lenses):
+        wide, high = _stored_size(shown, view)
+        sizes.append(turned_size(wide, high, int((wide > high) != (lens.width > lens.height))))
+    changed = changed_views(model, sizes)
+    plain, cropped = (
+        [follow_pictures(one, shown, way) for one in models for way in possible_turns(one, shown)]
+        for models in ([model], possible_crops(model, sizes))
+    )
+    # That photographs were resized is the plain explanation: it may be told in larger steps.
+    reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
+    if changed and not any(points_tell(one, shown, changed, reaches) for one in plain):
+        scores = [points_tell(one, shown, changed) for one in cropped]
+        if not any(scores):
+            return Ways(plain, cropped, changed)
+        crop = cropped[scores.index(max(scores))]
+        tell_crop(where, crop, changed, "what they show round its points")
+        return Ways([crop])
+    if not len(model.points_world):
+        return Ways(plain)
+    chosen = choose_turned(plain, shown, where)
+    if not torch.equal(chosen.cam_from_world, model.cam_from_world):
+        tell_turned(where, "what they show round its points")
+    return Ways([chosen])
+
+
+def place(path: Path) -> str:
+    """State what cameras come from, at the start of a sentence."""
+    return f"The file of cameras {path}" if path.is_file() else f"The COLMAP model in {path}"
+
+
+def taken(views: Views, model: SparseModel) -> Views:
+    """Take the photographs of a model, in its order."""
+    number = {name: index for index, name in enumerate(views.names)}
+    return views.take([number[name] for name in model.names])
+
+
+def _model_of_file(views: Views, path: Path) -> SparseModel:
+    """Read cameras that come without points."""
+    cameras = read_cameras(path, views.names, lambda names: _stored_sizes(views, names, path))
+    if not cameras:
+        raise InputError(
+            f"{path}: has no camera of {some(views.names)}; needed: cameras of these "
+            "photographs, by their names."
+        )
+    names = [camera.name.replace("\\", "/") for camera in cameras]
+    skewed = [
+        camera.name
+        for camera in cameras
+        if abs(camera.skew_px) * camera.lens.height
+        > 0.2 * camera.lens.params[1]  # of 0.1 px in the corners
+    ]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if skewed or twice:
+        found = f"a skew in {some(skewed)}" if skewed else f"several cameras of {some(twice)}"
+        raise InputError(
+            f"{path}: found {found}; needed: one camera a photograph, with axes at right angles. "
+            "Export the cameras of undistorted photographs."
+        )
+    return SparseModel(
+        names=tuple(names),
+        lenses=tuple(camera.lens for camera in cameras),
+        cam_from_world=torch.stack([camera.cam_from_world for camera in cameras]),
+    )
+
+
+def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
+    """Return the sizes of photographs in their files, which others' programs count pixels of."""
+    where = place(path)
+    found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
+    sizes: list[tuple[int, int] | None] = [None] * len(names)
+    for view, camera in enumerate(found):
+        if camera is not None:
+            sizes[camera] = _stored_size(views, view)
+    return sizes
+
+
+def _stored_size(views: Views, view: int) -> tuple[int, int]:
+    """Return a photograph's size in its file; that which it was read at where there is none."""
+    width, height = (int(side) for side in views.sizes_px[view])
+    with suppress(OSError, ValueError, Image.DecompressionBombError):
+        if views.folder:
+            with Image.open(Path(views.folder) / views.names[view]) as picture:
+                if max(picture.size) >= max(width, height):  # in camera raw it may be the preview
+                    return picture.size
+    return width, height
+
+
+def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
+    """Put a model's cameras and observations into photographs that were resized and turned.
+
+    Args:
+        model: Its pictures have the photographs' shapes once they are turned.
+        views: The photographs, in the model's order.
+        turns: Clockwise quarters by which each picture is turned in its photograph.
+    """
+    lenses = []
+    cameras: dict[tuple[int, int, int, int], int] = {}
+    fresh = 1 + max(lens.camera for lens in model.lenses)
+    pixels = torch.empty_like(model.observation_pixels)
+    poses = torch.empty_like(model.cam_from_world)
+    for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
+        width, height = views.sizes_px[view].tolist()
+        size = turned_size(width, height, quarters)
+        # Photographs of one camera that were resized or turned differently no longer share it; the
+        # first of them keep its number.
+        known = {number for number, *_ in cameras}
+        if lens.camera not in known:
+            cameras[lens.camera, *size, quarters] = lens.camera
+        camera = cameras.setdefault((lens.camera, *size, quarters), fresh + len(cameras))
+        resized = rescale_lens(lens, *size).replace(camera=camera)
+        lenses.append(turned_lens(resized, quarters))
+        scale = pixels.new_tensor([size[0] / lens.width, size[1] / lens.height])
+        here = model.observation_view == view
+        pixels[here] = turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
+        poses[view] = turned_pose(model.cam_from_world[view], quarters)
+    return model.replace(lenses=tuple(lenses), cam_from_world=poses, observation_pixels=pixels)

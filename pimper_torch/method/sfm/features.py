@@ -1,0 +1,190 @@
+"""SIFT features of photographs, found by COLMAP on the CPU."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.records import Views
+from pimper_torch.runtime.mapped import drop_pages
+from pimper_torch.runtime.memory import release_memory
+from pimper_torch.runtime.progress import track
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workspace:
+    """A folder with the files of one run.
+
+    Attributes:
+        files: Names of the photographs in ``images``, in the order of the views.
+        masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
+            behind, as COLMAP wants them.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    masked: bool
+    database_name: str = "database.db"
+
+    @property
+    def images(self) -> Path:
+        """Folder of the photographs."""
+        return self.folder / "images"
+
+    @property
+    def masks(self) -> Path:
+        """Folder of the masks."""
+        return self.folder / "masks"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.folder / self.database_name
+
+    def with_copied_database(self, name: str) -> "Workspace":
+        """Copy the database to another file of the folder, for matches of another hypothesis."""
+        copied = replace(self, database_name=name)
+        shutil.copyfile(self.database, copied.database)
+        return copied
+
+
+@contextmanager
+def workspace(views: Views, threads: int) -> Iterator[Workspace]:
+    """Write photographs and masks to a temporary folder, which goes when the block ends."""
+    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+        space = Workspace(
+            folder=Path(folder),
+            files=tuple(f"{index:06d}.png" for index in range(views.num_views)),
+            masked=views.masks is not None,
+        )
+        space.images.mkdir()
+        space.masks.mkdir()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda index: _write(views, index, space), range(views.num_views)))
+        release_memory()
+        yield space
+
+
+def _write(views: Views, index: int, space: Workspace) -> None:
+    """Write a photograph in 8-bit sRGB without its padding, and its mask if there is one."""
+    width, height = (int(side) for side in views.sizes_px[index])
+    pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
+    array = pixels.permute(1, 2, 0).numpy()
+    gray = array.shape[-1] == 1
+    picture = Image.fromarray(np.ascontiguousarray(array[..., 0] if gray else array))
+    # Fast compression: the files live for seconds. COLMAP looks for features in luma alone.
+    picture.convert("L").save(space.images / space.files[index], compress_level=1)
+    if views.masks is not None:
+        mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
+        Image.fromarray(mask).save(space.masks / f"{space.files[index]}.png", compress_level=1)
+    drop_pages()
+
+
+# The side of photographs below which COLMAP 4.2's covariant detector reads past their end.
+SMALLEST_PX = 16
+
+
+def too_small(views: Views) -> list[str]:
+    """List photographs in which features cannot be looked for: COLMAP's process ends there."""
+    small = (views.sizes_px < SMALLEST_PX).any(dim=1).tolist()
+    return [name for name, one in zip(views.names, small, strict=True) if one]
+
+
+def find_features(
+    space: Workspace,
+    settings: ReconstructConfig,
+    focals_px: Sequence[float | None],
+    lenses: Sequence[int],
+) -> list[int]:
+    """Find features and put them in the database, with one camera a lens.
+
+    Args:
+        space: Without a database, which is made. Where it has masks, features lie where they
+            are not black.
+        focals_px: Focal length of each photograph where it is known before. A camera shared by
+            several photographs gets their median.
+        lenses: Number of each photograph's lens; those of one lens have one size.
+    """
+    pycolmap = loaded()
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = settings.num_threads
+    options.sift.peak_threshold = settings.peak_threshold
+    options.sift.edge_threshold = settings.edge_threshold
+    options.sift.max_num_features = settings.max_features
+    options.sift.estimate_affine_shape = settings.affine_shape
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = settings.camera_model
+    if space.masked:
+        reader.mask_path = str(space.masks)
+    one = len(set(lenses)) == 1
+    mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.PER_IMAGE
+    with quiet():
+        pycolmap.Database.open(space.database).close()
+        _import(space, reader, lenses)
+        with pycolmap.Database.open(space.database) as stored:
+            _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
+        step = 2 * settings.num_threads  # photographs between two reports of progress
+        starts = range(0, len(space.files), step)
+        for start in track(starts):
+            pycolmap.extract_features(
+                space.database,
+                space.images,
+                list(space.files[start : start + step]),
+                camera_mode=mode,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+        with pycolmap.Database.open(space.database) as stored:
+            return [stored.num_keypoints_for_image(image) for image in image_ids(stored, space)]
+
+
+def image_ids(stored: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - pycolmap is untyped
+    """Return the number of each photograph in the database."""
+    ids = {image.name: image.image_id for image in stored.read_all_images()}
+    return [ids[file] for file in space.files]
+
+
+def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types
+    """Put photographs in the database in their order, each with the camera of its lens."""
+    pycolmap = loaded()
+    cameras: dict[int, int] = {}
+    for lens, run in groupby(zip(lenses, space.files, strict=True), key=itemgetter(0)):
+        files = [file for _, file in run]
+        reader.existing_camera_id = cameras.get(lens, -1)
+        shared = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(space.database, space.images, shared, files, reader)
+        if lens not in cameras:
+            with pycolmap.Database.open(space.database) as stored:
+                cameras[lens] = stored.read_image_with_name(files[0]).camera_id
+    reader.existing_camera_id = -1
+
+
+def _set_focals(stored: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
+    known: dict[int, list[float]] = {}
+    for image in stored.read_all_images():
+        focal = focals_px[image.name]
+        if focal is not None:
+            known.setdefault(image.camera_id, []).append(focal)
+    for camera in stored.read_all_cameras():
+        if camera.camera_id not in known:
+            continue
+        params = np.array(camera.params)
+        params[list(camera.focal_length_idxs())] = np.median(known[camera.camera_id])
+        camera.params = params
+        camera.has_prior_focal_length = True
+        stored.update_camera(camera)

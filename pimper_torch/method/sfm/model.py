@@ -1,0 +1,157 @@
+"""A sparse model before it has photographs: what SfM finds and COLMAP's folders hold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pimper_torch.records import Lens, Record, pairs_table
+from pimper_torch.records.scene import no_maps, no_series
+from pimper_torch.runtime.errors import InputError, some
+from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.ledger import leave_out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SparseModel(Record):
+    """Registered views and their sparse points, in float64 on the CPU.
+
+    Attributes:
+        lenses: One a view, before undistortion.
+        observation_pixels: Where, in the photograph before undistortion.
+        background_from_view: Maps from pixels of each photograph, before undistortion, to those
+            where the background is at rest before which the object turns; NaN where a view shows
+            too little of it. Empty without such a background.
+        series: Number of each view's series, where the object was moved between several; empty
+            where it was not.
+    """
+
+    names: tuple[str, ...]
+    lenses: tuple[Lens, ...]
+    cam_from_world: Float[Tensor, "view 4 4"]
+    points_world: Float[Tensor, "point 3"] = field(
+        default_factory=lambda: torch.zeros(0, 3).double()
+    )
+    observation_point: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_view: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_pixels: Float[Tensor, "observation 2"] = field(
+        default_factory=lambda: torch.zeros(0, 2).double()
+    )
+    background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
+    series: Int[Tensor, " divided"] = field(default_factory=no_series)
+
+    @property
+    def num_views(self) -> int:
+        """Number of registered views."""
+        return len(self.names)
+
+    @property
+    def observed(self) -> Bool[Tensor, "point view"]:
+        """True where a view sees a point."""
+        shape = len(self.points_world), self.num_views
+        return pairs_table(self.observation_point, self.observation_view, shape)
+
+    def with_points(self, other: "SparseModel") -> "SparseModel":
+        """Take points and observations from a model of the same views."""
+        return self.replace(
+            points_world=other.points_world,
+            observation_point=other.observation_point,
+            observation_view=other.observation_view,
+            observation_pixels=other.observation_pixels,
+        )
+
+    def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
+        """Leave observations out, and points that fewer than two views see then."""
+        kept = self.replace(
+            observation_point=self.observation_point[~observations],
+            observation_view=self.observation_view[~observations],
+            observation_pixels=self.observation_pixels[~observations],
+        )
+        return select_views(kept, range(self.num_views))
+
+
+def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
+    """Take views of a model, in the order given, and the points that two of them see.
+
+    Returns:
+        Points in their old order. Observations are sorted by point, then view.
+    """
+    views, counts = (
+        torch.tensor(chosen, dtype=torch.long),
+        torch.bincount(model.observation_view, minlength=model.num_views),
+    )
+    by_view = torch.split(torch.argsort(model.observation_view, stable=True), counts.tolist())
+    rows = torch.cat([views[:0], *(by_view[view] for view in chosen)])
+    view = torch.arange(len(chosen)).repeat_interleave(counts[views])
+    point = model.observation_point[rows]
+    tied = pairs_table(point, view, (len(model.points_world), len(chosen))).sum(dim=1) >= 2
+    rows, view, point = (values[tied[point]] for values in (rows, view, point))
+    point = (torch.cumsum(tied, dim=0) - 1)[point]
+    order = torch.argsort(point * max(len(chosen), 1) + view, stable=True)
+    maps, series = model.background_from_view, model.series
+    return SparseModel(
+        names=tuple(model.names[index] for index in chosen),
+        lenses=tuple(model.lenses[index] for index in chosen),
+        cam_from_world=model.cam_from_world[views],
+        points_world=model.points_world[tied],
+        observation_point=point[order],
+        observation_view=view[order],
+        observation_pixels=model.observation_pixels[rows[order]],
+        background_from_view=maps[views] if len(maps) else maps,
+        series=series[views] if len(series) else series,
+    )
+
+
+def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
+    """Drop views that see too few points for their pose to be trusted, until none is left."""
+    while model.num_views:
+        seen = torch.bincount(model.observation_view, minlength=model.num_views)
+        strong = torch.nonzero(seen >= fewest)[:, 0].tolist()
+        leave_out("sfm.weak_views", seen < fewest)
+        if len(strong) == model.num_views:
+            break
+        model = select_views(model, strong)
+    return model
+
+
+def longest_tracks(model: SparseModel, most: int) -> SparseModel:
+    """Keep of every view the points that most views see, and with them all who sees them.
+
+    Args:
+        most: Points a view; more where they are among another view's.
+    """
+    length = torch.bincount(model.observation_point)[model.observation_point]
+    order = torch.argsort(length, descending=True, stable=True)
+    order = order[torch.argsort(model.observation_view[order], stable=True)]
+    view = model.observation_view[order]
+    rank = torch.arange(len(order)) - torch.searchsorted(view, view)
+    wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
+    wanted[model.observation_point[order[rank < most]]] = True
+    return model.without(~wanted[model.observation_point])
+
+
+def match_names(
+    model: SparseModel, names: Sequence[str], where: str, photographs: str = ""
+) -> SparseModel:
+    """Find the photographs in a model by file name and put it in their order.
+
+    A model's image may lie in a subfolder, and its name may have been rewritten by another program:
+    see :func:`~pimper_torch.runtime.file_names.match_files`.
+
+    Raises:
+        InputError: No photograph is in the model, or a name may be any of several.
+    """
+    found = match_files(names, model.names, folder=photographs, where=where, what="image")
+    chosen = [index for index in found if index is not None]
+    if not chosen:
+        raise InputError(
+            f"{where} has none of the photographs. Its images are "
+            f"{some(model.names)}; the photographs are {some(names)}. Rename the "
+            "photographs to match, or leave the model out to run structure from motion."
+        )
+    renamed = select_views(model, chosen)
+    return renamed.replace(
+        names=tuple(name for name, index in zip(names, found, strict=True) if index is not None)
+    )

@@ -1,0 +1,93 @@
+"""Pairs of photographs that are likely to match, by one descriptor of each photograph.
+
+All pairs of a thousand photographs are half a million, of which some ten thousand matter. A vector
+of locally aggregated descriptors (VLAD) sums, word by word of a small vocabulary, how a
+photograph's features differ from the word; photographs that show the same have alike vectors. The
+vocabulary is learned from the photographs themselves, so that nothing is downloaded.
+
+Source: Jégou, Douze, Schmid & Pérez, Aggregating local descriptors into a compact image
+representation, CVPR 2010; the square root of Jégou & Chum, Negative evidences and co-occurences in
+image retrieval, ECCV 2012.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.method.sfm.features import Workspace, image_ids
+from pimper_torch.method.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, read_features
+from pimper_torch.runtime.parallel import on_one_thread
+
+# Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
+_WORDS, _NEIGHBOURS = 128, 20
+
+Descriptors = Float[Tensor, "feature length"]
+
+
+def pairs_to_match(space: Workspace) -> list[PhotographPair]:
+    """List all pairs of a small set; of a larger, each photograph with those most like it."""
+    if len(space.files) <= MOST_PAIRED:
+        return all_pairs(len(space.files))
+    with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
+        image_of = image_ids(stored, space)
+
+        def descriptors(number: int) -> Descriptors:
+            return read_features(stored, image_of[number]).descriptors
+
+        vectors = global_descriptors(descriptors, len(space.files))
+        return nearest_pairs(vectors, _NEIGHBOURS)
+
+
+def global_descriptors(
+    descriptors: Callable[[int], Descriptors], count: int
+) -> Float[Tensor, "photograph word_length"]:
+    """Return a vector of length 1 for each photograph; 0 for one without features."""
+    each = -(-40_000 // count)
+    learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
+    words = vocabulary(learned, _WORDS)
+    return torch.stack([_aggregated(descriptors(number), words) for number in range(count)])
+
+
+def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word length"]:
+    """Return the centres of clusters (k-means), first evenly spread among the descriptors."""
+    words = _some(descriptors, count)
+    for _ in range(10):
+        word = _nearest(descriptors, words)
+        sums = torch.zeros_like(words).index_add(0, word, descriptors)
+        sizes = torch.bincount(word, minlength=len(words))[:, None]
+        words = torch.where(sizes > 0, sums / sizes.clamp_min(1), words)
+    return words
+
+
+def nearest_pairs(
+    vectors: Float[Tensor, "photograph length"], neighbours: int
+) -> list[PhotographPair]:
+    """List, without repetition, the pairs of each vector with those most like it."""
+    found: set[PhotographPair] = set()
+    for number, vector in enumerate(vectors):
+        likeness = vectors @ vector
+        likeness[number] = -torch.inf
+        for other in likeness.topk(min(neighbours, len(vectors) - 1)).indices.tolist():
+            found.add((min(number, other), max(number, other)))
+    return sorted(found)
+
+
+def _some(descriptors: Descriptors, most: int) -> Descriptors:
+    """Keep so many at most, evenly spread."""
+    return descriptors[:: max(1, -(-len(descriptors) // most))]
+
+
+def _nearest(descriptors: Descriptors, words: Float[Tensor, "word length"]) -> Tensor:
+    return (descriptors @ words.mT - words.square().sum(dim=1) / 2).argmax(dim=1)
+
+
+def _aggregated(
+    descriptors: Descriptors, words: Float[Tensor, "word length"]
+) -> Float[Tensor, " word_length"]:
+    word = _nearest(descriptors, words)
+    sums = torch.zeros_like(words).index_add(0, word, descriptors - words[word]).flatten()
+    return normalize(sums.sign() * sums.abs().sqrt(), dim=0)

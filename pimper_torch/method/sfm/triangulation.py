@@ -1,0 +1,182 @@
+"""Points of cameras that are known: matched along their epipolar lines, cameras held fixed."""
+
+import tempfile
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.geometry.local_frame import local_origin, to_local
+from pimper_torch.method.sfm import epipolar, matching
+from pimper_torch.method.sfm.colmap import model_of, observation_errors, reconstruction_of
+from pimper_torch.method.sfm.conventions.by_matches import choose_way
+from pimper_torch.method.sfm.conventions.resized_pictures import Ways
+from pimper_torch.method.sfm.features import (
+    Workspace,
+    find_features,
+    image_ids,
+    too_small,
+    workspace,
+)
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.method.sfm.refine_tracks import refine_tracks
+from pimper_torch.method.sfm.retrieval import pairs_to_match
+from pimper_torch.method.sfm.static_background import enter_room, leave_out_room
+from pimper_torch.records import SparseScene, Views
+from pimper_torch.runtime.errors import caution
+from pimper_torch.runtime.memory import release_memory
+from pimper_torch.runtime.parallel import side_by_side
+
+# Observed points of the median view below which points are triangulated, and below which depth maps
+# help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
+FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
+
+
+def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
+    """Return whether most views observe fewer points."""
+    count = model.num_views if isinstance(model, SparseModel) else model.cameras.num_views
+    seen = torch.bincount(model.observation_view, minlength=count)
+    return float(seen.double().median()) < fewest
+
+
+def triangulate(views: Views, ways: Ways, settings: ReconstructConfig, where: str) -> SparseModel:
+    """Triangulate what photographs show, with cameras held fixed.
+
+    Features are found and matched as in structure from motion. What an epipolar geometry of its own
+    verifies tells whether the cameras belong to the photographs. Then features are matched anew
+    along the cameras' epipolar lines, triangulated, and found again in every view by aligning
+    patches. On one thread where the order of sums tells, so that bits repeat.
+
+    Args:
+        ways: Cameras of the photographs, in their order; those that fit best are taken. Points that
+            they have are replaced where more are found.
+
+    Returns:
+        Poses and lenses bit for bit as given. With the points as they were where no more are
+        found, which a :class:`~pimper_torch.runtime.errors.PimperWarning` says.
+    """
+    if too_small(views) and ways.plain:
+        _tell_nothing(0, where)
+        return ways.plain[0]
+    lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
+    with workspace(views, settings.num_threads) as space:
+        counts = find_features(space, settings, [None] * views.num_views, lenses)
+        release_memory()
+        if sum(count > 0 for count in counts) >= 2:
+            matching.match_pairs(space, pairs_to_match(space), settings)
+            enter_room(leave_out_room(space.database, settings))
+        verified = matching.verified_pairs(space)
+        given = choose_way(ways, verified, settings.max_error_px, where)
+        if ways.cropped and not lacks_points(given):
+            return given
+        offset = local_origin(given.cam_from_world, given.points_world)
+        local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
+        _match_along_lines(space, local, verified, settings)
+        found = local.with_points(_triangulated(space, local, settings.seed))
+    release_memory()
+    if len(found.points_world):
+        found = refine_tracks(views, found, settings.track_iterations, cameras=False)
+    points = found.points_world + found.points_world.new_tensor(offset)
+    found = given.with_points(found.replace(points_world=points))
+    if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
+        _tell_nothing(len(found.points_world), where)
+        return given
+    caution(
+        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
+        "were triangulated from the photographs with the cameras held fixed, observed "
+        f"{len(found.observation_point):,} times; median reprojection error "
+        f"{float(observation_errors(found).median()):.2f} px.",
+        stacklevel=3,
+    )
+    return found
+
+
+def _match_along_lines(
+    space: Workspace,
+    model: SparseModel,
+    verified: Sequence[matching.VerifiedPair],
+    settings: ReconstructConfig,
+) -> None:
+    """Replace what was verified by matches along the cameras' epipolar lines."""
+    pairs, cameras = _pairs(model, verified, settings), epipolar.pinholes_of(model)
+    kinds = loaded().TwoViewGeometryConfiguration
+    with quiet(), loaded().Database.open(space.database) as stored:
+        image_of = image_ids(stored, space)
+        features = []
+        for view, image in enumerate(image_of):
+            its = matching.read_features(stored, image)
+            features.append(
+                its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
+            )
+
+        def matches(pair: matching.PhotographPair) -> Tensor:
+            first, second = (features[number] for number in pair)
+            if not len(first.pixels) or not len(second.pixels):
+                return torch.zeros(0, 2, dtype=torch.long)
+            near = matching.Near(epipolar.epipolar_geometry(cameras, pair), settings.max_error_px)
+            found = matching.guided_matches(first, second, near, settings.max_ratio)
+            ends = matching.VerifiedPair(
+                views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
+            )
+            return found[epipolar.explained(cameras, ends, settings.max_error_px)]
+
+        stored.clear_two_view_geometries()
+        for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
+            geometry = loaded().TwoViewGeometry()
+            geometry.config = kinds.CALIBRATED
+            geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
+            geometry.inlier_matches = found.numpy().astype(np.uint32)
+            stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
+
+
+def _pairs(
+    model: SparseModel, verified: Sequence[matching.VerifiedPair], settings: ReconstructConfig
+) -> list[matching.PhotographPair]:
+    """Choose pairs by matches that the cameras explain, then by the angle between their axes."""
+    axes = model.cam_from_world[:, 2, :3]
+    angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
+    cameras, limit = epipolar.pinholes_of(model), settings.max_error_px
+    weights = {
+        (first, second): 1 - float(angles[first, second]) / 60
+        for first, second in combinations(range(model.num_views), 2)
+        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
+    }
+    for pair in epipolar.undistorted_pairs(model, verified):
+        count = int(epipolar.explained(cameras, pair, limit).sum())
+        if count:
+            weights[pair.views] = weights.get(pair.views, 0.0) + count
+    return matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
+
+
+def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
+    pycolmap = loaded()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.extract_colors = False
+    options.ba_refine_focal_length = False
+    options.ba_refine_extra_params = False
+    lenses = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
+    bare = SparseModel(names=space.files, lenses=lenses, cam_from_world=model.cam_from_world)
+    with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
+        cameras = reconstruction_of(bare)
+        with pycolmap.Database.open(space.database) as stored:
+            for camera in cameras.cameras.values():
+                stored.update_camera(camera)
+        found = pycolmap.triangulate_points(
+            cameras, space.database, space.images, output, True, options
+        )
+    return model_of(found)
+
+
+def _tell_nothing(count: int, where: str) -> None:
+    caution(
+        f"{where}: hardly any of its views observes points, and {count} could be "
+        "triangulated from features, which hardly match between the photographs.",
+        stacklevel=4,
+    )

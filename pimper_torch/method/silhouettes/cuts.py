@@ -1,0 +1,443 @@
+"""Alternate cuts of every view with a vote of all views on their visual hull.
+
+Cuts start from labels that are certain: of points, of parallax and, after a vote, of the hull.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pimper_torch.ground.geometry.opencv import (
+    BACKGROUND,
+    OBJECT,
+    PERHAPS_BACKGROUND,
+    PERHAPS_OBJECT,
+    blind_holes,
+    closed,
+    convex_hull_of,
+    dilated,
+    discs_at,
+    grab_cut,
+    grab_cut_halved,
+    opened,
+    signed_distance,
+    without_specks,
+)
+from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
+from pimper_torch.method.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
+from pimper_torch.method.silhouettes.parallax import DISPUTED, of_views
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteDetails
+from pimper_torch.records import Record, Silhouettes
+from pimper_torch.runtime.mapped import by_view
+
+# Fractions of the views that may lack what the others have in common, tried in turn until that
+# takes so much of a median mask; a mask that shows less than this of it is of something else.
+_DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
+
+# Lengths are fractions of the pictures' longer side.
+_DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
+_CLOSING = 1 / 90
+_DEEP = 1 / 50  # parallax this far inside the projection tells object
+_THIN = 1 / 200  # and this far in the middle of a part that is nowhere so deep
+_MIDDLE = 0.7  # of the depth of such a part: a body's legs and handle are seeded, no shadow is
+
+# Agreement with neighbours moved by the plane: below is not the plane, above is.
+_OFF_PLANE = 0.4
+_NOT_PLANE = 0.6
+_ON_PLANE = 0.75
+_THROUGH = 0.2  # of a hole: its border agrees with nothing
+
+Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Cuts(Record):
+    """The object in every view, as the view itself and as all together have it.
+
+    Attributes:
+        margins_px: Inside the projection of the hull, pixels of the working size.
+        exposed: Fraction of each cut that shows a background for certain.
+        held: Fraction of the object's points that each cut holds.
+        doubted: Views whose soft mask was not used.
+        hidden: Pixels of the cuts that show something before the object; ``None`` where none do.
+    """
+
+    masks: Bool[Tensor, "view height width"]
+    margins_px: Float[Tensor, "view height width"]
+    exposed: Float[Tensor, " view"]
+    held: Float[Tensor, " view"]
+    on_plane: bool
+    doubted: Bool[Tensor, " view"]
+    hidden: Bool[Tensor, "view height width"] | None = None
+
+
+def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
+    """Cut every view, vote, and cut again from what the vote says.
+
+    Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
+    that it is seen through stay open, and what stands before it stands out. Where parallax alone
+    cut, views abstain from the first vote beyond the plane.
+
+    Returns:
+        ``None`` where the cuts have nothing in common.
+    """
+    masks, unknown = _first(cues), _unknown(cues)
+    doubted = _doubted(cues, masks, details)
+    cues, voting = cues.without(doubted)
+    for _ in range(details.iterations):
+        cues = cues.relearned(masks)
+        masks = _filled(cues, masks)
+        abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
+        likely = by_view(torch.bitwise_or, masks, _likely(cues))
+        seen = _voted(cues, likely, details, abstain, voting)
+        if seen is None:
+            return None
+        cues, voting = cues.seen_in(seen), None
+        masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
+    cues = cues.relearned(masks)
+    masks = _filled(cues, masks)
+    hidden = _in_front(cues, masks)
+    seen = _voted(cues, masks, details, hidden)
+    if seen is None:
+        return None
+    hidden = by_view(lambda at, margin: at & (margin > 0), hidden, seen)
+    masks = by_view(torch.bitwise_or, masks, hidden)
+    found = cuts_of(cues.seen_in(seen), masks, seen, doubted)
+    return found.replace(hidden=hidden) if bool(hidden.any()) else found
+
+
+def cuts_of(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    margins_px: Float[Tensor, "view height width"],
+    doubted: Bool[Tensor, " view"],
+) -> Cuts:
+    """Compare cuts with backgrounds and points."""
+
+    def exposed(view: int) -> Float[Tensor, ""]:
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        return exposed_fraction(masks[view], agreement)
+
+    return Cuts(
+        masks=masks,
+        margins_px=margins_px,
+        exposed=of_views(exposed, len(masks)),
+        held=of_views(lambda view: held_fraction(masks[view], cues.object_px[view]), len(masks)),
+        on_plane=cues.plane is not None,
+        doubted=doubted,
+    )
+
+
+def _filled(
+    cues: Cues, masks: Bool[Tensor, "view height width"]
+) -> Bool[Tensor, "view height width"]:
+    """Fill holes that the plane is not seen through."""
+    agreement = cues.agreement
+    if agreement is None:
+        return masks
+    return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
+
+
+def _in_front(
+    cues: Cues, masks: Bool[Tensor, "view height width"]
+) -> Bool[Tensor, "view height width"]:
+    """Find what may hide the object in each view, so that its cut says nothing there."""
+    agreement = cues.agreement
+    if agreement is None:
+        return torch.zeros_like(masks)
+    return of_views(lambda view: in_front(masks[view], agreement[view]), len(masks))
+
+
+def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Cut from points and parallax; by parallax alone before a room, or with hardly a point.
+
+    Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
+    """
+    height, width = cues.pictures.grey.shape[1:]
+
+    def first(view: int) -> Bool[Tensor, "height width"]:
+        object_px = cues.object_px[view]
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        if cues.soft is not None and cues.soft.given[view]:
+            mask = cues.soft.masks[view]
+            return mask if agreement is None else mask & ~surely_on_plane(agreement)
+        if agreement is not None and (cues.all_round or not cues.has_points):
+            return off_plane(agreement) | not_seen_through(object_px, agreement)
+        labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
+        margin = signed_distance(convex_hull_of(object_px, (width, height)))
+        return _cut(grab_cut_halved, cues, view, labels, margin)
+
+    return of_views(first, cues.num_views)
+
+
+def _again(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    seen: Float[Tensor, "view height width"],
+    unknown: Bool[Tensor, "view height width"],
+) -> Bool[Tensor, "view height width"]:
+    """Cut from the last cut and the hull; drop what does not meet the hull."""
+
+    def again(view: int) -> Bool[Tensor, "height width"]:
+        object_px = cues.object_px[view]
+        agreement = None if cues.agreement is None else cues.agreement[view]
+        labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
+        if cues.soft is not None and cues.soft.given[view]:
+            labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
+        cut = _cut(grab_cut, cues, view, labels, seen[view])
+        return without_specks(cut, seen[view] > 0, round(2e-4 * cut.numel()))
+
+    return of_views(again, cues.num_views)
+
+
+def _cut(
+    how: Cutter,
+    cues: Cues,
+    view: int,
+    labels: UInt8[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> Bool[Tensor, "height width"]:
+    """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
+
+    Those cannot tell the grey inside of a vessel from a grey table: what is well inside is the
+    object's unless the plane is seen there.
+    """
+    if cues.agreement is None:
+        return how(cues.pictures.opponent[view], labels, 2)
+    agreement = cues.agreement[view]
+    surrounded = not_seen_through(cues.object_px[view], agreement)
+    surrounded &= ~(agreement >= DISPUTED)
+    labels = torch.where(is_deep(margin / 2.0) & surrounded, OBJECT, labels)
+    return how(cues.pictures.opponent[view], labels, 2)
+
+
+def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Find pixels too bright or too dark for the plane, such as the inside of a vessel.
+
+    They count as object in the vote, even where the cuts miss them.
+    """
+    agreement = cues.agreement
+    if agreement is None or not cues.has_points:
+        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+    return of_views(lambda view: off_level(agreement[view]), cues.num_views)
+
+
+def _doubted(
+    cues: Cues, masks: Bool[Tensor, "view height width"], details: SilhouetteDetails
+) -> Bool[Tensor, " view"]:
+    """Find soft masks that lack most of what most of them have in common; all if that is little."""
+    if cues.soft is None or int(cues.soft.given.sum()) < FEW:
+        return torch.zeros(len(masks), dtype=torch.bool)
+    given = cues.soft.given
+    for disagreeing in (details.disagreeing, *_DISAGREEING):
+        seen = _voted(cues, masks, replace(details, disagreeing=disagreeing), None, given)
+        if seen is not None:
+            common = seen > 0
+            shown, own = (one.sum(dim=(1, 2)).clamp_min(1) for one in (common, masks))
+            if (shown / own)[given].median() >= _COMMON:
+                return given & ((masks & common).sum(dim=(1, 2)) < _HELD * shown)
+    return given
+
+
+def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
+    """Find what a first cut by parallax knows nothing of, as beyond the plane."""
+    if cues.agreement is None or cues.has_points:
+        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+    return by_view(Tensor.isnan, cues.agreement)
+
+
+def _voted(
+    cues: Cues,
+    masks: Bool[Tensor, "view height width"],
+    details: SilhouetteDetails,
+    unknown: Bool[Tensor, "view height width"] | None = None,
+    voting: Bool[Tensor, " view"] | None = None,
+) -> Float[Tensor, "view height width"] | None:
+    """Build the hull above the plane, of what is pointed at, and see it in every view.
+
+    Args:
+        voting: Views that do; all by default.
+    """
+    cameras = cues.pictures.cameras
+    if voting is None:
+        voting = torch.ones(len(masks), dtype=torch.bool)
+    inside = by_view(Tensor.float, masks)
+    silhouettes = Silhouettes(inside=inside, reliable=voting, source="found")
+    hull = visual_hull(
+        silhouettes,
+        cameras,
+        cues.box_world,
+        num_voxels=details.num_voxels,
+        disagreeing=details.disagreeing,
+        unknown=unknown,
+    )
+    if hull is None:
+        return None
+    if cues.plane is not None:
+        hull = hull.above(cues.plane.normal_world, cues.plane.offset)
+    if cues.soft is not None:
+        hull = pointed_at(hull, cameras, cues.soft.seeds_px)
+    height, width = masks.shape[1:]
+
+    def margin(view: int) -> Float[Tensor, "height width"]:
+        frame = cameras.cam_from_world[view]
+        return margins(hull, cameras.intrinsics[view], frame, (width, height))
+
+    return of_views(margin, len(masks))
+
+
+def labels_from_points(
+    object_px: Float[Tensor, "point 2"],
+    background_px: Float[Tensor, "other 2"],
+    agreement: Float[Tensor, "height width"] | None,
+    size_px: tuple[int, int],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with the points that a view observes, the object's and others, and with parallax.
+
+    Without parallax a strip along the border is background.
+    """
+    longer = max(size_px)
+    region = convex_hull_of(object_px, size_px)
+    labels = torch.full(size_px[::-1], PERHAPS_BACKGROUND, dtype=torch.uint8)
+    if agreement is not None:
+        labels[surely_on_plane(agreement)] = BACKGROUND
+        region &= ~_shows_plane(agreement)
+    else:
+        strip = max(1, round(1 / 64 * longer))
+        border = torch.ones_like(labels, dtype=torch.bool)
+        border[strip:-strip, strip:-strip] = False
+        labels[border] = BACKGROUND
+    labels[region & (labels != BACKGROUND)] = PERHAPS_OBJECT
+    labels[discs_at(background_px, _DISC * longer, size_px)] = BACKGROUND
+    labels[discs_at(object_px, _DISC * longer, size_px)] = OBJECT
+    return labels
+
+
+def labels_from_hull(
+    margin: Float[Tensor, "height width"],
+    cut: Bool[Tensor, "height width"],
+    object_px: Float[Tensor, "point 2"],
+    agreement: Float[Tensor, "height width"] | None,
+    unknown: Bool[Tensor, "height width"] | None = None,
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a view's last cut, the projection of the hull, points in it, and parallax.
+
+    Nothing is certain where the vote on the hull was ``unknown``, none by default.
+    """
+    height, width = margin.shape
+    longer = max(height, width)
+    labels = torch.full(margin.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
+    region = cut | closed(margin > 0, max(1, round(_CLOSING * longer)))
+    if agreement is not None:
+        region &= ~_shows_plane(agreement)
+    labels[region] = PERHAPS_OBJECT
+    if agreement is not None:
+        labels[surely_on_plane(agreement)] = BACKGROUND
+        labels[_grainless(agreement < _OFF_PLANE) & is_inmost(margin)] = OBJECT
+    beyond = margin < -1 / 25 * longer
+    labels[beyond if unknown is None else beyond & ~unknown] = BACKGROUND
+    discs = discs_at(object_px, _DISC * longer, (width, height))
+    labels[discs & (margin > 0)] = OBJECT
+    return labels
+
+
+def labels_from_soft(
+    labels: UInt8[Tensor, "height width"],
+    mask: Bool[Tensor, "height width"],
+    margin: Float[Tensor, "height width"],
+) -> UInt8[Tensor, "height width"]:
+    """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
+    border, reach = signed_distance(mask), 1 / 160 * max(mask.shape)
+    labels = torch.where((border > reach) & (margin > 0), OBJECT, labels)
+    outside = (border < -reach) & ~is_deep(margin) | (margin < -2 * reach)
+    return torch.where(outside, BACKGROUND, labels)
+
+
+def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
+    found = _grainless(agreement < _NOT_PLANE)
+    return filled(closed(found, round(1 / 50 * max(agreement.shape))), agreement)
+
+
+def in_front(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find what stands before the plane and is not the object, as a person who may hide some of it.
+
+    Windows that hold some of the object do not agree with the plane either: what is as narrow as
+    these is left out.
+    """
+    longer = max(cut.shape)
+    other = closed(agreement < _OFF_PLANE, round(1 / 200 * longer)) & ~cut
+    return opened(other, round(_DEEP * longer))
+
+
+def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is so far inside that shadows beside the object do not reach it."""
+    return margin > _DEEP * max(margin.shape)
+
+
+def is_inmost(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is deep inside, and the middle of what is too thin to be deep."""
+    longer = max(margin.shape)
+    middle = margin > _MIDDLE * dilated(margin, max(1, round(_DEEP * longer)))
+    return is_deep(margin) | (middle & (margin > _THIN * longer))
+
+
+def not_seen_through(
+    object_px: Float[Tensor, "point 2"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Find what the object's points surround, where the plane is not seen."""
+    height, width = agreement.shape
+    return convex_hull_of(object_px, (width, height)) & ~_shows_plane(agreement)
+
+
+def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what is so bright or dark that light cannot make it so on the plane."""
+    return _grainless(agreement == -1)
+
+
+def filled(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Fill holes that the plane is not seen through, such as the inside of a vessel."""
+    whole = closed(cut, max(1, round(_CLOSING * max(cut.shape))))
+    return cut | blind_holes(whole, agreement > _ON_PLANE, _THROUGH)
+
+
+def exposed_fraction(
+    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"] | None
+) -> Float[Tensor, ""]:
+    """Return the fraction of a cut that shows a background for certain; 0 where none is known."""
+    if agreement is None:
+        return torch.zeros((), dtype=torch.float64)
+    return (cut & surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
+
+
+def held_fraction(
+    cut: Bool[Tensor, "height width"], object_px: Float[Tensor, "point 2"]
+) -> Float[Tensor, ""]:
+    """Return the fraction of the object's points that a cut holds; 1 where too few are known."""
+    if len(object_px) < MIN_POINTS:
+        return torch.ones((), dtype=torch.float64)
+    column, row = object_px.floor().long().unbind(dim=1)
+    height, width = cut.shape
+    return cut[row.clamp(0, height - 1), column.clamp(0, width - 1)].double().mean()
+
+
+def surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find the plane, but not what is next to something else: the object's foot agrees, too."""
+    sure = _grainless(agreement > _ON_PLANE)
+    return signed_distance(sure) > 1 / 200 * max(agreement.shape)
+
+
+def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find what some window that agrees with the plane holds."""
+    return signed_distance(_grainless(agreement > _ON_PLANE)) > -1 / 160 * max(agreement.shape)
+
+
+def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    return opened(mask, max(1, round(1 / 200 * max(mask.shape))))

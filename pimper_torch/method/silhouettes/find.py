@@ -1,0 +1,255 @@
+"""Which pixels of every view show the object."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_hull
+from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cuts import Cuts, cut_in_iterations
+from pimper_torch.method.silhouettes.reliability import (
+    Agreement,
+    agreement_of,
+    contradictory,
+    silhouettes_of,
+)
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.records import Failure, Silhouettes, SparseScene
+from pimper_torch.records.scene_parts import OneAPose, with_views
+from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.failures import skipped
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.mapped import by_view
+from pimper_torch.runtime.stage import Stage
+
+_USED = 0.25  # probability above which a pixel is used as the object's
+_UNLIKE = "its soft mask lacks most of what the others have in common"
+_BY_HULL = "The hull of the other masks stands in for them, and they do not constrain the surface"
+
+
+class FindSilhouettes(Stage):
+    """Find the object's silhouette in every view; a constant to autograd."""
+
+    def __init__(
+        self, config: SilhouetteConfig | None = None, details: SilhouetteDetails | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config or SilhouetteConfig()
+        self.details = details or SilhouetteDetails()
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene) -> Silhouettes:
+        """Find silhouettes, or take the masks for them.
+
+        Returns:
+            Everything where that is asked for. A mask that clearly contradicts those of the others
+            is not believed: the hull of these stands in for it. Where silhouettes cannot be
+            reliable, everything above the plane that the object stands on, or everything where none
+            is found, with a :class:`~pimper_torch.runtime.errors.PimperWarning` that says why.
+            Where the object was moved between series of photographs, each series is looked at by
+            itself.
+        """
+        config, masks = self.config, scene.views.masks
+        if config.object == "everything":
+            return Silhouettes.everything(scene.views)
+        if masks is not None:
+            reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
+            found = Silhouettes(
+                inside=by_view(Tensor.float, masks), reliable=reliable, source="masks"
+            ).to(masks.device)
+            return self._agreeing(_believed(found, scene.views.names), scene)
+        if config.object == "masks":
+            raise InputError(
+                "`silhouettes.object` is masks, but the photographs come without any. Give a "
+                "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
+            )
+        return by_series(scene, self._found).to(scene.views.images.device)
+
+    def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
+        """Replace masks that clearly contradict the others by what the hull of these shows."""
+        doubted = contradictory(silhouettes, scene.cameras)
+        if not bool(doubted.any()):
+            return silhouettes
+        if torch.equal(doubted, silhouettes.reliable):
+            caution(
+                "The masks contradict one another, and no more than half of them agree: all are "
+                "believed. Look whether they show the same object in all photographs, and whether "
+                "the cameras are those of these.",
+                stacklevel=3,
+            )
+            return silhouettes
+        _tell(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
+        others = silhouettes.replace(reliable=silhouettes.reliable & ~doubted)
+        cameras, box = scene.cameras.to(torch.float32), box_round(others, scene.cameras)
+        hull = None
+        if box is not None:
+            hull = visual_hull(others, cameras, box.float(), num_voxels=self.details.num_voxels)
+        within = scene.views.inside
+        inside = by_view(Tensor.detach, silhouettes.inside)
+        for view in doubted.nonzero()[:, 0].tolist():
+            # What looks past a photograph's edge once it is undistorted is black.
+            inside[view] = within[view] & (scene.views.images[view].detach().amax(dim=0) > 0)
+            if hull is not None:
+                width, height = (int(side) for side in scene.views.sizes_px[view])
+                K, pose = cameras.intrinsics[view], cameras.cam_from_world[view]
+                inside[view, :height, :width] *= margins(hull, K, pose, (width, height)) > 0
+        return others.replace(inside=inside)
+
+    def _found(self, scene: SparseScene) -> Silhouettes:
+        """Find silhouettes in photographs between which the object was not moved."""
+        cues = cues_of(scene, self.config, self.details)
+        cuts, doubt = self._cut(cues)
+        if doubt and cues.soft is not None and not cues.soft.points:
+            # Several things stand apart: the one that cameras look at is likelier than all.
+            cuts, doubt = self._cut(cues.looked_at())
+        leave_out("silhouettes.doubt", bool(doubt))
+        if cuts is None or doubt:
+            _warn(doubt, cues.plane is not None)
+            return Silhouettes.everything(scene.views, self._top(cues))
+        _tell(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
+        return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
+
+    def _cut(self, cues: Cues) -> tuple[Cuts | None, str]:
+        """Cut all views, and state why the cuts are unreliable, or nothing."""
+        cuts = None
+        if cues.agreement is not None or cues.has_points or cues.soft is not None:
+            cuts = cut_in_iterations(cues, self.details)
+        if cuts is None:
+            return None, "the views' silhouettes have nothing in common"
+        return cuts, self._doubt(agreement_of(cuts))
+
+    def _top(self, cues: Cues) -> Float[Tensor, "plane 4"] | None:
+        """Return the upper side of the supporting plane, as thick as its points are rough."""
+        if cues.plane is None:
+            return None
+        thickness = self.details.plane.tolerance * cues.fixation.distance
+        height = cues.plane.offset + thickness
+        return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
+
+    def _doubt(self, agreement: Agreement) -> str:
+        reliable = agreement.reliable(self.details)
+        overlap = float(agreement.overlap.median())
+        if overlap < self.details.min_overlap:
+            return (
+                f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
+                f"needed: {self.details.min_overlap:.0%}"
+            )
+        exposed, held = float(agreement.exposed.median()), float(agreement.held.median())
+        if exposed > self.details.max_exposed:
+            return (
+                f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
+                f"the median; at most: {self.details.max_exposed:.0%}"
+            )
+        if held < self.details.min_held:
+            return (
+                f"silhouettes hold {held:.0%} of the object's points in the median; needed: "
+                f"{self.details.min_held:.0%}"
+            )
+        if int(reliable.sum()) < max(3, len(reliable) / 2):
+            return (
+                f"only {int(reliable.sum())} of {len(reliable)} silhouettes agree with the others"
+            )
+        return ""
+
+
+def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
+    """Return the scene with silhouettes that were found for masks, a little wider where unsure.
+
+    What hides the object is left out.
+
+    Args:
+        silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
+            that were not believed.
+    """
+    used = by_view(lambda inside: inside > _USED, silhouettes.inside)
+    if silhouettes.hidden is not None:
+        used = by_view(lambda one, hidden: one & ~hidden, used, silhouettes.hidden)
+    given = scene.views.masks
+    if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
+        return scene
+    return scene.replace(views=scene.views.replace(masks=used))
+
+
+def of_all_photographs(
+    scene: SparseScene, few: OneAPose, found: Silhouettes
+) -> tuple[SparseScene, Silhouettes]:
+    """Carry silhouettes of one photograph a pose to all photographs of the scene.
+
+    Args:
+        found: In the photographs of ``few``.
+
+    Returns:
+        The scene with these silhouettes for masks, see :func:`masked`, and silhouettes of its
+        views.
+    """
+    if few.scene is not scene:
+        found = found.take(few.of)
+    return masked(scene, found), found
+
+
+def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
+    """Take empty silhouettes for unreliable: the hull of all views would be empty."""
+    leave_out("silhouettes.unreliable", ~silhouettes.reliable, names=names)
+    empty = silhouettes.reliable & ~by_view(lambda inside: (inside > 0.5).any(), silhouettes.inside)
+    leave_out("silhouettes.empty", empty, names=names)
+    if not bool(empty.any()):
+        return silhouettes
+    _tell(empty, names, "its silhouette is empty", "These silhouettes do not constrain the surface")
+    return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
+
+
+def _tell(views: Bool[Tensor, " view"], names: tuple[str, ...], reason: str, done: str) -> None:
+    skipped(
+        *(
+            Failure(stage="silhouettes", what="view", name=names[view], reason=reason, done=done)
+            for view in views.nonzero()[:, 0].tolist()
+        )
+    )
+
+
+def _warn(why: str, on_plane: bool) -> None:
+    what = "above the plane that it stands on" if on_plane else "that the photographs show"
+    caution(
+        f"Everything {what} is taken for the object: {why}. Give masks, or a "
+        "box round the object (`silhouettes.region`); `silhouettes.object` everything says that "
+        "this is meant.",
+        stacklevel=3,
+    )
+
+
+def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) -> Silhouettes:
+    """Find silhouettes in the views of each series, and put them side by side.
+
+    Args:
+        find: From the scene of one series to its silhouettes.
+
+    Returns:
+        Of all views. Where those of one series are everything, everything above every known plane.
+    """
+    if not len(scene.series):
+        return find(scene)
+    chosen = [scene.series == number for number in sorted(set(scene.series.tolist()))]
+    views = [one.nonzero()[:, 0] for one in chosen]
+    found = [find(part(scene, one.tolist())) for one in views]
+    doubtful = sum(one.source == "everything" for one in found)
+    leave_out("silhouettes.by_series", doubtful, total=len(found))
+    if doubtful:
+        planes = torch.cat([one.planes_world for one in found])
+        return Silhouettes.everything(scene.views, planes)
+    order = torch.cat(views).argsort()
+    hidden = [one.inside < 0 if one.hidden is None else one.hidden for one in found]
+    return found[0].replace(
+        inside=torch.cat([one.inside for one in found])[order],
+        reliable=torch.cat([one.reliable for one in found])[order],
+        hidden=torch.cat(hidden)[order] if any(map(torch.any, hidden)) else None,
+    )
+
+
+def part(scene: SparseScene, views: list[int]) -> SparseScene:
+    """Return the scene of some views, as if the object had stood there alone."""
+    kept = torch.zeros(scene.views.num_views, dtype=torch.bool)
+    kept[views] = True
+    some = with_views(scene, kept)
+    return some.replace(series=some.series[:0])

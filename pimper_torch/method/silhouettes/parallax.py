@@ -1,0 +1,312 @@
+"""Parallax: what stands before a background does not look as the background does from elsewhere.
+
+Backgrounds are what views see through homographies: the plane that the object stands on, and a room
+at rest before which it turns. All photographs are rectified to it. The median of what they show
+there is its texture, without what stands before it and without shadows, which move with the light.
+Where a view agrees with it, it shows the background; where it does not, something stands before it,
+textured or not. Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.opencv import shrunk, warped, window_means
+from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
+from pimper_torch.ground.geometry.supporting_plane import Fixation, Plane
+from pimper_torch.ground.radiometry.response import srgb_from_linear
+from pimper_torch.records import Cameras, Record, Views
+from pimper_torch.runtime.mapped import stacked, zeros
+from pimper_torch.runtime.parallel import side_by_side
+
+_FAINT = 0.03  # of white; ratios of darker colours tell noise
+_RATIO = 100.0  # grey levels for a ratio of e
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class WorkingPictures(Record):
+    """Photographs in display colours, reduced.
+
+    Attributes:
+        colours: Encoded as sRGB, exposed alike; padding is black.
+        opponent: Brightness and two ratios of colours, which shadows change little.
+        grey: Logarithm of the mean radiance.
+        factors: Size of these pictures over that of the photographs, across and down.
+    """
+
+    colours: UInt8[Tensor, "view height width 3"]
+    opponent: UInt8[Tensor, "view height width 3"]
+    grey: Float[Tensor, "view height width"]
+    cameras: Cameras
+    factors: tuple[float, float]
+
+
+def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPictures:
+    """Shrink photographs so that the longer side of the raster is at most so long."""
+    height, width = views.images.shape[-2:]
+    factor = min(1.0, size_px / max(height, width))
+    wide, high = max(1, round(factor * width)), max(1, round(factor * height))
+    factors = (wide / width, high / height)
+
+    def shown(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
+        small = shrunk(image, wide, high)
+        level = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
+        radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
+        colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
+        # Logarithms of what is darker tell noise.
+        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + 0.005)
+
+    images = views.images.detach().cpu().unbind()
+    colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
+    grey = zeros((len(images), high, wide))
+    for view, layers in enumerate(side_by_side(shown, images, tracked=False)):
+        colours[view], opponent[view], grey[view] = layers
+    scale = torch.tensor(factors)
+    return WorkingPictures(
+        colours=colours,
+        opponent=opponent,
+        grey=grey,
+        cameras=cameras.to("cpu", torch.float32).replace(
+            intrinsics=scale_intrinsics(cameras.intrinsics.cpu().float(), *factors),
+            sizes_px=(cameras.sizes_px.cpu() * scale).round().long().clamp_min(1),
+        ),
+        factors=factors,
+    )
+
+
+def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
+    """Stack what is computed of every view by itself."""
+    return stacked(side_by_side(work, range(count)), count)
+
+
+def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:
+    """Return brightness and two ratios of colours, which shadows and shading leave as they are."""
+    red, green, blue = torch.log(radiance + _FAINT)
+    luma = 255 * srgb_from_linear(radiance.mean(dim=0))
+    ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
+    return torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
+
+
+DISPUTED = 0.5  # agreement where views do not agree on what the background looks like
+# Fractions of the pictures' longer side.
+_WINDOW = 1 / 80  # windows that are compared: 9 px of 640
+_SHADING = 1 / 25  # what is smoother than this is light, not texture
+# Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
+_FLAT = 0.008
+_REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each side
+_STEP = 2.0  # working pixels at the fixation point between samples of the plane
+# The same for brightness, where there is no texture.
+_FAR_REACH, _FAR_STEP = 2.0, 8.0
+_ROOM = 1.0  # of the picture's size beyond it: a room that shifts by more is not looked at
+_NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Raster(Record):
+    """A raster on a background.
+
+    Attributes:
+        pixels_from_raster: From homogeneous pixels of the raster to those of each view; NaN for a
+            view that does not see the background.
+    """
+
+    pixels_from_raster: Float[Tensor, "view 3 3"]
+    size_px: tuple[int, int]
+
+
+def plane_agreement(
+    pictures: WorkingPictures,
+    plane: Plane,
+    fixation: Fixation,
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
+
+    Args:
+        fixation: Its fixation point is the centre of what is looked at.
+        hidden: Where views do not show the plane, as far as is known.
+    """
+    near = _plane_raster(pictures.cameras, plane, fixation, _REACH, _STEP)
+    far = _plane_raster(pictures.cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
+    return texture_agreement(pictures, near, far, hidden)
+
+
+def room_agreement(
+    pictures: WorkingPictures,
+    background_from_view: Float[Tensor, "view 3 3"],
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
+
+    Args:
+        background_from_view: From pixels of each photograph to those where the room is at rest;
+            NaN for views that show too little of it.
+        hidden: Where views do not show the room, as far as is known.
+    """
+    raster = _room_raster(pictures, background_from_view.cpu().double())
+    return texture_agreement(pictures, raster, raster, hidden)
+
+
+def texture_agreement(
+    pictures: WorkingPictures,
+    near: Raster,
+    far: Raster,
+    hidden: Bool[Tensor, "view height width"] | None = None,
+) -> Float[Tensor, "view height width"]:
+    r"""Return how well each view agrees with the texture of a background.
+
+    Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
+    radiance without its smooth part.
+
+    Args:
+        far: Samples of the brightness, which may be fewer and reach farther.
+        hidden: Where views do not show the background, as far as is known. What they show there is
+            compared with its texture, but is no part of it.
+
+    Returns:
+        Between -1 and 1; ``DISPUTED`` where views do not agree on what the background looks like,
+        as where it is always hidden; NaN where it is flat, or few views see it; -1 where a view
+        that does not agree is brighter or darker than the others by more than light does it.
+    """
+    count, longer = len(pictures.grey), max(pictures.grey.shape[1:])
+    hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
+
+    def textured(view: int) -> Float[Tensor, "height width"]:
+        return _textured(pictures.grey[view], hidden[view], longer)
+
+    texture = of_views(textured, count)
+    common, spread = _common(texture, hidden, near)
+    level, level_spread = _common(pictures.grey, hidden, far)
+
+    def agreement_of(view: int) -> Float[Tensor, "height width"]:
+        agreement = _agreement(texture[view], common[view], spread[view], longer)
+        other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
+        other &= level_spread[view] < _NO_SHADOW / 2
+        return torch.where(~(agreement > DISPUTED) & other, -1, agreement)
+
+    return of_views(agreement_of, count)
+
+
+def _common(
+    values: Float[Tensor, "view height width"],
+    hidden: Bool[Tensor, "view height width"],
+    raster: Raster,
+) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
+    """Return the views' median on a background, and its spread, as each view sees it."""
+    maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
+    sees = maps.isfinite().flatten(1).all(dim=1).tolist()
+
+    def rectified(view: int) -> Float[Tensor, "row column"]:
+        if not sees[view]:
+            return values.new_full(raster.size_px[::-1], torch.nan)
+        seen = values[view].masked_fill(hidden[view], torch.nan)
+        return warped(seen, maps[view], raster.size_px)
+
+    seen = of_views(rectified, len(values))
+    rows = torch.split(seen, max(1, 2**20 // (len(seen) * raster.size_px[0])), dim=1)
+    common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
+
+    def back(view: int) -> Float[Tensor, "layer height width"]:
+        if not sees[view]:
+            return values.new_full((2, *size_px[::-1]), torch.nan)
+        to = torch.linalg.inv(maps[view])
+        return torch.stack([_in_front(warped(one, to, size_px), to) for one in (common, spread)])
+
+    common, spread = of_views(back, len(values)).unbind(dim=1)
+    return common, spread
+
+
+def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
+    """Return the views' median and the spread round it; NaN where too few see the plane."""
+    common = seen.nanmedian(dim=0).values
+    spread = (seen - common).abs().nanmedian(dim=0).values
+    few = seen.isfinite().sum(dim=0) < 3
+    return torch.stack([common, spread]).masked_fill(few, torch.nan)
+
+
+def _in_front(
+    layer: Float[Tensor, "height width"], raster_from_pixels: Float[Tensor, "3 3"]
+) -> Float[Tensor, "height width"]:
+    """Mask what a homography maps in front of the camera though it lies behind it."""
+    height, width = layer.shape
+    pixels = pixel_centers(width, height, like=layer)
+    scale = pixels @ raster_from_pixels[2, :2] + raster_from_pixels[2, 2]
+    return torch.where(scale > 0, layer, torch.nan)
+
+
+def _plane_raster(
+    cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
+) -> Raster:
+    """Lay a raster on the plane about the foot of the fixation point."""
+    normal = plane.normal_world
+    axis = torch.eye(3)[normal.abs().argmin()].to(normal)
+    first = normalize(torch.linalg.cross(normal, axis), dim=0)
+    second = torch.linalg.cross(normal, first)
+    foot = fixation.fixation_world - plane.height_of(fixation.fixation_world) * normal
+    step = step_px * fixation.distance / cameras.intrinsics[:, 0, 0].median()
+    size = int(2 * reach * fixation.distance / step)
+    corner = foot - step * size / 2 * (first + second)
+    world_from_raster = torch.stack([step * first, step * second, corner], dim=1)
+    cam_from_raster = cameras.cam_from_world[:, :3, :3] @ world_from_raster
+    cam_from_raster[:, :, 2] += cameras.cam_from_world[:, :3, 3]
+    return Raster(pixels_from_raster=cameras.intrinsics @ cam_from_raster, size_px=(size, size))
+
+
+def _room_raster(
+    pictures: WorkingPictures, background_from_view: Float[Tensor, "view 3 3"]
+) -> Raster:
+    """Lay a raster over the room, of working pixels where it is at rest, as far as views see."""
+    height, width = pictures.grey.shape[1:]
+    scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())
+    maps = scale @ background_from_view @ torch.linalg.inv(scale)
+    corners = maps.new_tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
+    ends = (maps @ corners.mT).mT.reshape(-1, 3)
+    ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
+    size = maps.new_tensor([width, height])
+    low = torch.maximum(ends.amin(dim=0), -_ROOM * size).floor()
+    high = torch.minimum(ends.amax(dim=0), (1 + _ROOM) * size).ceil()
+    shift = torch.eye(3).to(maps)
+    shift[:2, 2] = low
+    to_pixels = torch.full_like(maps, torch.nan)
+    seen = maps.isfinite().flatten(1).all(dim=1)
+    to_pixels[seen] = torch.linalg.inv(maps[seen]) @ shift
+    columns, rows = (high - low).int().tolist()
+    return Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
+
+
+def _textured(
+    grey: Float[Tensor, "height width"], hidden: Bool[Tensor, "height width"], longer: int
+) -> Float[Tensor, "height width"]:
+    """Take the light out: what varies smoothly, on the plane and on what hides it apart."""
+    window = _odd(_SHADING * longer)
+    off = hidden.to(grey)
+    sums = window_means(torch.stack([grey * off, off, grey * (1 - off), 1 - off]), window)
+    smooth = torch.where(hidden, sums[0] / sums[1], sums[2] / sums[3])
+    return grey - smooth
+
+
+def _agreement(
+    one: Float[Tensor, "height width"],
+    common: Float[Tensor, "height width"],
+    spread: Float[Tensor, "height width"],
+    longer: int,
+) -> Float[Tensor, "height width"]:
+    """Compare a view with the plane's texture window by window."""
+    known = common.isfinite() & spread.isfinite()
+    common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)
+    layers = [one, common, one * one, common * common, one * common, spread, known.to(one)]
+    means = window_means(torch.stack(layers), _odd(_WINDOW * longer))
+    variance = (means[2] - means[0] ** 2).clamp_min(0)
+    variance_common = (means[3] - means[1] ** 2).clamp_min(0)
+    agreement = 2 * (means[4] - means[0] * means[1]) / (variance + variance_common)
+    disputed = means[5] > variance_common.sqrt().clamp_min(_FLAT)
+    known_here = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
+    return torch.where(known_here, torch.where(disputed, DISPUTED, agreement), torch.nan)
+
+
+def _odd(size: float) -> int:
+    return 2 * round(size / 2) + 1

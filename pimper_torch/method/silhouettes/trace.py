@@ -1,0 +1,52 @@
+"""The stage that turns silhouettes into constraints on the surface."""
+
+import torch
+
+from pimper_torch.ground.geometry.contours import Contours, RayConfig, contour_rays
+from pimper_torch.ground.geometry.visual_hull import box_round, visual_hull
+from pimper_torch.records import Cameras, Silhouettes
+from pimper_torch.runtime.errors import caution
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.stage import Stage
+
+# Fraction of the views whose silhouette may be wrong at a place. Those that are found lack parts in
+# shadow: with 0.05, where 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are
+# not covered, with 0.1 0.3 %. With 0.15 one of 8 views is outvoted: Chamfer 0.19 for 0.12.
+_DISAGREEING = {"masks": 0.03, "found": 0.1}
+
+
+class TraceContours(Stage):
+    """Turn silhouettes into constraints on the surface; a constant to autograd."""
+
+    def __init__(self, config: RayConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RayConfig()
+
+    @torch.no_grad()
+    def forward(self, silhouettes: Silhouettes, cameras: Cameras) -> Contours:
+        """Cast rays through the silhouettes and build their visual hull.
+
+        Returns:
+            Contours that constrain nothing where silhouettes leave nothing out, and, with a
+            warning, where they have no place in common.
+        """
+        if silhouettes.source == "everything":
+            return Contours.none(silhouettes, cameras)
+        box = box_round(silhouettes, cameras)
+        hull = None
+        if box is not None:  # voxels need no more than single precision
+            fraction = _DISAGREEING[silhouettes.source]
+            hull = visual_hull(
+                silhouettes, cameras.to(torch.float32), box.float(), disagreeing=fraction
+            )
+        leave_out("contours.hull", hull is None)
+        if hull is None:
+            caution(
+                "contours: the silhouettes of the views have no place in common, so that they "
+                "say nothing about the surface. Look at the masks: do they show the same "
+                "object in all photographs?",
+                stacklevel=2,
+            )
+            return Contours.none(silhouettes, cameras)
+        rays = contour_rays(silhouettes, cameras, self.config)
+        return Contours(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)

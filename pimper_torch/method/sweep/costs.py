@@ -1,0 +1,361 @@
+"""Costs of a bucket's samples at all heights, under the fitted light.
+
+On the CPU a kernel computes them in float32, and its adjoint the gradients; the torch functions
+here are its reference.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.pyramids import (
+    Sources,
+    centers_in_patches,
+    image_from_patch,
+    kernel_geometry,
+    look_up,
+)
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.kernels.arrays import as_array, pulled_back
+from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
+
+_Array = NDArray[Any]
+
+
+def inconsistency(
+    radiance: Float[Tensor, "sample view hypothesis"],
+    shading: Float[Tensor, "sample view"],
+    seen: Bool[Tensor, "sample view"],
+    scale: Float[Tensor, " sample"],
+    iterations: int = 2,
+) -> Float[Tensor, "sample hypothesis"]:
+    r"""Return the robust cost of every hypothesis.
+
+    .. math:: C = \sum_g \tfrac12 \log(1 + (x_g - \rho s_g)^2 / c^2)
+
+    with the albedo that is the median of those of single views, then so many re-weighted means.
+
+    Args:
+        radiance: What each view shows of the sample if the hypothesis holds.
+        shading: Of albedo 1, the same for all hypotheses; positive where seen.
+        seen: Views that take part; the same for all hypotheses, as costs of different sets
+            could not be compared.
+        scale: ``c``, in units of radiance.
+
+    Differentiable in radiance, shading and scale, through the iterations of the albedo.
+    """
+    s = torch.where(seen, shading, 1)[..., None]
+    taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
+    single = torch.where(seen[..., None], radiance / s, torch.nan)
+    albedo = single.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
+    for _ in range(iterations):
+        residual = (radiance - albedo * s) * per_scale
+        lit = taken * s / (1 + residual.square())
+        square = (lit * s).sum(dim=1, keepdim=True)
+        albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
+    residual = (radiance - albedo * s) * per_scale
+    return 0.5 * (taken * torch.log1p(residual.square())).sum(dim=1)
+
+
+def best_views(
+    score: Float[Tensor, "sample view"], usable: Bool[Tensor, "sample view"], count: int
+) -> tuple[Int[Tensor, "sample chosen"], Bool[Tensor, "sample chosen"]]:
+    """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
+
+    Returns:
+        The views, and which entries are no padding: a sample with fewer usable ones has fewer.
+
+    >>> score = torch.tensor([[0.5, 0.9, 0.7]])
+    >>> best_views(score, torch.tensor([[True, True, False]]), 2)
+    (tensor([[1, 0]]), tensor([[True, True]]))
+    """
+    rated = torch.where(usable, score, -torch.inf)
+    best = rated.topk(min(count, score.shape[1]), dim=1)
+    return best.indices, best.values > -torch.inf
+
+
+def poses_first(
+    score: Float[Tensor, "sample view"],
+    usable: Bool[Tensor, "sample view"],
+    poses: Int[Tensor, " view"],
+) -> Float[Tensor, "sample view"]:
+    """Rate the best usable view of every pose before the second of any, and so on.
+
+    Views of one pose say nothing of a height: they agree whatever it is.
+
+    Args:
+        score: In [0, 1].
+
+    Returns:
+        The score, less the number of better views of the same pose.
+
+    >>> score, poses = torch.tensor([[0.9, 0.8, 0.3]]), torch.tensor([0, 0, 1])
+    >>> poses_first(score, torch.ones(1, 3, dtype=torch.bool), poses)
+    tensor([[ 0.9000, -0.2000,  0.3000]])
+    """
+    rated = torch.where(usable, score, -torch.inf)
+    found = score.clone()
+    for pose in sorted(set(poses.tolist())):
+        (own,) = torch.nonzero(poses == pose, as_tuple=True)
+        order = rated[:, own].argsort(dim=1, descending=True, stable=True)
+        found[:, own] -= order.argsort(dim=1)
+    return found
+
+
+def view_scores(
+    facing: Float[Tensor, "sample view"],
+    footprint: Float[Tensor, "sample view"],
+    shading: Float[Tensor, "sample view"],
+) -> Float[Tensor, "sample view"]:
+    """Rate views by angle, resolution and light.
+
+    Args:
+        facing: Cosine between the normal and the way to the camera.
+        footprint: Pixels that a sample spans, if it faced the camera; more than one is no
+            better than one.
+        shading: What the light makes of albedo 1 there.
+
+    A view that sees the surface straight on and finely, in the light of a good view, has 1.
+    """
+    typical = shading.clamp_min(0).mean(dim=1, keepdim=True)
+    lit = shading / torch.where(typical > 0, typical, 1)
+    return facing * footprint.clamp_max(1) * lit.clamp(0, 1)
+
+
+# Samples of the template between heights that are tried: a choice.
+STEP = 0.7
+
+# A sample seen at a flatter angle (cosine) is looked up as if seen at this one, 87 degrees.
+_MIN_FACING = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Hypotheses(Record):
+    """Heights of a bucket's samples that are tried, and what they are tried on.
+
+    Attributes:
+        registered: Which views have which samples.
+        outward: Unit normals that samples are moved along, patch frame.
+        cameras: Of the bucket's views.
+        images: Where each camera's photograph is among the sources.
+        poses: Number of each view's pose, where some have several.
+        ladder: Heights, in steps.
+        scale: Of the robust cost, in units of radiance.
+    """
+
+    templates: Templates
+    registered: Observations
+    photometry: Photometry
+    outward: Float[Tensor, "patch height width 3"]
+    cameras: Cameras
+    sources: Sources
+    images: Int[Tensor, " view"]
+    poses: Int[Tensor, " view"] | None
+    ladder: Float[Tensor, " hypothesis"]
+    scale: Float[Tensor, " patch"]
+
+    @property
+    def lights(self) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
+        """Lights over the exposure of their views, and the factors of radiance beside them."""
+        lights, exposure = self.photometry.lights_patch, self.photometry.exposure
+        gains = torch.ones_like(lights[..., 0]) if exposure is None else 1 / exposure
+        return lights * gains[..., None], gains
+
+
+Costs = tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]
+
+
+def costs_of(given: Hypotheses, num_views: int, min_views: int) -> Costs:
+    """Return the robust cost of every height, and 1 where a sample is swept, else 0.
+
+    Args:
+        num_views: Largest number of views that a sample is compared in.
+        min_views: Least number of them for a sample that is swept.
+    """
+    gray = given.sources.gray.finest
+    if gray.dtype == torch.float32 and compiled_for(gray.detach()):
+        return _compiled_costs(given, num_views, min_views)
+    samples = _compared(given, num_views, min_views)
+    cost = inconsistency(
+        _look_up(given, samples), samples.shading, samples.seen, given.scale[samples.patch]
+    )
+    raster = given.templates.depth
+    flat = cost.new_zeros(raster.numel(), cost.shape[1]).index_copy(0, samples.index, cost)
+    swept = torch.zeros_like(raster).flatten().index_fill(0, samples.index, 1.0)
+    return flat.reshape(*raster.shape, -1).movedim(-1, 1), swept.reshape(raster.shape)
+
+
+def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
+    from pimper_torch.ground.kernels import sweep_costs
+
+    templates, photometry, gray = given.templates, given.photometry, given.sources.gray
+    to_patches = given.cameras, templates.patch_from_world
+    projection, centers = image_from_patch(*to_patches), centers_in_patches(*to_patches)
+    intrinsics = given.cameras.intrinsics.double()
+    focals = (intrinsics[:, 0, 0] * intrinsics[:, 1, 1]).sqrt()
+    placed, samples = kernel_geometry(given.images, templates, given.outward, projection, centers)
+    light = photometry.normals_patch, *given.lights
+    trial = sweep_costs.Trial(
+        as_array(photometry.observed & templates.inside),
+        as_array(given.registered.valid),
+        as_array(given.scale, torch.float32),
+        as_array(STEP * given.ladder, torch.float64),
+        as_array(torch.zeros(0, dtype=torch.long) if given.poses is None else given.poses),
+        num_views,
+        min_views,
+        _MIN_FACING,
+    )
+    shading = sweep_costs.Shading(*(as_array(each, torch.float32) for each in light))
+    call = gray.pictures, as_array(gray.table), placed, as_array(focals), samples, shading, trial
+    cost, swept = _Compiled.apply(  # type: ignore[no-untyped-call]
+        call,
+        gray.finest.flatten(1),
+        gray.coarser,
+        projection.flatten(0, 1),
+        centers.flatten(0, 1),
+        focals,
+        templates.origin,
+        templates.spacing,
+        templates.depth,
+        given.outward,
+        *light,
+        given.scale,
+    )
+    return cost.to(templates.depth), swept.to(templates.depth)
+
+
+class _Compiled(torch.autograd.Function):
+    """Costs as a function of pictures, geometry and light, by a kernel and its adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, call: Any, *inputs: Tensor) -> Costs:
+        """Return the costs, and which samples are swept."""
+        from pimper_torch.ground.kernels import sweep_costs
+
+        trial = call[-1]
+        num_patches, _, *raster = trial.valid.shape
+        cost = torch.zeros(num_patches, len(trial.ladder), *raster)
+        swept = torch.zeros(num_patches, *raster)
+        sweep_costs.costs(*(*call, as_array(cost), as_array(swept)))
+        ctx.call = call
+        ctx.save_for_backward(*inputs)
+        ctx.mark_non_differentiable(swept)
+        return cost, swept
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_cost: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Return gradients of pictures, geometry and light."""
+        from pimper_torch.ground.kernels import sweep_adjoint as adjoint
+
+        of_pictures = any(ctx.needs_input_grad[1:3])
+
+        def add_to(*found: _Array) -> None:
+            gradients = adjoint.CostGradients(*found)
+            adjoint.pull_back(*(*ctx.call, as_array(on_cost), int(of_pictures), gradients))
+
+        return None, *pulled_back(add_to, ctx.saved_tensors, of_pictures)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Samples(Record):
+    """The samples of a bucket that are swept, in a row.
+
+    Attributes:
+        index: In the flattened rasters.
+        outward: Along which it is swept; unit, world.
+        shading: Of albedo 1 in these.
+        gains: Factors of radiance in these.
+    """
+
+    index: Int[Tensor, " sample"]
+    patch: Int[Tensor, " sample"]
+    points_world: Float[Tensor, "sample 3"]
+    outward: Float[Tensor, "sample 3"]
+    chosen: Int[Tensor, "sample chosen"]
+    seen: Bool[Tensor, "sample chosen"]
+    shading: Float[Tensor, "sample chosen"]
+    gains: Float[Tensor, "sample chosen"]
+
+
+def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
+    """List the samples that enough views have, with these."""
+    templates, cameras, poses = given.templates, given.cameras, given.poses
+    tested = given.photometry.observed & templates.inside
+    tested = tested & (given.registered.valid.sum(dim=1) >= min_views)
+    (index,) = torch.nonzero(tested.flatten(), as_tuple=True)
+    patch = index // tested[0].numel()
+    world_from_patch = invert_rigid(templates.patch_from_world)
+    points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+    outward = rotate(world_from_patch, given.outward.flatten(1, 2))
+    points, outward = points.reshape(-1, 3)[index], outward.reshape(-1, 3)[index]
+    normals = given.photometry.normals_patch.reshape(-1, 3)[index]
+    basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
+    lights, gains = given.lights
+    shading = torch.einsum("sga,sa->sg", lights[patch], basis)
+    valid = given.registered.valid.movedim(1, -1).reshape(-1, cameras.num_views)[index]
+    with torch.no_grad():
+        away = cameras.centers_world - points[:, None]
+        facing = (normalize(away, dim=-1) * outward[:, None]).sum(dim=-1)
+        footprint = _footprint(points, templates.spacing[patch], cameras)
+        score = view_scores(facing, footprint, shading)
+        usable = valid & (facing > 0) & (shading > 0)
+        if poses is not None:
+            score = poses_first(score, usable, poses)
+        chosen, seen = best_views(score, usable, num_views)
+        enough = seen.sum(dim=1) >= min_views
+        if poses is not None:
+            enough = (seen & (score.gather(1, chosen) > 0)).sum(dim=1) >= min_views
+    return _Samples(
+        index=index[enough],
+        patch=patch[enough],
+        points_world=points[enough],
+        outward=outward[enough],
+        chosen=chosen[enough],
+        seen=seen[enough],
+        shading=shading.gather(1, chosen)[enough],
+        gains=gains[patch].gather(1, chosen)[enough],
+    )
+
+
+def _footprint(
+    points: Float[Tensor, "sample 3"], spacing: Float[Tensor, " sample"], cameras: Cameras
+) -> Float[Tensor, "sample view"]:
+    """Return the pixels that a sample would span in each view if it faced it."""
+    focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
+    axes = cameras.cam_from_world[:, 2]
+    depth = points @ axes[:, :3].mT + axes[:, 3]
+    return spacing[:, None] * focal / depth.clamp_min(torch.finfo(depth.dtype).eps)
+
+
+def _look_up(given: Hypotheses, samples: _Samples) -> Float[Tensor, "sample chosen hypothesis"]:
+    """Look every sample up at all heights in its chosen views."""
+    spacing = given.templates.spacing[samples.patch]
+    moves = STEP * spacing[:, None] * given.ladder.to(spacing)
+    radiance = moves.new_zeros(*samples.chosen.shape, moves.shape[1]).flatten(0, 1)
+    width = samples.chosen.shape[1]
+    for view in range(given.cameras.num_views):
+        (slot,) = torch.nonzero(((samples.chosen == view) & samples.seen).flatten(), as_tuple=True)
+        if len(slot) == 0:
+            continue
+        sample = slot // width
+        outward, start = samples.outward[sample], samples.points_world[sample]
+        moved = start[:, None] + moves[sample, :, None] * outward[:, None]
+        camera = given.cameras.take([view])
+        pixels, _ = project(moved.reshape(-1, 3), camera.cam_from_world[0], camera.intrinsics[0])
+        across = _footprint(start, spacing[sample], camera)[:, 0]
+        away = normalize(camera.centers_world - start, dim=-1)
+        squeezed = (away * outward).sum(dim=-1).clamp_min(_MIN_FACING)
+        level = (across * squeezed.sqrt()).clamp_min(1).log2()
+        level = level[:, None].expand(-1, moves.shape[1]).flatten()
+        looked_up = look_up(given.sources.gray.levels(int(given.images[view])), pixels, level)
+        radiance = radiance.index_copy(0, slot, looked_up.reshape(len(slot), -1).to(radiance))
+    return samples.gains[..., None] * radiance.reshape(*samples.chosen.shape, moves.shape[1])

@@ -1,0 +1,72 @@
+"""Silhouettes of a segmenter, and those that a person points at."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pimper_torch.doors.size.given import Mark, number_of, require_inside
+from pimper_torch.priors.from_maps import silhouettes_from, stacked
+from pimper_torch.priors.prior_files.folder import read_maps, single
+from pimper_torch.records import SilhouettePrior, Views
+from pimper_torch.runtime.errors import InputError
+
+_KINDS = ("mask", "silhouette", "alpha", "inside")  # how names of arrays begin
+
+
+def read_silhouettes(
+    folder: Path | str, views: Views, *, undistorted: bool = False
+) -> SilhouettePrior:
+    """Read soft masks of photographs from a folder: PNG or JPEG of 8 or 16 bits, EXR, NPZ or NPY.
+
+    A mask has the photograph's name, with what segmenters append, its shape, and any size; some
+    photographs may have none. It is 1 on the object, in full scale. In pictures that are somewhere
+    transparent it is their opacity. NaN says nothing.
+
+    Args:
+        undistorted: Whether they are of the photographs as a run undistorts them.
+    """
+    return silhouettes_from(
+        read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted
+    )
+
+
+def _chance(path: Path, values: np.ndarray) -> np.ndarray:
+    values = single(path, values)
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if low < 0 or high > 1:
+        raise InputError(
+            f"{path}: holds values from {low:g} to {high:g}; needed: the probability of the "
+            "object, from 0 to 1. A network's logits go through a sigmoid first."
+        )
+    levels = 255 * known
+    # Files of 8 bits whose levels are all below 32 hold labels: all but 0 is the object.
+    if 0 < high < 32 / 255 and np.allclose(levels, np.rint(levels), atol=1e-3):
+        return (values > 0).astype(np.float32)
+    return values
+
+
+def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
+    """Make maps of pixels that show the object, and say nothing elsewhere.
+
+    Args:
+        marks: Places on it, in one photograph or more each.
+
+    Raises:
+        InputError: No such photograph, or a pixel outside of it.
+    """
+    maps: dict[int, torch.Tensor] = {}
+    for pointer in (one for mark in marks for one in mark.pointers):
+        view = number_of(pointer.name, views.names)
+        size = views.sizes_px[view].tolist()
+        full = pointer.size_px or size
+        require_inside(pointer, *full)
+        scale = min(1.0, 512 / max(size))
+        width, height = (max(1, round(scale * side)) for side in size)
+        inside = maps.setdefault(view, torch.full((height, width, 1), 0.5))
+        column = min(int(pointer.x * width / full[0]), width - 1)
+        row = min(int(pointer.y * height / full[1]), height - 1)
+        inside[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = 1
+    return silhouettes_from(stacked({views.names[view]: (one, None) for view, one in maps.items()}))

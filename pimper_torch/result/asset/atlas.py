@@ -1,0 +1,157 @@
+"""Where on a texture every face of a mesh lies."""
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pimper_torch.records import Mesh, Record
+from pimper_torch.runtime.errors import caution
+from pimper_torch.runtime.failures import reason_of
+
+# A choice: what browsers on telephones take.
+MAX_SIDE = 4096
+
+# The same mesh takes it 1.5 s. A choice: long enough for a slow machine.
+_LIMIT_S = 60.0
+
+# Of Python: the folder of the script, with this room's modules, is no place to import from.
+_CHILD = ("-P",)
+
+# Round a cell's triangles; as much is between them, along each side. With 1, colours of a sphere
+# are off by 2.8 levels in place of 0.5.
+_GUTTER_TEXELS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Atlas(Record):
+    """A mesh cut along seams and laid out flat.
+
+    Attributes:
+        vertex: The mesh's vertex that every vertex of the atlas is a copy of.
+        faces: The mesh's faces, in its order, as vertices of the atlas.
+        uv: Right and down over the texture, in [0, 1].
+    """
+
+    vertex: Int[Tensor, " copy"]
+    faces: Int[Tensor, "face 3"]
+    uv: Float[Tensor, "copy 2"]
+    width: int
+    height: int
+    charts: int
+
+
+def unwrapped(mesh: Mesh, texel: float) -> Atlas:
+    """Lay a mesh out by xatlas; triangle by triangle where xatlas fails or takes too long.
+
+    Args:
+        texel: Side wanted, scene units; larger where the texture would be larger than 4096.
+    """
+    return _by_xatlas(mesh, texel) or by_triangles(mesh, texel)
+
+
+def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
+    """Run xatlas on pieces of a mesh in a child process; ``None`` where that fails."""
+    # Its tolerances are absolute: lengths are in texels, from the mesh's centre.
+    places = mesh.vertices_world.detach().double()
+    places = ((places - places.median(dim=0).values) / texel).float()
+    order, pieces = _pieces(places, mesh.faces)
+    sources, corners = zip(
+        *(torch.unique(mesh.faces[some], return_inverse=True) for some in pieces), strict=True
+    )
+    source = torch.cat(sources)
+    with tempfile.TemporaryDirectory() as folder:
+        before, after = Path(folder) / "pieces.npz", Path(folder) / "atlas.npz"
+        np.savez(
+            before,
+            vertices=places[source].numpy(),
+            faces=torch.cat(corners).numpy().astype(np.uint32),
+            vertex_counts=[len(one) for one in sources],
+            face_counts=[len(one) for one in corners],
+        )
+        command = [sys.executable, *_CHILD, str(Path(__file__).with_name("charts.py"))]
+        try:
+            subprocess.run(
+                [*command, str(before), str(after)],
+                check=True,
+                timeout=_LIMIT_S,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+            )
+        except (subprocess.SubprocessError, OSError) as error:
+            told = (getattr(error, "stderr", None) or b"").decode(errors="replace").split("\n")
+            reason = next((line for line in reversed(told) if line.strip()), reason_of(error))
+            caution(
+                f"asset: xatlas made no atlas ({reason}). Every face has a place of its own on the "
+                "textures, which makes `asset.glb` larger."
+            )
+            return None
+        with np.load(after, allow_pickle=False) as found:
+            values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}
+            size, charts = found["size"].tolist(), int(found["charts"])
+    shrunk = min(1.0, MAX_SIDE / max(size))
+    width, height = (max(1, round(shrunk * side)) for side in size)
+    faces = torch.empty_like(mesh.faces)
+    faces[order] = values["faces"]
+    return Atlas(
+        vertex=source[values["vertex"]],
+        faces=faces,
+        uv=values["uv"],
+        width=width,
+        height=height,
+        charts=charts,
+    )
+
+
+def _pieces(
+    places: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+) -> tuple[Int[Tensor, " face"], list[Int[Tensor, " some"]]]:
+    """Halve the faces across their longest side until pieces are small; list them, and joined."""
+    centres = places[faces].mean(dim=1)
+    pieces = [torch.arange(len(faces))]
+    # xatlas takes 7.9 s for 50,000 faces in one piece, 1.4 s in 128, with as many charts.
+    while len(pieces[0]) > 512:
+        halves = []
+        for some in pieces:
+            box = centres[some].amax(dim=0) - centres[some].amin(dim=0)
+            along = some[centres[some, box.argmax()].argsort(stable=True)]
+            halves += [along[: len(some) // 2], along[len(some) // 2 :]]
+        pieces = halves
+    return torch.cat(pieces), pieces
+
+
+def by_triangles(mesh: Mesh, texel: float) -> Atlas:
+    """Lay every face out by itself, as half of a square cell of a grid.
+
+    Args:
+        texel: Side wanted, scene units: the mean face has as many texels as its area asks for.
+    """
+    count = len(mesh.faces)
+    a, b, c = mesh.vertices_world.detach().double()[mesh.faces].unbind(dim=1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1).mean() / 2
+    columns = max(1, int(np.ceil(np.sqrt(count / 2))))
+    wanted = int(np.ceil(np.sqrt(2 * float(area)) / texel)) + 3 * _GUTTER_TEXELS
+    side = min(wanted, MAX_SIDE // columns)
+    rows = -(-count // (2 * columns))
+    # The right angle of the first lies at the cell's upper left, that of the second opposite.
+    leg = side - 3 * _GUTTER_TEXELS
+    first = torch.tensor([[0.0, 0], [0, leg], [leg, 0]]) + _GUTTER_TEXELS
+    halves = torch.stack([first, side - first])
+    cell = torch.arange(count) // 2
+    corner = side * torch.stack([cell % columns, cell // columns], dim=1)
+    size = torch.tensor([side * columns, side * rows])
+    placed = corner[:, None] + halves[torch.arange(count) % 2]
+    return Atlas(
+        vertex=mesh.faces.flatten(),
+        faces=torch.arange(3 * count).reshape(-1, 3),
+        uv=(placed / size).reshape(-1, 2),
+        width=int(size[0]),
+        height=int(size[1]),
+        charts=count,
+    )

@@ -1,0 +1,184 @@
+"""Textures of a mesh of few faces, read off the surface that it stands for."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize
+
+from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.surfaces import (
+    barycentric_2d,
+    side_lengths,
+    unit_face_normals,
+    vertex_normals,
+)
+from pimper_torch.ground.geometry.visibility import Hits, RayCaster
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.records import Mesh, Textured
+from pimper_torch.result.asset.atlas import Atlas
+from pimper_torch.result.asset.tangents import frames, tangents
+from pimper_torch.result.viz.maps import albedo_scale, base_color
+from pimper_torch.runtime.parallel import side_by_side
+
+
+def halved(asset: Textured) -> Textured:
+    """Return the same with textures of half the size."""
+    reflectance = asset.reflectance
+    return asset.replace(
+        base_color=_halved(asset.base_color.float()).round().to(torch.uint8),
+        normal=_halved(asset.normal.float()).round().to(torch.uint8),
+        reflectance=None if reflectance is None else _halved(reflectance),
+    )
+
+
+def _halved(
+    texture: Float[Tensor, "height width channel"],
+) -> Float[Tensor, "half narrower channel"]:
+    return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
+
+
+def baked(
+    full: Mesh, few: Mesh, atlas: Atlas, reflectance: Float[Tensor, "vertex 3"] | None = None
+) -> Textured:
+    """Read albedo and normals of a surface off onto textures of a mesh that has fewer faces.
+
+    From the centre of every texel, on a face of the mesh, a ray along the mesh's blended normals
+    meets the surface, outward or inward, where that is nearer. A texel far from all faces, or whose
+    ray meets no surface that faces the same way, has the values of the nearest one that does.
+
+    Args:
+        full: The surface, on the CPU.
+        few: The mesh that was laid out, its normals those that the normal map is relative to.
+        reflectance: Metallic, roughness and specular of the mesh's vertices.
+    """
+    normals = _normals(few)[atlas.vertex]
+    mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
+    shape = vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
+    tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
+    colors = base_color(full, albedo_scale(few)).expand(-1, 3)
+    values, surface, laid = (
+        torch.cat([_normals(full), colors], dim=1),
+        _Surface(full, few),
+        _laid(atlas),
+    )
+    own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
+
+    def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
+        """Return the values of texels, and whether the surface was met."""
+        here = Hits(
+            face=laid.face[texels],
+            distance=laid.distance[texels],
+            barycentric=laid.barycentric[texels],
+        )
+        points = here.interpolate(mesh.vertices_world, mesh.faces)
+        met = surface.nearest(points, here.interpolate(shape, mesh.faces))
+        found = met.interpolate(values, full.faces)
+        axes = frames(here, normals, tangent, mesh.faces)
+        columns = [_relative(found[:, :3], axes), found[:, 3:], here.interpolate(own, mesh.faces)]
+        return torch.cat(columns, dim=1), met.face >= 0
+
+    (texels,) = torch.nonzero(laid.face >= 0, as_tuple=True)
+    blocks = list(side_by_side(bake, torch.split(texels, 250_000), tracked=False))
+    raster = values.new_zeros(len(laid.face), values.shape[1] + own.shape[1])
+    raster[texels] = torch.cat([found for found, _ in blocks])
+    known = torch.zeros_like(laid.face, dtype=torch.bool)
+    known[texels] = torch.cat([there for _, there in blocks])
+    size = (atlas.height, atlas.width)
+    raster = raster[_nearest_known(known.reshape(size))[0]].reshape(*size, -1)
+    return Textured(
+        mesh=mesh,
+        vertex=atlas.vertex,
+        normals=normals,
+        uv=atlas.uv,
+        tangent=tangent,
+        normal=(255 * (0.5 + 0.5 * raster[..., :3])).round().to(torch.uint8),
+        base_color=to_bytes(raster[..., 3:6]),
+        reflectance=None if reflectance is None else raster[..., 6:],
+        charts=atlas.charts,
+    )
+
+
+class _Surface:
+    """A surface that rays from a mesh nearby meet from either side."""
+
+    def __init__(self, full: Mesh, few: Mesh) -> None:
+        self._caster = RayCaster(full.vertices_world, full.faces)
+        self._upright = unit_face_normals(full.vertices_world, full.faces)
+        # Few faces are off by far less than their sides, and what is farther is another place.
+        self._reach = float(side_lengths(few.vertices_world[few.faces]).median())
+
+    def nearest(self, points: Float[Tensor, "texel 3"], along: Float[Tensor, "texel 3"]) -> Hits:
+        """Meet the surface outward or inward, in lengths of ``along``; -1 where it is not near."""
+        outward, inward = (self._facing(points, sign * along, along) for sign in (1.0, -1.0))
+        first = outward.distance <= inward.distance
+        return Hits(
+            face=torch.where(first, outward.face, inward.face),
+            distance=torch.minimum(outward.distance, inward.distance),
+            barycentric=torch.where(first[:, None], outward.barycentric, inward.barycentric),
+        )
+
+    def _facing(
+        self,
+        points: Float[Tensor, "texel 3"],
+        directions: Float[Tensor, "texel 3"],
+        along: Float[Tensor, "texel 3"],
+    ) -> Hits:
+        met = self._caster.cast(points, directions, torch.full_like(points[:, 0], self._reach))
+        same_side = (self._upright[met.face.clamp_min(0)] * along).sum(dim=1) > 0
+        return met.replace(
+            face=torch.where(same_side, met.face, -1),
+            distance=torch.where(same_side, met.distance, torch.inf),
+        )
+
+
+def _laid(atlas: Atlas) -> Hits:
+    """Find the face that every texel shows, row by row, and where on it; -1 where none is near.
+
+    Graphics cards blend a texel at a border with one beside the chart: that shows the border's face
+    continued.
+    """
+    size = atlas.uv.new_tensor([atlas.width, atlas.height])
+    flat = torch.cat([atlas.uv * size, torch.zeros_like(atlas.uv[:, :1])], dim=1)
+    centers = pixel_centers(atlas.width, atlas.height, like=flat).reshape(-1, 2)
+    start = torch.cat([centers, torch.full_like(centers[:, :1], -1.0)], dim=1)
+    met = RayCaster(flat, atlas.faces).cast(start, torch.tensor([0.0, 0, 1]).expand_as(start))
+    nearest, distance = _nearest_known((met.face >= 0).reshape(atlas.height, atlas.width))
+    # Texels that blending may reach are a diagonal away.
+    (beside,) = torch.nonzero((distance > 0) & (distance < 1.5), as_tuple=True)
+    face, barycentric = met.face.clone(), met.barycentric.clone()
+    face[beside] = met.face[nearest[beside]]
+    barycentric[beside] = barycentric_2d(centers[beside], flat[atlas.faces[face[beside]], :2])
+    # Slivers would be continued far.
+    close = (barycentric > -1.0).all(dim=1)
+    return met.replace(face=torch.where(close, face, -1), barycentric=barycentric)
+
+
+def _relative(
+    normals: Float[Tensor, "texel 3"], axes: Float[Tensor, "texel 3 3"]
+) -> Float[Tensor, "texel 3"]:
+    """Return the unit vectors that the axes turn into the normals' directions."""
+    tangent, bitangent, normal = axes.unbind(dim=-1)
+    # Cramer's rule: the axes are not quite at right angles, and seldom without volume.
+    across = [torch.linalg.cross(*pair) for pair in ((bitangent, normal), (normal, tangent))]
+    across.append(torch.linalg.cross(tangent, bitangent))
+    volume = (tangent * across[0]).sum(dim=1, keepdim=True)
+    found = torch.stack([(normals * one).sum(dim=1) for one in across], dim=1) * volume.sign()
+    found = normalize(found, dim=1)
+    # Viewers do not draw a surface that faces away from itself.
+    return normalize(torch.cat([found[:, :2], found[:, 2:].clamp_min(0.02)], dim=1), dim=1)
+
+
+def _nearest_known(
+    known: Bool[Tensor, "height width"],
+) -> tuple[Int[Tensor, " texel"], Float[Tensor, " texel"]]:
+    """Number the nearest known texel of every one, row by row, and return how far that is."""
+    away, (row, column) = distance_transform_edt(~known.numpy(), return_indices=True)
+    index = torch.from_numpy(row).long() * known.shape[1] + torch.from_numpy(column)
+    return index.flatten(), torch.from_numpy(away).flatten()
+
+
+def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+    if mesh.normals_world is None:
+        return vertex_normals(mesh.vertices_world, mesh.faces)
+    return mesh.normals_world

@@ -1,0 +1,118 @@
+"""Finish of a surface before it is written: fewer vertices, and caps where it is open."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.ground.geometry.poisson import reduced
+from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.method.meshing.closing import closed
+from pimper_torch.method.meshing.simplify import simplify
+from pimper_torch.records import Closed, Finished, Mesh
+from pimper_torch.result.viz.maps import base_color
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.stage import Stage
+
+# What people can edit, and browsers draw at once.
+_FACES = 50_000
+
+# Steps that the eye hardly sees on a rendered surface, and errors far below what these two
+# figures are known to.
+_MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshFiles:
+    """Form in which the surface is written.
+
+    Attributes:
+        faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a
+            sample's spacing and 1.5 degrees.
+        formats: Beside PLY and GLB, which are always written.
+    """
+
+    faces: int | Literal["all"] | None = None
+    watertight: bool = False
+    formats: tuple[Literal["stl", "obj"], ...] = ()
+
+    def __post_init__(self) -> None:
+        few = self.faces is not None and self.faces != "all" and self.faces < 4
+        require(not few, "faces", self.faces, "all, or 4 at least, those of a tetrahedron")
+
+
+class Simplify(Stage):
+    """Reduce a surface to as few vertices as tell it, and close it where that is asked for."""
+
+    def forward(self, mesh: Mesh, files: MeshFiles) -> Finished:
+        """Make a surface ready to be written."""
+        how, moved = "", dict[str, int | float]()
+        whole: Closed | None = None
+        if isinstance(files.faces, int):
+            how = "reduced"
+            few, whole = _few_enough(mesh, files.faces, files.watertight)
+        elif files.faces == "all":
+            few = mesh
+        else:
+            how, found = "simplified", simplify(mesh, values=written_channels(mesh))
+            few = found.mesh
+            moved = {
+                "spacing": found.spacing,
+                "max_spacings": found.max_spacings,
+                "max_angle_deg": found.max_angle_deg,
+            }
+        if files.watertight and whole is None:
+            whole = closed(few)
+        return Finished(
+            mesh=few,
+            few=reduced(few, _FACES),
+            closed=whole,
+            how=how,
+            counts={"vertices": len(few.vertices_world), "faces": len(few.faces), **moved},
+            caps={} if whole is None else _caps(whole),
+        )
+
+
+def _few_enough(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed | None]:
+    """Reduce a mesh until it has few enough faces, together with its caps if it gets some."""
+    few = reduced(mesh, faces)
+    if not watertight:
+        return few, None
+    whole, wanted = closed(few), faces
+    for _ in range(4):  # caps hardly change after the second time
+        excess = len(whole.mesh.faces) - faces
+        wanted -= excess
+        if excess <= 0 or wanted < 4:
+            break
+        few = reduced(mesh, wanted)
+        whole = closed(few)
+    return few, whole
+
+
+def _caps(whole: Closed) -> dict[str, int | float]:
+    area = face_normals(whole.mesh.vertices_world, whole.mesh.faces).norm(dim=1)
+    return {
+        "borders": whole.borders,
+        "faces": int((~whole.measured).sum()),
+        "area_fraction": float(area[~whole.measured].sum() / area.sum()),
+    }
+
+
+def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
+    """Return a file's other values of vertices, in units of their tolerances.
+
+    For :func:`pimper_torch.method.meshing.simplify.simplify`: sRGB colour may be off by 8 levels of
+    255, confidence by 0.1, expected error by a tenth of itself.
+    """
+    channels = [mesh.vertices_world.new_zeros(len(mesh.vertices_world), 0)]
+    if mesh.albedo is not None:
+        channels.append(255 / _MAX_LEVELS * srgb_from_linear(base_color(mesh).expand(-1, 3)))
+    if mesh.confidence is not None:
+        channels.append(mesh.confidence[:, None] / _MAX_CONFIDENCE)
+    if mesh.expected_error is not None:
+        least = torch.finfo(torch.float32).tiny
+        channels.append(mesh.expected_error[:, None].clamp_min(least).log() / _MAX_RATIO)
+    return torch.cat(channels, dim=1).detach()

@@ -1,0 +1,112 @@
+"""Binary glTF."""
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
+
+_ARRAYS, _INDICES = 34962, 34963  # what a view of the buffer is for
+_TRIANGLES, _POINTS = 4, 0
+_KINDS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
+_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_LINEAR_MIPMAP_LINEAR, _LINEAR, _CLAMP = 9987, 9729, 33071
+# glTF's own is metal.
+MATTE: dict[str, Any] = {
+    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+    "doubleSided": True,
+}
+# Of normals and tangents that have no length: glTF wants them unit.
+_UPWARD = (0.0, 0.0, 1.0)
+
+
+def gltf_of(
+    attributes: Mapping[str, np.ndarray],
+    faces: np.ndarray,
+    material: Mapping[str, Any],
+    images: Sequence[bytes] = (),
+    offset_world: Offset = NO_OFFSET,
+) -> bytes:
+    """Return one mesh of one material as a GLB.
+
+    Args:
+        attributes: By glTF's names, one row a vertex; written in single precision.
+        faces: Three vertices each. Without any, the vertices are points.
+        material: In glTF's words; its textures' indices are those of ``images``. Extensions that it
+            names are declared.
+        images: PNG or JPEG files.
+    """
+    buffer, views, accessors = bytearray(), [], []
+
+    def viewed(data: bytes, target: int | None) -> int:
+        view: dict[str, int] = {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
+        views.append(view if target is None else {**view, "target": target})
+        buffer.extend(data + bytes(-len(data) % 4))
+        return len(views) - 1
+
+    def stored(values: np.ndarray, target: int, **more: object) -> int:
+        rows = np.ascontiguousarray(values)
+        accessors.append(
+            {
+                "bufferView": viewed(rows.tobytes(), target),
+                "componentType": _KINDS[rows.dtype.str[1:]],
+                "count": len(rows),
+                "type": _SHAPES[1 if rows.ndim == 1 else rows.shape[1]],
+                **more,
+            }
+        )
+        return len(accessors) - 1
+
+    places = np.asarray(attributes["POSITION"], "<f4")
+    bounds = {"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()}
+    primitive: dict[str, Any] = {"attributes": {}, "mode": _TRIANGLES if len(faces) else _POINTS}
+    if len(faces):
+        kind = "<u2" if len(places) < 65536 else "<u4"
+        primitive["indices"] = stored(faces.astype(kind).ravel(), _INDICES)
+    for name, values in attributes.items():
+        rows = _unit(values) if name in ("NORMAL", "TANGENT") else np.asarray(values, "<f4")
+        more = bounds if name == "POSITION" else {}
+        primitive["attributes"][name] = stored(rows, _ARRAYS, **more)
+    primitive["material"] = 0
+    tree: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "pimper_torch"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material],
+        "accessors": accessors,
+        "bufferViews": views,
+    }
+    if offset_world != NO_OFFSET:
+        tree["nodes"][0]["translation"] = list(offset_world)
+    if images:
+        tree["images"] = [
+            {
+                "bufferView": viewed(image, None),
+                "mimeType": "image/png" if image.startswith(b"\x89PNG") else "image/jpeg",
+            }
+            for image in images
+        ]
+        sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
+        tree["samplers"] = [{**sampler, "wrapS": _CLAMP, "wrapT": _CLAMP}]
+        tree["textures"] = [{"source": index, "sampler": 0} for index in range(len(images))]
+    if "extensions" in material:
+        tree["extensionsUsed"] = sorted(material["extensions"])
+    tree["buffers"] = [{"byteLength": len(buffer)}]
+    text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer))
+    head += struct.pack("<I4s", len(text), b"JSON") + text
+    return head + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Make the first three columns unit, in single precision."""
+    rows = np.array(values, "<f8")
+    length = np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
+    rows[:, :3] = np.where(length > 0, rows[:, :3] / np.where(length > 0, length, 1), _UPWARD)
+    return rows.astype("<f4")

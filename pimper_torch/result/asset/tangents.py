@@ -1,0 +1,59 @@
+"""The frames that normal maps are relative to, as viewers compute them."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from pimper_torch.ground.geometry.visibility import Hits
+
+
+def tangents(
+    vertices: Float[Tensor, "vertex 3"],
+    normals: Float[Tensor, "vertex 3"],
+    uv: Float[Tensor, "vertex 2"],
+    faces: Int[Tensor, "face 3"],
+) -> Float[Tensor, "vertex 4"]:
+    """Return glTF's tangents: unit, at right angles to the normal, along ``u``; then a sign.
+
+    The sign times the cross product of normal and tangent points up the picture, against ``v``;
+    it is -1 where the texture shows the surface mirrored. Directions of the faces round a vertex
+    are weighted by their area on the texture.
+
+    Args:
+        uv: Right and down over the texture.
+    """
+    a, b, c = vertices[faces].unbind(dim=1)
+    p, q, r = (uv * uv.new_tensor([1.0, -1.0]))[faces].unbind(dim=1)
+    one, other = q - p, r - p
+    area = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+    along = (b - a) * other[:, 1:] - (c - a) * one[:, 1:]
+    along = along * area.sign()[:, None]
+    total = torch.zeros_like(vertices)
+    signed = torch.zeros_like(vertices[:, 0])
+    for corner in range(3):
+        total = total.index_add(0, faces[:, corner], along)
+        signed = signed.index_add(0, faces[:, corner], area)
+    across = total - (total * normals).sum(dim=1, keepdim=True) * normals
+    # Where faces have no area on the texture, any direction along the surface will do.
+    axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
+    lost = across.norm(dim=1, keepdim=True) <= 1e-6 * total.norm(dim=1, keepdim=True)
+    across = torch.where(lost, torch.linalg.cross(normals, axis), across)
+    sign = torch.where(signed < 0, -1.0, 1.0)
+    return torch.cat([normalize(across, dim=1, eps=0), sign[:, None]], dim=1)
+
+
+def frames(
+    hits: Hits,
+    normals: Float[Tensor, "vertex 3"],
+    tangent: Float[Tensor, "vertex 4"],
+    faces: Int[Tensor, "face 3"],
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return tangent, bitangent and normal in columns, blended over faces as shaders do.
+
+    Khronos' viewer and three.js blend each of the three and make it unit again; they are then not
+    quite at right angles to each other.
+    """
+    along, sign = tangent[:, :3], tangent[:, 3:]
+    axes = (along, sign * torch.linalg.cross(normals, along), normals)
+    return torch.stack([normalize(hits.interpolate(axis, faces), dim=-1) for axis in axes], dim=-1)

@@ -1,0 +1,322 @@
+"""The light of every photograph: ambient and directed, fitted with the surface held fixed.
+
+A photograph's exposure and colour are part of its light. Radiance is linear in the ambient and the
+directed strength of each channel, so only the direction is searched: over the whole sphere without
+cast shadows, then among the best with them, then in ever smaller steps. Errors are those of sRGB
+values, under Cauchy's loss, so that highlights and shadows of other objects have little weight.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize, pad
+
+from pimper_torch.ground.geometry.directions import even_directions
+from pimper_torch.ground.geometry.pixels import scale_intrinsics
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
+from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.records import (
+    Cameras,
+    Materials,
+    Mesh,
+    Record,
+    Silhouettes,
+    SparseScene,
+    ViewLights,
+)
+from pimper_torch.result.relighting.lit_surface import (
+    LitSurface,
+    SurfacePixels,
+    diffuse_color,
+    response,
+)
+from pimper_torch.runtime.parallel import side_by_side
+
+# Longer side of the photographs that lights are fitted to, at most: some 20,000 pixels of an
+# object, ten thousand times what a light has unknowns.
+_SIZE_PX = 300
+
+# Below this radiance an error counts no more for being in the dark: sRGB's slope would let noise
+# decide.
+_DARK = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Observed(Record):
+    """The pixels of a photograph that show a surface.
+
+    Attributes:
+        weight: Of a squared error of radiance, so that errors are those of sRGB.
+        saturated: True where the photograph is, in part of the pixel at least: radiance is then not
+            below the value shown.
+    """
+
+    pixels: SurfacePixels
+    radiance: Float[Tensor, "pixel channel"]
+    weight: Float[Tensor, "pixel channel"]
+    saturated: Bool[Tensor, " pixel"]
+
+    def errors(
+        self, predicted: Float[Tensor, "*batch pixel channel"]
+    ) -> Float[Tensor, "*batch pixel channel"]:
+        """Return how far predicted radiance is off; 0 where it exceeds a saturated photograph's."""
+        error = predicted - self.radiance
+        return torch.where(self.saturated[:, None], error.clamp_max(0), error)
+
+    def thinned(self, most: int) -> "Observed":
+        """Keep every n-th pixel, so that few enough are left."""
+        step = -(-len(self.radiance) // most)
+        return self.take(slice(None, None, step)) if step > 1 else self
+
+
+def shrinking(sizes_px: tuple[int, int]) -> int:
+    """Return the side of the blocks of pixels that are averaged."""
+    return max(1, -(-max(sizes_px) // _SIZE_PX))
+
+
+def shrunk(cameras: Cameras, view: int) -> Cameras:
+    """Return the camera of a view's shrunk photograph."""
+    width, height = (int(side) for side in cameras.sizes_px[view])
+    factor = shrinking((width, height))
+    return Cameras(
+        intrinsics=scale_intrinsics(cameras.intrinsics[view : view + 1], 1 / factor, 1 / factor),
+        cam_from_world=cameras.cam_from_world[view : view + 1],
+        sizes_px=cameras.sizes_px[view : view + 1] // factor,
+    )
+
+
+def observe_all(
+    surface: LitSurface, scene: SparseScene, silhouettes: Silhouettes | None
+) -> list[Observed]:
+    """Look at the surface through every photograph; see :func:`observe`."""
+    look = partial(observe, surface, scene, silhouettes=silhouettes)
+    return list(side_by_side(look, range(scene.cameras.num_views), tracked=False))
+
+
+def observe(
+    surface: LitSurface, scene: SparseScene, view: int, silhouettes: Silhouettes | None
+) -> Observed:
+    """Return the pixels of a photograph that show the surface and nothing else.
+
+    Args:
+        silhouettes: Of all views; by default the surface's own outline.
+    """
+    camera = shrunk(scene.cameras, view)
+    width, height = (int(side) for side in scene.cameras.sizes_px[view])
+    factor = shrinking((width, height))
+    image = scene.views.images[view, :, :height, :width].detach().cpu().float()
+    radiance = avg_pool2d(image, factor).flatten(1).mT
+    saturated = avg_pool2d((image.amax(dim=0, keepdim=True) >= SATURATED).float(), factor)
+    pixels = surface.pixels(camera, 0)
+    kept = pixels.inner & radiance[pixels.pixel].isfinite().all(dim=1)
+    for mask in _masks(scene, view, silhouettes):
+        inside = avg_pool2d(mask[None, :height, :width].cpu().float(), factor)
+        kept &= inside.flatten()[pixels.pixel] > 0.99
+    pixels = pixels.take(kept)
+    radiance = radiance[pixels.pixel].clamp(0, 1)
+    # The slope of sRGB but for its factor.
+    return Observed(
+        pixels=pixels,
+        radiance=radiance,
+        weight=radiance.clamp_min(_DARK) ** (2 / 2.4 - 2),
+        saturated=saturated.flatten()[pixels.pixel] > 0,
+    )
+
+
+def _masks(scene: SparseScene, view: int, silhouettes: Silhouettes | None) -> list[Tensor]:
+    """List what says where a view shows the object."""
+    if silhouettes is not None:
+        return [silhouettes.masks[view]]
+    return [] if scene.views.masks is None else [scene.views.masks[view]]
+
+
+# Ambient and directed strengths of every light and channel, and the mean loss.
+Strengths = tuple[
+    Float[Tensor, "light channel"], Float[Tensor, "light channel"], Float[Tensor, " light"]
+]
+
+
+def loss_scale(seen: Observed) -> float:
+    """Return the scale of Cauchy's loss, by a light of first order without any shadow."""
+    basis = torch.cat([torch.ones_like(seen.radiance[:, :1]), seen.pixels.normals_world], dim=1)
+    root = seen.weight.sqrt() * ~seen.saturated[:, None]
+    residuals = []
+    for channel in range(seen.radiance.shape[1]):
+        rows = (root * seen.pixels.base_color)[:, channel, None] * basis
+        values = (root * seen.radiance)[:, channel]
+        light = torch.linalg.lstsq(rows, values[:, None], driver="gelsd").solution[:, 0]
+        residuals.append(values - rows @ light)
+    size = torch.stack(residuals).norm(dim=0)
+    deviation = float(median_deviation(size, torch.ones_like(size, dtype=torch.bool)))
+    # Half a level of eight bits.
+    return CAUCHY_TUNING * max(deviation, 0.002)
+
+
+def fit_strengths(
+    seen: Observed,
+    diffuse: Float[Tensor, "*batch pixel #channel"],
+    response: Float[Tensor, "light pixel #channel"],
+    scale: float,
+) -> Strengths:
+    """Fit ambient and directed strength for every light, by reweighted least squares.
+
+    Args:
+        diffuse: Radiance under an ambient light of 1, one for all lights or one for each.
+        response: Radiance under a directed light of strength 1.
+
+    Returns:
+        Both, neither below 0, and the mean loss.
+    """
+    base, radiance = diffuse, seen.radiance
+    used = (~seen.saturated)[:, None].expand_as(response).float()
+    robust = torch.ones_like(response[..., 0])
+    for _ in range(3):
+        weight = robust[..., None] * seen.weight * used
+        aa, ab = (weight * base**2).sum(dim=1), (weight * base * response).sum(dim=1)
+        bb = (weight * response**2).sum(dim=1)
+        ay = (weight * base * radiance).sum(dim=1)
+        by = (weight * response * radiance).sum(dim=1)
+        ambient, directed = _non_negative(aa, ab, bb, ay, by)
+        error = seen.errors(ambient[:, None] * base + directed[:, None] * response)
+        used = (error != 0).float()
+        size = (seen.weight * error**2).sum(dim=-1).sqrt()
+        robust = cauchy_weights(size, torch.full_like(size[:1, :1], scale))
+    return ambient, directed, -robust.log().mean(dim=1)
+
+
+def _non_negative(
+    aa: Tensor, ab: Tensor, bb: Tensor, ay: Tensor, by: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Solve the normal equations of two unknowns, neither below 0."""
+    tiny = torch.finfo(aa.dtype).tiny
+    determinant = aa * bb - ab**2
+    sound = determinant > 1e-6 * aa * bb
+    determinant = torch.where(sound, determinant, 1)
+    first, second = (bb * ay - ab * by) / determinant, (aa * by - ab * ay) / determinant
+    alone, other = ay / aa.clamp_min(tiny), by / bb.clamp_min(tiny)
+    both = sound & (first >= 0) & (second >= 0)
+    # One of them is 0 at the best point that is allowed: the gain of each alone decides.
+    larger = ay * alone >= by * other
+    return (
+        torch.where(both, first, torch.where(larger, alone, 0)),
+        torch.where(both, second, torch.where(larger, 0, other)),
+    )
+
+
+# Directions that are tried first, some 12 degrees apart, and how many of them with cast shadows.
+_DIRECTIONS, _CANDIDATES = 300, 12
+# Pixels of a photograph that the first directions are tried on, and the last.
+_FEW, _MANY = 500, 2000
+# Radius over distance that is tried first, and at most: a light as near as a lamp is held.
+_CLOSENESS, _CLOSEST = (0.0, 0.25, 0.5), 0.7
+# Of direction, in radians, and of closeness: half the distance of the first directions, down to a
+# tenth of a degree.
+_COARSE, _FINE = (0.1, 0.1, 0.05, 0.05, 0.025, 0.025), (0.04, 0.02, 0.01, 0.005, 0.0025)
+
+
+def fit_lights(
+    mesh: Mesh,
+    scene: SparseScene,
+    silhouettes: Silhouettes | None = None,
+    materials: Materials | None = None,
+) -> ViewLights:
+    """Fit the light of every photograph of a scene.
+
+    Args:
+        mesh: In the scene's frame, with albedo.
+        silhouettes: Of the scene's views; by default the mesh's outline.
+    """
+    surface = LitSurface(mesh)
+    return lights_of(surface, observe_all(surface, scene, silhouettes), materials)
+
+
+def lights_of(
+    surface: LitSurface,
+    observed: Sequence[Observed],
+    materials: Materials | None = None,
+    start: ViewLights | None = None,
+) -> ViewLights:
+    """Fit the light of every photograph; see :func:`fit_lights`.
+
+    Args:
+        start: Lights nearby; by default the whole sphere is searched.
+    """
+    material = None if materials is None else materials.at_vertices()
+
+    def fit(view: int) -> ViewLights:
+        near = None if start is None else start.take([view])
+        return _fit(surface, observed[view], material, near)
+
+    fits = side_by_side(fit, range(len(observed)), tracked=False)
+    return ViewLights.cat(list(fits))
+
+
+def _fit(
+    surface: LitSurface,
+    seen: Observed,
+    material: Float[Tensor, "vertex 3"] | None,
+    start: ViewLights | None,
+) -> ViewLights:
+    """Fit the light of one photograph."""
+    if len(seen.radiance) == 0:
+        none = torch.zeros(1, seen.radiance.shape[1])
+        up = torch.tensor([[0.0, 0.0, 1.0]])
+        return ViewLights(direction_world=up, closeness=none[:, 0], ambient=none, directed=none)
+    few, many = seen.thinned(_FEW), seen.thinned(_MANY)
+    scale = loss_scale(few)
+
+    def rendered(
+        seen: Observed, lights: Float[Tensor, "light 4"], shadows: bool = True
+    ) -> tuple[Float[Tensor, "pixel channel"], Float[Tensor, "light pixel channel"]]:
+        own = None if material is None else material[seen.pixels.vertex]
+        light = surface.incidence(seen.pixels, lights[:, :3], lights[:, 3], shadows=shadows)
+        return diffuse_color(seen.pixels, own), response(seen.pixels, light, own)
+
+    def best(
+        seen: Observed, lights: Float[Tensor, "start light 4"], shadows: bool = True, most: int = 1
+    ) -> Float[Tensor, "start most 4"]:
+        """Return the best lights of every start, best first."""
+        losses = fit_strengths(seen, *rendered(seen, lights.flatten(0, 1), shadows), scale)[2]
+        loss = losses.reshape(lights.shape[:2])
+        order = loss.argsort(dim=1, stable=True)[:, :most]
+        return lights.gather(1, order[..., None].expand(-1, -1, 4))
+
+    lights = pad(even_directions(_DIRECTIONS).float(), (0, 1))
+    if start is not None:
+        lights = torch.cat([start.direction_world, start.closeness[:, None]], dim=1)
+    else:
+        far = best(few, lights[None], shadows=False, most=_CANDIDATES)[0]
+        starts = best(few, torch.stack([_with(far, one) for one in _CLOSENESS]))
+        for step in _COARSE:
+            starts = best(few, torch.stack([_neighbours(one[0], step) for one in starts]))
+        lights = best(many, starts.flatten(0, 1)[None])[0]
+    for step in _FINE:
+        lights = best(many, _neighbours(lights[0], step)[None])[0]
+    ambient, directed, _ = fit_strengths(many, *rendered(many, lights[:1]), scale)
+    direction_world, closeness = lights[:1, :3], lights[:1, 3]
+    return ViewLights(
+        direction_world=direction_world, closeness=closeness, ambient=ambient, directed=directed
+    )
+
+
+def _with(lights: Float[Tensor, "light 4"], closeness: float) -> Float[Tensor, "light 4"]:
+    return torch.cat([lights[:, :3], torch.full_like(lights[:, 3:], closeness)], dim=1)
+
+
+def _neighbours(light: Float[Tensor, " 4"], step: float) -> Float[Tensor, "11 4"]:
+    """Return a light, and others round it: ``step`` radians beside it, nearer and farther."""
+    direction = light[:3]
+    axis = torch.eye(3).to(direction)[direction.abs().argmin()]
+    first = normalize(torch.linalg.cross(direction, axis), dim=0)
+    second = torch.linalg.cross(direction, first)
+    angle = torch.arange(8, dtype=direction.dtype) * (torch.pi / 4)
+    around = angle.cos()[:, None] * first + angle.sin()[:, None] * second
+    beside = torch.cat([direction[None], normalize(direction + step * around, dim=1)])
+    beside = torch.cat([beside, light[3].expand(9, 1)], dim=1)
+    along = light.repeat(2, 1)
+    along[:, 3] = (light[3] + torch.tensor([-step, step])).clamp(0, _CLOSEST)
+    return torch.cat([beside, along])

@@ -1,0 +1,136 @@
+"""Prediction of photographs from a surface, its materials and a light, and the errors."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.records import (
+    Cameras,
+    Judged,
+    Materials,
+    Mesh,
+    Relighting,
+    Silhouettes,
+    SparseScene,
+    Textured,
+    ViewLights,
+)
+from pimper_torch.result.relighting.fit_lights import Observed, lights_of, observe_all
+from pimper_torch.result.relighting.fit_materials import materials_under
+from pimper_torch.result.relighting.lit_surface import (
+    LitSurface,
+    SurfacePixels,
+    TexturedSurface,
+    diffuse_color,
+    response,
+)
+from pimper_torch.runtime.stage import Stage
+
+
+def predict(
+    mesh: Mesh | LitSurface, camera: Cameras, light: ViewLights, materials: Materials | None = None
+) -> Float[Tensor, "height width channel"]:
+    """Return the linear radiance that a camera sees, with cast shadows; NaN beside the mesh.
+
+    Args:
+        mesh: With albedo; prepared where several pictures of it are wanted.
+    """
+    surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
+    pixels = surface.pixels(camera, 0)
+    width, height = (int(side) for side in camera.sizes_px[0])
+    radiance = shaded(surface, pixels, light, materials)
+    picture = torch.full((height * width, radiance.shape[1]), torch.nan)
+    picture[pixels.pixel] = radiance
+    return picture.reshape(height, width, -1)
+
+
+def shaded(
+    surface: LitSurface, pixels: SurfacePixels, light: ViewLights, materials: Materials | None
+) -> Float[Tensor, "pixel channel"]:
+    """Return the linear radiance of pixels."""
+    material = None if materials is None else materials.at_vertices()[pixels.vertex]
+    incidence = surface.incidence(pixels, light.direction_world, light.closeness)
+    lit = response(pixels, incidence, material)[0]
+    return light.ambient * diffuse_color(pixels, material) + light.directed * lit
+
+
+def psnr(
+    predicted: Float[Tensor, "pixel channel"], radiance: Float[Tensor, "pixel channel"]
+) -> float:
+    """Return the peak signal-to-noise ratio of sRGB values in [0, 1], in decibels.
+
+    Args:
+        predicted: Linear, clipped to [0, 1] as a photograph is; ``radiance`` likewise.
+    """
+    error = srgb_from_linear(predicted).double() - srgb_from_linear(radiance).double()
+    return float(-10 * error.square().mean().clamp_min(1e-12).log10())
+
+
+class Relight(Stage):
+    """Fit lights and materials to the photographs, and predict these, or others, with them."""
+
+    def forward(
+        self,
+        mesh: Mesh,
+        scene: SparseScene,
+        silhouettes: Silhouettes | None,
+        held_out: SparseScene | None = None,
+    ) -> Relighting:
+        """Fit and judge them.
+
+        Args:
+            mesh: In the scene's frame, with albedo.
+            held_out: What is predicted; without, the scene's own photographs.
+        """
+        surface = LitSurface(mesh)
+        observed = observe_all(surface, scene, silhouettes)
+        matte = lights_of(surface, observed)
+        materials = materials_under(surface, observed, matte)
+        lights = matte
+        if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
+            lights = lights_of(surface, observed, materials, matte)
+        if held_out is None:
+            names = scene.views.names
+            judged = judge(surface, observed, names, lights, materials)
+            plain = judge(surface, observed, names, matte)
+        else:
+            names, observed = held_out.views.names, observe_all(surface, held_out, None)
+            judged, plain = (
+                judge(surface, observed, names, lights_of(surface, observed, one), one)
+                for one in (materials, None)
+            )
+        return Relighting(
+            lights=lights,
+            materials=materials,
+            judged=judged,
+            matte=plain,
+            held_out=held_out is not None,
+        )
+
+
+def judge_textures(
+    relighting: Relighting, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
+) -> Relighting:
+    """Judge the textured surface, too, under the same lights."""
+    surface = TexturedSurface(asset)
+    observed = observe_all(surface, scene, silhouettes)
+    materials = surface.materials(relighting.materials)
+    judged = relighting.judged
+    found = judge(surface, observed, judged.names, judged.lights, materials)
+    return relighting.replace(textured=found)
+
+
+def judge(
+    surface: LitSurface,
+    observed: list[Observed],
+    names: tuple[str, ...],
+    lights: ViewLights,
+    materials: Materials | None = None,
+) -> Judged:
+    """Compare photographs with what the surface shows under lights."""
+    found = [
+        psnr(shaded(surface, seen.pixels, lights.take([view]), materials), seen.radiance)
+        for view, seen in enumerate(observed)
+    ]
+    return Judged(psnr_db=torch.tensor(found), lights=lights, names=names)

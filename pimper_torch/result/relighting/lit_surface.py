@@ -1,0 +1,247 @@
+r"""A surface with glTF materials: the pixels that show it, and its radiance under directed lights.
+
+The radiance is that of three.js's ``MeshPhysicalMaterial``. With base colour :math:`b`, metallic
+:math:`m`, roughness :math:`r` and specular :math:`s`,
+
+.. math:: (1 - m)\, b \cos\theta + \pi D_{r^2} V_{r^2} F \cos\theta, \quad
+    F = f_0 + (f_{90} - f_0) (1 - v \cdot h)^5
+
+with :math:`f_0 = 0.04 s (1 - m) + b m` and :math:`f_{90} = \min(s, 1) (1 - m) + m`. A white matte
+surface that faces a light of strength 1 has radiance 1: three.js's light is :math:`\pi` times as
+strong, directed and ambient. A specular above 1 is ``KHR_materials_specular``'s
+``specularColorFactor``, below 1 its ``specularFactor``.
+
+Source: Walter et al., EGSR 2007, for the distribution GGX; Heitz, JCGT 3(2), 2014, for Smith's
+masking with correlated heights.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d, normalize
+
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
+from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.records import Cameras, Materials, Mesh, Record, Textured
+from pimper_torch.result.asset.tangents import frames
+from pimper_torch.result.viz.maps import base_color
+
+
+def facet_density(
+    cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch"]:
+    """Return GGX's density of facets per solid angle.
+
+    Args:
+        cosine: Between a facet's normal and the surface's.
+        alpha: Width of the distribution; squared roughness.
+    """
+    spread = cosine**2 * (alpha**2 - 1) + 1
+    return alpha**2 / (torch.pi * spread**2)
+
+
+def masking(
+    to_light: Float[Tensor, "*#batch"],
+    to_eye: Float[Tensor, "*#batch"],
+    alpha: Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*batch"]:
+    """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
+
+    Args:
+        to_light: Cosine between light and normal, more than 0; ``to_eye`` likewise.
+    """
+    light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
+    eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()
+    return 0.5 / (light_side + eye_side)
+
+
+# Shadow rays start this far from the surface, as a fraction of its radius: beyond what
+# simplification moves it by, and short of what casts a shadow worth seeing.
+_LIFT = 0.004
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SurfacePixels(Record):
+    """The pixels of a view that show a surface.
+
+    Attributes:
+        pixel: Index into the raster, row by row.
+        points_world: Intersections of the rays through the pixels' centres.
+        normals_world: Unit, as the mesh has them.
+        to_eye: Unit, towards the camera.
+        vertex: The nearest vertex of the face that is met.
+        inner: False beside pixels that show something else, with which they are blended.
+    """
+
+    pixel: Int[Tensor, " pixel"]
+    points_world: Float[Tensor, "pixel 3"]
+    normals_world: Float[Tensor, "pixel 3"]
+    to_eye: Float[Tensor, "pixel 3"]
+    base_color: Float[Tensor, "pixel channel"]
+    vertex: Int[Tensor, " pixel"]
+    inner: Bool[Tensor, " pixel"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Incidence(Record):
+    """Visibility of the lights at the pixels of a view.
+
+    Attributes:
+        cosine: Between the normal and the light; 0 where the surface faces away or is shadowed.
+        irradiance: Of a light that has 1 at the surface's centre.
+    """
+
+    to_light: Float[Tensor, "light pixel 3"]
+    cosine: Float[Tensor, "light pixel"]
+    irradiance: Float[Tensor, "light pixel"]
+
+
+class LitSurface:
+    """A mesh prepared to be seen and to cast shadows; a constant to autograd, on the CPU."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        mesh = mesh.detach().to("cpu").to(torch.float32)
+        self.mesh = mesh
+        normals = mesh.normals_world
+        if normals is None:
+            normals = vertex_normals(mesh.vertices_world, mesh.faces)
+        self.normals_world = normals
+        self.base_color = base_color(mesh)
+        self._caster = RayCaster(mesh.vertices_world, mesh.faces)
+        low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
+        self.center_world = (low + high) / 2
+        self.radius = float((high - low).norm()) / 2
+
+    def pixels(self, cameras: Cameras, view: int) -> SurfacePixels:
+        """Return what a view shows."""
+        cameras = cameras.detach().to("cpu").to(torch.float32)
+        hits = cast_view(self._caster, cameras, view)
+        seen = hits.face >= 0
+        faces, met = self.mesh.faces, hits.take(seen)
+        points = met.interpolate(self.mesh.vertices_world, faces)
+        nearest = met.barycentric.argmax(dim=1, keepdim=True)
+        normals_world, base_color = self.appearance(met)
+        elsewhere = max_pool2d((~seen)[None].float(), 3, stride=1, padding=1)[0] > 0
+        return SurfacePixels(
+            pixel=seen.reshape(-1).nonzero()[:, 0],
+            points_world=points,
+            normals_world=normals_world,
+            to_eye=normalize(cameras.centers_world[view] - points, dim=-1),
+            base_color=base_color,
+            vertex=faces[met.face].gather(1, nearest)[:, 0],
+            inner=~elsewhere[seen],
+        )
+
+    def appearance(
+        self, met: Hits
+    ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel channel"]]:
+        """Return unit normals, world frame, and base colours where rays meet the mesh."""
+        faces = self.mesh.faces
+        normals = normalize(met.interpolate(self.normals_world, faces), dim=-1)
+        return normals, met.interpolate(self.base_color, faces)
+
+    def incidence(
+        self,
+        pixels: SurfacePixels,
+        directions: Float[Tensor, "light 3"],
+        closeness: Float[Tensor, " light"],
+        *,
+        shadows: bool = True,
+    ) -> "Incidence":
+        """Return the directions to lights at pixels, and the light that arrives.
+
+        Args:
+            directions: Unit, world, from the surface's centre.
+            closeness: The surface's radius over the light's distance; 0 for a light at infinity.
+            shadows: Whether the surface casts any; without, only back faces are dark.
+        """
+        offset = (pixels.points_world - self.center_world) / self.radius
+        toward = directions[:, None] - closeness[:, None, None] * offset
+        # No point is nearer to a light.
+        distance = toward.norm(dim=-1).clamp_min(0.1)
+        toward = toward / distance[..., None]
+        cosine = (toward * pixels.normals_world).sum(dim=-1).clamp_min(0)
+        if shadows:
+            light, pixel = (cosine > 0).nonzero(as_tuple=True)
+            along = toward[light, pixel]
+            lift = _LIFT * self.radius * (pixels.normals_world[pixel] + along)
+            reach = torch.full_like(lift[:, 0], torch.inf)
+            blocked = self._caster.blocked(pixels.points_world[pixel] + lift, along, reach)
+            cosine[light[blocked], pixel[blocked]] = 0
+        return Incidence(to_light=toward, cosine=cosine, irradiance=cosine / distance**2)
+
+
+DIELECTRIC = 0.04
+"""Reflectance of glTF's dielectric at normal incidence."""
+
+
+def diffuse_color(
+    pixels: SurfacePixels, material: Float[Tensor, "*batch pixel 3"] | None = None
+) -> Float[Tensor, "*batch pixel channel"]:
+    """Return the albedo of the matte part, which ambient light meets, too.
+
+    Args:
+        material: Metallic, roughness and specular; matte without.
+    """
+    return pixels.base_color if material is None else (1 - material[..., :1]) * pixels.base_color
+
+
+def response(
+    pixels: SurfacePixels, light: Incidence, material: Float[Tensor, "*batch pixel 3"] | None = None
+) -> Float[Tensor, "lit pixel channel"]:
+    """Return the radiance under directed lights of strength 1.
+
+    Args:
+        material: Metallic, roughness and specular; matte without.
+    """
+    if material is None:
+        return light.irradiance[..., None] * pixels.base_color
+    metallic, roughness, specular = material.unbind(dim=-1)
+    aligned = (light.to_light * pixels.to_eye).sum(dim=-1)
+    length = (2 + 2 * aligned).clamp_min(1e-6).sqrt()  # of the sum of both directions
+    to_eye = (pixels.normals_world * pixels.to_eye).sum(dim=1).clamp_min(1e-3)
+    alpha = roughness**2
+    density = facet_density(((light.cosine + to_eye) / length).clamp(0, 1), alpha)
+    highlight = torch.pi * density * masking(light.cosine, to_eye, alpha) * light.irradiance
+    grazing = (1 - (1 + aligned) / length).clamp(0, 1) ** 5
+    dielectric = (1 - metallic) * specular
+    head_on = (DIELECTRIC * dielectric)[..., None] + metallic[..., None] * pixels.base_color
+    edge = ((1 - metallic) * specular.clamp_max(1) + metallic)[..., None]
+    mirrored = head_on + (edge - head_on) * grazing[..., None]
+    matte = light.irradiance[..., None] * diffuse_color(pixels, material)
+    return matte + highlight[..., None] * mirrored
+
+
+class TexturedSurface(LitSurface):
+    """A mesh whose base colours and normals are those of textures, blended between texels."""
+
+    def __init__(self, asset: Textured) -> None:
+        super().__init__(asset.mesh.replace(normals_world=asset.normals))
+        self.asset = asset
+
+    def appearance(
+        self, met: Hits
+    ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel channel"]]:
+        """Return unit normals, world frame, and base colours where rays meet the mesh."""
+        asset, faces = self.asset, self.mesh.faces
+        uv = met.interpolate(asset.uv, faces)
+        axes = frames(met, asset.normals, asset.tangent, faces)
+        relative = 2 * _sampled(asset.normal, uv) - 1
+        normals = normalize((axes * relative[:, None]).sum(dim=-1), dim=-1)
+        return normals, linear_from_srgb(_sampled(asset.base_color, uv))
+
+    def materials(self, few: Materials) -> Materials:
+        """Return the materials of the copied vertices."""
+        return few.replace(cluster=few.cluster[self.asset.vertex])
+
+
+def _sampled(
+    texture: UInt8[Tensor, "height width 3"], uv: Float[Tensor, "pixel 2"]
+) -> Float[Tensor, "pixel 3"]:
+    values = texture.movedim(-1, 0)[None].float() / 255
+    grid = (2 * uv - 1)[None, None]
+    found = grid_sample(values, grid, padding_mode="border", align_corners=False)
+    return found[0, :, 0].mT

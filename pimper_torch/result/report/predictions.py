@@ -1,0 +1,173 @@
+"""Photographs as the surface explains them, small enough for a page."""
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from pimper_torch.ground.geometry.pixels import scale_intrinsics
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.records import (
+    Cameras,
+    Mesh,
+    Record,
+    Relighting,
+    Silhouettes,
+    SparseScene,
+    ViewLights,
+)
+from pimper_torch.result.relighting.held_out import predict
+from pimper_torch.result.relighting.lit_surface import LitSurface
+from pimper_torch.runtime.mapped import drop_pages
+from pimper_torch.runtime.parallel import side_by_side
+
+# The demo's 24 photographs and their predictions take 1.1 MB of its page; more photographs share
+# the room that so many take. Fewer pixels than the least show nothing.
+_LONGEST_PX, _SHORTEST_PX, _VIEWS = 800, 120, 24
+
+
+def longest_px(num_views: int) -> int:
+    """Return the longer side of every photograph in a page of so many."""
+    return round(max(_SHORTEST_PX, _LONGEST_PX * min(1.0, math.sqrt(_VIEWS / num_views))))
+
+
+def shrunk(
+    picture: Float[Tensor, "channel height width"], longest: int
+) -> Float[Tensor, "channel shorter narrower"]:
+    """Average a picture down until its longer side is ``longest`` pixels; small ones stay."""
+    height, width = picture.shape[-2:]
+    factor = min(1.0, longest / max(height, width))
+    size = (max(1, round(factor * height)), max(1, round(factor * width)))
+    return interpolate(picture[None], size=size, mode="area")[0]
+
+
+def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
+    """Return a picture of linear radiance, cut off at 1, as a data address of a JPEG."""
+    colors = to_bytes(radiance.detach().cpu().clamp(0, 1).movedim(0, -1)).expand(-1, -1, 3)
+    file = BytesIO()
+    Image.fromarray(colors.numpy()).save(file, "JPEG", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+
+
+def outline(inside: Float[Tensor, "height width"], scale: float) -> str:
+    """Trace the border of a silhouette as a path of SVG.
+
+    Args:
+        scale: Pixels of the photograph to one of ``inside``.
+    """
+    # Local: scipy's image functions take long to import.
+    from skimage.measure import approximate_polygon, find_contours
+
+    values = inside.detach().float().cpu().numpy()
+    lines = [approximate_polygon(line, 0.7) for line in find_contours(values, 0.5)]
+    return "".join(
+        "M" + "L".join(f"{scale * (x + 0.5):.0f} {scale * (y + 0.5):.0f}" for y, x in line)
+        for line in lines
+        if len(line) > 2
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Prediction(Record):
+    """A photograph as the surface explains it.
+
+    Attributes:
+        radiance: Linear, under the photograph's fitted light; zero off the surface.
+        figure: What the prediction is worth, in a few words.
+    """
+
+    radiance: Float[Tensor, "channel height width"]
+    light: ViewLights
+    figure: str = ""
+
+
+def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[Prediction]:
+    """Predict every photograph of a scene under its fitted light.
+
+    Args:
+        mesh: In the scene's frame, with albedo.
+    """
+    surface, judged = LitSurface(mesh), relighting.judged
+    longest = longest_px(scene.views.num_views) // 2  # rays are what they cost
+    worth = dict(zip(judged.names, judged.psnr_db.tolist(), strict=True))
+
+    def one(view: int) -> Prediction:
+        light, camera = relighting.lights.take([view]), scene.cameras.take([view])
+        seen = predict(surface, _smaller(camera, longest), light, relighting.materials)
+        decibels = worth.get(scene.views.names[view], torch.nan)
+        return Prediction(
+            radiance=seen.nan_to_num(0).movedim(-1, 0),
+            light=light,
+            figure=f"{decibels:.1f} dB" if decibels == decibels else "",
+        )
+
+    return list(side_by_side(one, range(scene.views.num_views), tracked=False))
+
+
+def _smaller(camera: Cameras, longest: int) -> Cameras:
+    """Return a camera whose picture is at most ``longest`` pixels wide and high."""
+    width, height = (int(side) for side in camera.sizes_px[0])
+    factor = min(1.0, longest / max(width, height))
+    sides = [max(1, round(factor * side)) for side in (width, height)]
+    return Cameras(
+        intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
+        cam_from_world=camera.cam_from_world,
+        sizes_px=torch.tensor([sides]),
+    )
+
+
+Json = dict[str, object]
+
+
+def view_entries(
+    scene: SparseScene, silhouettes: Silhouettes, predictions: Sequence[Prediction | None]
+) -> list[Json]:
+    """List the photographs with their pinholes, pictures, silhouettes and lights.
+
+    Args:
+        predictions: One a view, ``None`` where there is none.
+    """
+    longest = longest_px(scene.views.num_views)
+    cameras, entries = scene.cameras.to("cpu"), []
+    for view, (name, predicted) in enumerate(zip(scene.views.names, predictions, strict=True)):
+        width, height = (int(side) for side in cameras.sizes_px[view])
+        intrinsics = cameras.intrinsics[view]
+        entry: Json = {
+            "name": name,
+            "width": width,
+            "height": height,
+            "focal": [float(intrinsics[0, 0]), float(intrinsics[1, 1])],
+            "centre": [float(intrinsics[0, 2]), float(intrinsics[1, 2])],
+            "pose": cameras.cam_from_world[view].double().flatten().tolist(),
+            "reliable": bool(silhouettes.reliable[view]),
+            "photo": jpeg(shrunk(scene.views.images[view, :, :height, :width], longest)),
+        }
+        if silhouettes.source != "everything":
+            small = shrunk(silhouettes.inside[view, :height, :width][None], longest)[0]
+            entry["outline"] = outline(small, width / small.shape[1])
+        if predicted is not None:
+            entry |= {"light": _light(predicted.light), "figure": predicted.figure}
+            entry["prediction"] = jpeg(shrunk(predicted.radiance, longest))
+        entries.append(entry)
+        drop_pages()
+    return entries
+
+
+def _light(light: ViewLights) -> Json:
+    return {
+        "direction": light.direction_world[0].tolist(),
+        "closeness": float(light.closeness[0]),
+        "directed": _three(light.directed[0]),
+        "ambient": _three(light.ambient[0]),
+    }
+
+
+def _three(values: Float[Tensor, " channel"]) -> list[float]:
+    return values.expand(3).tolist()

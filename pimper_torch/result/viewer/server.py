@@ -1,0 +1,79 @@
+"""A web server for one process, of viser, an extra.
+
+Loads nothing, so that a command refuses at once where viser is missing.
+"""
+
+import ipaddress
+import socket
+from contextlib import redirect_stdout
+from importlib.util import find_spec
+from io import StringIO
+from typing import TYPE_CHECKING
+
+from pimper_torch.runtime.config import require
+from pimper_torch.runtime.errors import ConfigError, caution
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+HOST, PORT = "127.0.0.1", 8080
+
+
+def require_viser() -> None:
+    """Refuse to go on without viser."""
+    if find_spec("viser") is None:
+        raise ConfigError(
+            "the viewer needs viser, which is not installed: pip install 'pimper_torch[view]'."
+        )
+
+
+def open_server(host: str = HOST, port: int = PORT) -> "ViserServer":
+    """Open a server; where the port is taken, on the next free one.
+
+    Args:
+        host: An address of this machine. A warning tells where others reach it.
+        port: 0 takes any free one.
+
+    Raises:
+        ConfigError: viser is missing, or there is no such address or port.
+    """
+    require_viser()
+    require(0 <= port <= 65_535, "port", port, "0 to 65535")
+    _require_own(host)
+    from viser import ViserServer
+
+    with redirect_stdout(StringIO()):
+        server = ViserServer(host=host, port=port, label="pimper_torch", verbose=False)
+    # Any page in the browser could ask for a tunnel through viser's servers.
+    server.request_share_url = lambda *_, **__: None
+    return server
+
+
+def close_server(server: "ViserServer") -> None:
+    """Close a server with all its connections."""
+    with redirect_stdout(StringIO()):
+        server.stop()
+
+
+def address(server: "ViserServer") -> str:
+    """Return the address that a browser opens."""
+    host = server.get_host()
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+
+
+def _require_own(host: str) -> None:
+    """Refuse an address that is not this machine's; viser would try it for ever."""
+    try:
+        family, _, _, _, place = socket.getaddrinfo(host or "?", 0, type=socket.SOCK_STREAM)[0]
+        socket.create_server((host, 0), family=family).close()
+    except OSError as error:
+        raise ConfigError(
+            f"host is {host!r}, which cannot be bound ({error.strerror}); needed: an address of "
+            f"this machine, such as {HOST}."
+        ) from error
+    if not ipaddress.ip_address(place[0]).is_loopback:
+        caution(
+            f"host is {host}: whoever reaches this machine can see the photographs and the "
+            f"surface. {HOST} keeps the viewer to yourself.",
+            stacklevel=3,
+        )

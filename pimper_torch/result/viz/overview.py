@@ -1,0 +1,230 @@
+"""The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d
+
+from pimper_torch.ground.geometry.poisson import reduced
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.radiometry import srgb_from_linear, to_bytes
+from pimper_torch.records import (
+    Cameras,
+    CoarseMesh,
+    Reconstruction,
+    Silhouettes,
+    SparseScene,
+    Views,
+)
+from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
+from pimper_torch.result.viz.render import bounding_box, crop, frame, rotation, shade
+from pimper_torch.result.viz.tiles import (
+    TALLEST,
+    Picture,
+    Tile,
+    array,
+    encoded,
+    fitted,
+    sheet,
+    with_color,
+    with_triangles,
+)
+from pimper_torch.runtime.mapped import drop_pages
+
+_ACROSS, _PANEL_PX = 4, 390
+_FACETS = "#ffd24a"
+_THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
+
+
+def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PANEL_PX) -> None:
+    """Draw the contact sheet of a run as PNG.
+
+    Shown in the reference view, cropped to the object: the photograph, the facets over it
+    and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
+    and that again from 40 degrees to the left and to the right. Where silhouettes are known they
+    are drawn over the photograph, and below over small photographs of all views, or of 64 where
+    there are more, red where a view is not trusted.
+    """
+    shown = tiles(result, panel_px)
+    rows = [shown[first : first + _ACROSS] for first in range(0, len(shown), _ACROSS)]
+    if result.silhouettes.source != "everything":
+        rows.append([_all_views(result, _ACROSS * panel_px)])
+    sheet(rows, panel_px, headline(result)).save(path, compress_level=3)
+
+
+def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
+    """Make the pictures of the contact sheet."""
+    reference = result.coarse.reference
+    own = result.cameras.take([reference])
+    shape = reduced(result.mesh, 200_000)  # more than a panel has pixels to show
+    vertices = result.mesh.vertices_world
+    camera = _framed(own, vertices, panel_px)
+    name = result.scene.views.names[reference]
+    photograph, outlined, corners = _photograph(result, own, panel_px)
+    maps = view_maps(result.mesh, camera, 0)
+    center = vertices.mean(dim=0)
+    sides = [_framed(rotation(own, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
+    coarse = result.coarse.mesh
+    shown = {
+        f"photograph {name}": outlined,
+        f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points": with_triangles(
+            0.45 * photograph, corners, _FACETS
+        ),
+        "facets, shaded": array(shade(coarse, camera, flat=True)),
+        "surface, shaded": array(shade(shape, camera)),
+        "normals": array(normal_colors(maps.normals_cam)),
+        "albedo": encoded(albedo_scale(result.mesh) * maps.albedo),
+        "surface from 40° left": array(shade(shape, sides[0])),
+        "surface from 40° right": array(shade(shape, sides[1])),
+    }
+    return [Tile(title=title, picture=picture) for title, picture in shown.items()]
+
+
+def _all_views(result: Reconstruction, width_px: int) -> Tile:
+    """Show photographs with their silhouettes: of many a selection, those not trusted first."""
+    silhouettes = result.silhouettes
+    shown = _selected(silhouettes.reliable.cpu())
+    small = thumbnails(
+        result.scene.views, silhouettes, shown, width_px=width_px, across=_THUMBNAILS_ACROSS
+    )
+    origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
+    count = len(silhouettes.reliable)
+    title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"
+    if len(shown) < count:
+        title += f", {len(shown)} shown"
+    return Tile(title=title, picture=array(small), wide=True)
+
+
+def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
+    """Return the views that are shown, in order: of those that are trusted evenly many."""
+    most = _THUMBNAILS_ACROSS * _THUMBNAILS_DOWN
+    doubted = (~reliable).nonzero()[:most, 0]
+    trusted = reliable.nonzero()[:, 0]
+    room = min(len(trusted), most - len(doubted))
+    even = torch.linspace(0, max(0, len(trusted) - 1), room).round().long()
+    return torch.cat([doubted, trusted[even]]).sort().values.tolist()
+
+
+def _framed(camera: Cameras, vertices: Float[Tensor, "vertex 3"], width_px: int) -> Cameras:
+    """Crop a camera's picture to the object, at the size that its panel has on the sheet."""
+    low, high = bounding_box(camera, vertices, 0.05)
+    width, height = (high - low).tolist()
+    return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), TALLEST)))
+
+
+def headline(result: Reconstruction) -> str:
+    """State in a line what went in and what came out."""
+    taken = result.scene.views.num_views
+    given = taken + len(result.scene.unregistered)
+    seconds = sum(report.seconds for report in result.report)
+    doubtful = " (cameras doubtful)" if result.scene.doubt else ""
+    return (
+        f"{taken} of {given} photographs{doubtful}, {len(result.coarse.mesh.faces)} facets, "
+        f"{len(result.mesh.vertices_world):,} vertices, {seconds:.0f} s"
+    )
+
+
+def _photograph(
+    result: Reconstruction, own: Cameras, panel_px: int
+) -> tuple[Picture, Picture, Float[Tensor, "facet 3 2"]]:
+    """Crop the reference photograph to the object.
+
+    Returns:
+        The picture, the same with the silhouette drawn over it, and the facets' corners in it,
+        pixels.
+    """
+    reference = result.coarse.reference
+    width, height = (int(side) for side in own.sizes_px[0])
+    low, high = bounding_box(own, result.mesh.vertices_world, 0.05)
+    left, top = (max(0, int(corner)) for corner in low.floor())
+    right, bottom = (int(corner) for corner in high.ceil())
+    box = slice(top, min(bottom, height)), slice(left, min(right, width))
+    image = encoded(result.scene.views.images[reference][:, *box].movedim(0, -1))
+    photograph = outlined = fitted(image, panel_px)
+    if result.silhouettes.source != "everything":
+        inside = array(result.silhouettes.inside[reference][box])[..., None]
+        drawn = torch.from_numpy(fitted(inside.repeat(3, axis=-1), panel_px)[..., 0] > 0.5)
+        outlined = with_color(photograph, border(drawn), RELIABLE)
+    coarse = result.coarse.mesh
+    pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
+    corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]
+    return photograph, outlined, corners * (photograph.shape[1] / image.shape[1])
+
+
+RELIABLE, DOUBTED = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
+
+
+def thumbnails(
+    views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int
+) -> Float[Tensor, "height width 3"]:
+    """Tile small photographs of some views, each with its silhouette as a line of one pixel.
+
+    Args:
+        silhouettes: Of the same views. Lines are yellow, and red where a view is not trusted.
+        shown: Views, in the order of the tiles.
+
+    Returns:
+        sRGB in [0, 1]; tiles that are left over are white.
+    """
+    height, width = views.images.shape[-2:]
+    wide = max(1, width_px // across)
+    high = max(1, round(wide * height / width))
+    rows = -(-len(shown) // across)
+    sheet = torch.ones(rows * high, across * wide, 3)
+    for place, view in enumerate(shown):
+        image = adaptive_avg_pool2d(views.images[view].detach().cpu(), (high, wide))
+        inside = adaptive_avg_pool2d(silhouettes.inside[view].cpu()[None], (high, wide))[0]
+        tile = srgb_from_linear(image.clamp(0, 1)).expand(3, -1, -1).movedim(0, -1).clone()
+        tile[border(inside > 0.5)] = tile.new_tensor(
+            RELIABLE if silhouettes.reliable[view] else DOUBTED
+        )
+        top, left = place // across * high, place % across * wide
+        sheet[top : top + high, left : left + wide] = tile
+        drop_pages()
+    return sheet
+
+
+def border(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Find pixels of the mask next to others; the picture's edge is no border."""
+    beside = max_pool2d((~mask)[None].float(), kernel_size=3, stride=1, padding=1)[0] > 0
+    return mask & beside
+
+
+_SIDES_DEG = (0.0, -40.0, 40.0)
+
+
+@torch.no_grad()
+def draw_preview(
+    scene: SparseScene, coarse: CoarseMesh, path: Path | str, panel_px: int = 360
+) -> None:
+    """Draw the reference photograph, and the coarse surface from there, left and right, as PNG.
+
+    Args:
+        path: A former file is replaced when the new one is complete.
+        panel_px: Longer side of a picture of the surface, and height of the photograph.
+    """
+    path = Path(path)
+    own = scene.cameras.take([coarse.reference]).to("cpu")
+    mesh = coarse.mesh.to("cpu")
+    width, height = own.sizes_px[0].tolist()
+    image = scene.views.images[coarse.reference, :, :height, :width].cpu()[None]
+    size = (panel_px, max(1, round(panel_px * width / height)))
+    photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
+    center = mesh.vertices_world.mean(dim=0)
+    panels = [Image.fromarray(to_bytes(photograph.expand(*size, 3)).numpy())]
+    for angle in _SIDES_DEG:
+        camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, 0.05)
+        drawn = (255 * shade(mesh, camera)).round().to(torch.uint8)
+        panels.append(Image.fromarray(drawn.numpy()))
+    sheet = Image.new("RGB", (sum(one.width for one in panels), panel_px), "white")
+    left = 0
+    for panel in panels:
+        sheet.paste(panel, (left, (panel_px - panel.height) // 2))
+        left += panel.width
+    fresh = path.with_name(f"{path.name}.new")
+    sheet.save(fresh, format="PNG")
+    fresh.replace(path)

@@ -1,0 +1,118 @@
+"""A turning picture of a surface: a loop that browsers and file managers play."""
+
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, normalize
+
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.rigid import rotate
+from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
+from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.records import Cameras, Mesh
+from pimper_torch.result.viz.maps import albedo_scale
+from pimper_torch.result.viz.render import lambertian, tone
+from pimper_torch.runtime.parallel import side_by_side
+
+# Choices: a turn in three seconds, seen from a little above, in 0.2 MB.
+_FRAMES, _FRAME_MS = 30, 100
+_OVERSAMPLING = 2
+_ELEVATION_DEG, _FOV_DEG, _MARGIN = 15.0, 30.0, 1.03
+_QUALITY, _EXPOSURE = 70, 1.4  # the latter takes albedo under the raking light to its own tones
+
+
+def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
+    """Return the direction that pictures call up: y, unless photographs were held otherwise.
+
+    The frame has y up where a plane or level cameras told it; where they did not, up is that of
+    the photographs on average.
+    """
+    mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
+    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean
+
+
+@torch.no_grad()
+def draw_turn(
+    mesh: Mesh, cameras: Cameras, reference: int, path: Path | str, side_px: int = 280
+) -> None:
+    """Draw a surface turning once round, its shape on the left and its albedo lit on the right.
+
+    An animated WebP with a transparent ground. The light stays beside the viewer.
+
+    Args:
+        cameras: Of the photographs, which tell where up is.
+        reference: View whose side of the surface is seen first.
+    """
+    mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
+    caster = RayCaster(mesh.vertices_world, mesh.faces)
+    circle = circling(
+        mesh, up_world(cameras), cameras.centers_world[reference], _FRAMES, side_px * _OVERSAMPLING
+    )
+    normals = vertex_normals(mesh.vertices_world, mesh.faces)
+    colors = torch.full_like(normals, 0.5) if mesh.albedo is None else mesh.albedo
+    colors = albedo_scale(mesh) * colors.expand(-1, 3)
+    look = torch.cat([normals, colors], dim=1)
+
+    def drawn(view: int) -> Image.Image:
+        return _drawn(cast_view(caster, circle, view), look, mesh, circle.cam_from_world[view])
+
+    frames = list(side_by_side(drawn, range(_FRAMES), tracked=False))
+    frames[0].save(
+        path,
+        "WEBP",
+        save_all=True,
+        append_images=frames[1:],
+        duration=_FRAME_MS,
+        loop=0,
+        quality=_QUALITY,
+        method=2,
+    )
+
+
+def circling(
+    mesh: Mesh, up: Float[Tensor, " 3"], start: Float[Tensor, " 3"], number: int, side_px: int
+) -> Cameras:
+    """Return square pinholes that look at a mesh from a circle round it.
+
+    Args:
+        up: Unit, world frame.
+        start: Place above or below which the first one stands, world.
+        number: Of cameras, equally far apart.
+    """
+    low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
+    center = (low + high) / 2
+    radius = float((mesh.vertices_world - center).norm(dim=1).max())
+    ahead = start - center
+    ahead = normalize(ahead - (ahead @ up) * up, dim=0)
+    beside = torch.linalg.cross(up, ahead)
+    elevation = math.radians(_ELEVATION_DEG)
+    angles = torch.arange(number).to(up) * (2 * math.pi / number)
+    level = angles.cos()[:, None] * ahead + angles.sin()[:, None] * beside
+    half = math.radians(_FOV_DEG) / 2
+    back = math.cos(elevation) * level + math.sin(elevation) * up
+    eyes = center + _MARGIN * radius / math.sin(half) * back
+    focal_px = side_px / 2 / math.tan(half)
+    return pinholes(look_at(eyes, center, up), focal_px, side_px, side_px)
+
+
+def _drawn(hits: Hits, look: Float[Tensor, "vertex 6"], mesh: Mesh, pose: Tensor) -> Image.Image:
+    """Draw the shape and the lit albedo side by side, averaged over the pixels' parts.
+
+    Args:
+        look: Normal and albedo of every vertex.
+    """
+    values, seen = hits.interpolate(look, mesh.faces), (hits.face >= 0)[..., None].float()
+    shading = lambertian(normalize(rotate(pose, values[..., :3]), dim=-1))[..., None]
+    lit = srgb_from_linear((_EXPOSURE * shading * values[..., 3:]).clamp(0, 1))
+    both = torch.cat([tone(shading).expand_as(lit), lit], dim=1)
+    opacity = torch.cat([seen, seen], dim=1)
+    layers = torch.cat([opacity * both, opacity], dim=-1).movedim(-1, 0)
+    colors = avg_pool2d(layers, _OVERSAMPLING).movedim(0, -1)
+    opacity = colors[..., 3:]
+    picture = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
+    return Image.fromarray((255 * picture).round().to(torch.uint8).numpy())

@@ -1,0 +1,225 @@
+"""One bad patch, view or solver does not end a run: it is left out, and told at the end.
+
+Only what data can cause is left out: numbers that are not finite, matrices that are singular, and
+input of one part that cannot be used. Other errors are mistakes in a program, or a lack of memory,
+and end the run.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import groupby
+from typing import Literal, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from pimper_torch.records.failure import Failure, LeftOut
+from pimper_torch.records.record import Record
+from pimper_torch.runtime.errors import (
+    InputError,
+    NumericalError,
+    OutOfMemoryError,
+    ReconstructionError,
+    caution,
+)
+from pimper_torch.runtime.journal import current, writing
+
+OnFailure = Literal["skip", "fail"]
+Result = TypeVar("Result")
+AnyRecord = TypeVar("AnyRecord", bound=Record)
+
+# What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
+
+# Torch's own name for it is not typed.
+_LinAlgError: type[Exception] = getattr(torch.linalg, "LinAlgError")  # noqa: B009
+
+
+@contextmanager
+def collecting(
+    on_failure: OnFailure = "skip", events: list[object] | None = None
+) -> Iterator[list[object]]:
+    """Collect what is told inside the ``with`` block: what is skipped, left out, and so on.
+
+    Where the block ends in an error, what was skipped before is told first.
+
+    Args:
+        on_failure: ``"fail"`` refuses instead of skipping.
+        events: Those so far, which more are added to.
+
+    Yields:
+        The events so far, for :func:`warn_of` at the end.
+
+    Raises:
+        OutOfMemoryError: In place of an error of memory.
+    """
+    outer, events = current(), [] if events is None else events
+    before, fail = len(events), on_failure == "fail"
+    try:
+        with writing(replace(outer, events=events, collects=True, fail=fail)):
+            yield events
+    except BaseException as error:
+        warn_of(events)
+        if out_of_memory(error):
+            raise OutOfMemoryError(
+                f"Memory did not suffice: {reason_of(error)}. "
+                "Shrink the photographs (`--max-size-px`), take fewer samples "
+                "(`decompose.samples_per_pixel`), or close other programs."
+            ) from error
+        raise
+    for event in events[before:]:
+        if not isinstance(event, Failure | LeftOut):
+            outer.tell(event)
+
+
+def skipped(*failures: Failure, error: BaseException | None = None) -> None:
+    """Note what failed and was left out; outside of :func:`collecting`, warn of it at once.
+
+    Raises:
+        ReconstructionError: Failures are to end the run.
+    """
+    journal = current()
+    if failures and journal.fail:
+        first = failures[0]
+        raise ReconstructionError(
+            f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures are to end "
+            f"the run (`on_failure` is fail); with skip it goes on: {first.done}."
+        ) from error
+    if not journal.collects:
+        warn_of(failures)
+        return
+    for failure in failures:
+        journal.tell(failure)
+
+
+def skipped_patches(
+    stage: str, facets: Int[torch.Tensor, " patch"], reason: str, done: str
+) -> None:
+    """Note patches that were left out; see :func:`skipped`."""
+    skipped(
+        *(
+            Failure(stage=stage, what="patch", name=str(facet), reason=reason, done=done)
+            for facet in facets.tolist()
+        )
+    )
+
+
+def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:
+    """List each failure once, in an order that threads do not change."""
+    return tuple(sorted({one for one in entries if isinstance(one, Failure)}, key=_order))
+
+
+def warn_of(entries: Sequence[object]) -> None:
+    """Warn once of each kind of failure, with how many there are and the first of them."""
+    for (stage, what, done), some in groupby(distinct(entries), key=_kind):
+        kind = list(some)
+        names = list(dict.fromkeys(failure.name for failure in kind))
+        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        caution(
+            f"{stage}: {len(names)} failed ({what} {listed}): {kind[0].reason}. {done}. "
+            "`failures` in summary.json lists all; `--on-failure fail` ends the run instead.",
+            stacklevel=3,
+        )
+
+
+def solved_or(
+    solve: Callable[[], Result],
+    otherwise: Callable[[], Result],
+    *,
+    stage: str,
+    name: str,
+    done: str,
+) -> Result:
+    """Solve, or give something else where equations have no solution.
+
+    Args:
+        otherwise: Gives what stands in for the solution.
+    """
+    try:
+        return solve()
+    except Exception as error:
+        if not by_data(error):
+            raise
+        reason = reason_of(error)
+        failure = Failure(stage=stage, what="solver", name=name, reason=reason, done=done)
+        skipped(failure, error=error)
+    return otherwise()
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Return whether an allocation failed."""
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
+
+
+def by_data(error: BaseException) -> bool:
+    """Return whether numbers may have caused an error, rather than a mistake in a program.
+
+    >>> by_data(torch.linalg.LinAlgError("singular")), by_data(KeyError("lights"))
+    (True, False)
+    """
+    numeric = (ArithmeticError, np.linalg.LinAlgError, InputError, NumericalError)
+    # Torch's kernels raise RuntimeError itself; its subclasses but one are of other kinds.
+    of_torch = type(error) in (RuntimeError, _LinAlgError) and not out_of_memory(error)
+    return isinstance(error, numeric) or of_torch
+
+
+def reason_of(error: BaseException) -> str:
+    """Return an error in a line."""
+    text = " ".join(str(error).split()).rstrip(".")
+    return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
+
+
+def over_patches(
+    work: Callable[[slice], AnyRecord],
+    facets: Sequence[int] | torch.Tensor,
+    stage: str,
+    lost: Callable[[slice], AnyRecord],
+    done: str,
+) -> AnyRecord:
+    """Work on a batch of patches; where it fails as a whole, on each of them by itself.
+
+    So a patch that cannot be worked on is found and left out. Patches must be independent; those of
+    a batch that failed are as in a whole one, up to rounding.
+
+    Args:
+        work: Called with a range of patches; gives their record.
+        lost: Gives the record of a patch that failed.
+        done: What that means, for the warning.
+
+    Raises:
+        BaseException: What no data can cause, or all of several patches failed with.
+    """
+    try:
+        return work(slice(0, len(facets)))
+    except Exception as error:
+        if not by_data(error) or len(facets) == 0:
+            raise
+        first = error
+    parts, failures = [], []
+    for index in range(len(facets)):
+        alone = slice(index, index + 1)
+        try:
+            parts.append(work(alone))
+        except Exception as error:
+            if not by_data(error):
+                raise
+            parts.append(lost(alone))
+            name, reason = str(int(facets[index])), reason_of(error)
+            failures.append(Failure(stage=stage, what="patch", name=name, reason=reason, done=done))
+    if len(failures) == len(facets) > 1:
+        raise first
+    skipped(*failures, error=first)
+    return type(parts[0]).cat(parts)
+
+
+def _kind(failure: Failure) -> tuple[str, str, str]:
+    return failure.stage, failure.what, failure.done
+
+
+def _order(failure: Failure) -> tuple[object, ...]:
+    number = int(failure.name) if failure.name.isdigit() else -1
+    return (*_kind(failure), number, failure.name, failure.reason)
