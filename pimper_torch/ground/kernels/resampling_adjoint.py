@@ -48,8 +48,8 @@ def pull_back(
     """Compute derivatives by pictures and geometry from those by the samples.
 
     Args:
-        valid: Samples that count, as :func:`~pimper_torch.ground.kernels.resampling.register` finds
-        them.
+        valid: Samples that count, as ``register`` of :mod:`pimper_torch.ground.kernels.resampling`
+            finds them.
         on_pixels: Whether derivatives by pictures are wanted, 1 or 0.
         found: Added to.
     """

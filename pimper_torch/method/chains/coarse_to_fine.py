@@ -98,7 +98,7 @@ class CoarseToFineConfig:
         hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
         scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
         photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-        ``encoding``.
+            ``encoding``.
     """
 
     chain: ClassVar[str] = "coarse-to-fine"

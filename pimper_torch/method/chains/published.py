@@ -52,7 +52,7 @@ class PublishedConfig:
         chain: Which chain these are the settings of.
         on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
         photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-        ``encoding``.
+            ``encoding``.
     """
 
     chain: ClassVar[str] = "published"
