@@ -1,7 +1,7 @@
 """What the method does on each patch by itself: samples, normals under the light, and heights."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pimper_torch.ground.geometry.pyramids import Sources
 from pimper_torch.method.photometry.fit_light import Illumination
@@ -23,6 +23,7 @@ from pimper_torch.runtime.stage import Stage
 Factorizing = Callable[[PatchViews, Illumination], PhotometricPatches]
 
 
+@runtime_checkable
 class Warping(Protocol):
     """A stage that resamples all views on templates."""
 
@@ -32,6 +33,7 @@ class Warping(Protocol):
         """Return the samples J of every patch, and which of them are missing."""
 
 
+@runtime_checkable
 class Sweeping(Protocol):
     """A stage that finds heights under the fitted light."""
 
