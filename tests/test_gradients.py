@@ -73,7 +73,7 @@ def test_stages_of_the_published_chain_agree_with_finite_differences(published, 
 @pytest.mark.parametrize("loss", ["squares", "cauchy"])
 def test_factorization_agrees_with_finite_differences(light, loss, generator):
     few = small_scene(num_views=5, width=32, num_points=6)
-    chain = in_iterations(factorize={"light": light, "loss": loss})
+    chain = in_iterations(light={"model": light}, factorize={"loss": loss})
     found = probes(chain, *few)["factorize"].check(generator, directions=1)
     assert_agree("factorize", found, STAGE)
 

@@ -11,6 +11,7 @@ from typing import TypeVar, TypeVarTuple
 from torch.utils.checkpoint import checkpoint
 
 from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.geometry.visibility import forget_casters
 from pimper_torch.records import PatchSet
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
@@ -111,6 +112,7 @@ def release_memory() -> None:
     again, and patches before the fusion some 200, which would add to what comes after.
     """
     drop_pages()
+    forget_casters()
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 

@@ -164,13 +164,19 @@ _preparing = Lock()
 
 
 def ray_caster(mesh: Mesh) -> RayCaster:
-    """Return a mesh prepared for ray casting, once as long as it lives."""
+    """Return a mesh prepared for ray casting, once until :func:`forget_casters` or its end."""
     with _preparing:
         faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]
         if faces is not mesh.faces:
             caster = RayCaster(mesh.vertices_world, mesh.faces)
             _prepared[mesh.vertices_world] = mesh.faces, caster
         return caster
+
+
+def forget_casters() -> None:
+    """Let meshes be prepared anew: that of a last pass's surface takes some 200 MB."""
+    with _preparing:
+        _prepared.clear()
 
 
 def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
