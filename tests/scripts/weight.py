@@ -28,7 +28,7 @@ LINES = {
     "doors/outputs": 588,
     "doors/size": 1093,
     "ground": 1,
-    "ground/geometry": 3645,
+    "ground/geometry": 3644,
     "ground/kernels": 5091,
     "ground/linalg": 1599,
     "ground/radiometry": 506,

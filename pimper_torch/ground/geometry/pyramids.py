@@ -347,15 +347,11 @@ def _lights_of(views: Views) -> LightPrior | None:
         return None
     lights = given.lights.new_zeros(views.num_views, 4)
     variance = torch.full_like(lights[:, 0], torch.inf)
-    there = [index for index, name in enumerate(given.names) if name in views.names]
-    view = torch.tensor([views.names.index(given.names[index]) for index in there]).to(
-        lights.device
-    )
-    return given.replace(
-        lights=lights.index_copy(0, view.long(), given.lights[there]),
-        variance=variance.index_copy(0, view.long(), given.variance[there]),
-        names=views.names,
-    )
+    for light, error, name in zip(given.lights, given.variance, given.names, strict=True):
+        if name in views.names:
+            view = views.names.index(name)
+            lights[view], variance[view] = light, error
+    return given.replace(lights=lights, variance=variance, names=views.names)
 
 
 def _one(
@@ -395,7 +391,6 @@ def _one(
 
 
 def _sizes(height: int, width: int, levels: int) -> tuple[tuple[int, int], ...]:
-    """Return height and width of every level."""
     sizes = [(height, width)]
     while len(sizes) < levels and min(sizes[-1]) >= 8:
         height, width = height // 2, width // 2

@@ -13,12 +13,15 @@ import torch
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Mesh, Record
+
+Rows = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -102,25 +105,26 @@ class RayCaster:
             reach: How far each goes, in lengths of its direction; without, to infinity.
         """
         shape = directions.shape[:-1]
-        start = _as_rows(self._near(origins).expand_as(directions))
-        along = _as_rows(directions)
         far = None if reach is None else _reaches(reach, shape)
-        found = self._scene.run(start, along, dists=far, output=1)
+        found = self._scene.run(*self._rays(origins, directions), dists=far, output=1)
         face = torch.from_numpy(found["primID"].astype(np.int64))
         hit = face >= 0
         distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
         v, w = torch.from_numpy(found["u"]), torch.from_numpy(found["v"])
         barycentric = torch.stack([1 - v - w, v, w], dim=-1) * hit[:, None]
-        like = directions
         return Hits(
-            face=face.reshape(shape).to(like.device),
-            distance=distance.reshape(shape).to(like),
-            barycentric=barycentric.reshape(*shape, 3).to(like),
+            face=face.reshape(shape).to(directions.device),
+            distance=distance.reshape(shape).to(directions),
+            barycentric=barycentric.reshape(*shape, 3).to(directions),
         )
 
     def _near(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Return points by the origin that the mesh is stored round."""
         return points if self._origin is None else points - self._origin.to(points)
+
+    def _rays(
+        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Rows, Rows]:
+        return _as_rows(self._near(origins).expand_as(directions)), _as_rows(directions)
 
     def occluded(
         self,
@@ -151,10 +155,8 @@ class RayCaster:
             reach: How far each goes, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]
-        start = _as_rows(self._near(origins).expand_as(directions))
-        along = _as_rows(directions)
-        far = _reaches(reach, shape)
-        found = self._scene.run(start, along, dists=far, query="OCCLUDED")
+        rays = self._rays(origins, directions)
+        found = self._scene.run(*rays, dists=_reaches(reach, shape), query="OCCLUDED")
         return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
 
 
@@ -207,16 +209,12 @@ def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:
     return middle if bool(middle.norm() > 16.0 * (high - low).norm()) else None
 
 
-def _reaches(
-    reach: Float[Tensor, "*#batch"], shape: torch.Size
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def _reaches(reach: Float[Tensor, "*#batch"], shape: torch.Size) -> Rows:
     far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
     # embree's own word for infinity
     return far.clamp(0, 1e37).contiguous().numpy()
 
 
-def _as_rows(
-    vectors: Float[Tensor, "*batch 3"],
-) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _as_rows(vectors: Float[Tensor, "*batch 3"]) -> Rows:
     rows = vectors.detach().to("cpu", torch.float32).reshape(-1, 3)
     return np.ascontiguousarray(rows.numpy())

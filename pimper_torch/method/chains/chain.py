@@ -322,7 +322,6 @@ class Chain(Stage):
         __call__ = forward
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
-        """Put modules in the places of stages."""
         for name, module in stages.items():
             known = [known for known, _ in self.named_children()]
             if name not in known:

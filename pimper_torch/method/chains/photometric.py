@@ -93,7 +93,6 @@ class Photometric(Stage):
 
 
 def _joined(patches: PatchSet, parts: Sequence[SweptPatches]) -> SweptPatches:
-    """Put buckets together."""
     photometric = PhotometricPatches(
         patches=patches, buckets=tuple(one for each in parts for one in each.photometric.buckets)
     )
