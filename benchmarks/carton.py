@@ -26,13 +26,14 @@ from sides import drawn, far_apart, square_round
 from torch import Tensor
 
 from pimper_bench.datasets import read_llff, write_colmap
+from pimper_bench.truth import Capture
 from pimper_torch.doors.exchange.picture_files import file_names
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.chains.presets import load_chain, load_config
 from pimper_torch.method.chains.published import PublishedConfig
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Cameras, Capture, Lens, Mesh, SparseScene
+from pimper_torch.records import Cameras, Lens, Mesh, SparseScene
 from pimper_torch.result.viz.render import crop
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.stage import Given

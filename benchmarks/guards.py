@@ -35,11 +35,12 @@ from pimper_bench.datasets import read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface, true_surface
+from pimper_bench.truth import Capture
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.chains.presets import load_chain
-from pimper_torch.records import Capture, Estimate, LeftOut, Reconstruction
+from pimper_torch.records import Estimate, LeftOut, Reconstruction
 from pimper_torch.runtime.errors import PimperError
 from pimper_torch.runtime.ledger import GUARDS, listening
 

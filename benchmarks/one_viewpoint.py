@@ -12,10 +12,11 @@ from torch import Tensor
 
 from pimper_bench.datasets.diligent import FLIP, decoded_normals, directed_lights
 from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath, contents
 from pimper_torch.doors.io.photographs import read_mask
 from pimper_torch.ground.radiometry import LINEAR
-from pimper_torch.records import Capture, Record, Truth, Views
+from pimper_torch.records import Record, Views
 from pimper_torch.runtime.numpy_files import read_npz
 
 _UW = "the UW photometric stereo set"

@@ -27,11 +27,12 @@ from pimper_bench.scenes.render_in_memory import render_objects
 from pimper_bench.scenes.scene_lights import Lights
 from pimper_bench.scenes.scene_settings import SceneConfig, SensorConfig, expose
 from pimper_bench.scenes.whole_scene import Scene, build_scene
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import Capture, Lens, Truth, Views
+from pimper_torch.records import Lens, Views
 
 RENDERED_FOCAL = 1.3  # widths of a picture that all cameras' pictures are cut from
 NOISELESS = SensorConfig(read_noise=0.0, shot_noise=0.0, exposure=0.4)

@@ -92,7 +92,7 @@ SOLE_IMPORTERS = {
     "numba": {"ground/kernels/compile.py"},
     "yaml": {"runtime/config.py"},
     "tyro": {"cli/", "cli/batches/", "pimper_bench/cli/", "single_view/cli/"},
-    "matplotlib": {"result/viz/"},
+    "matplotlib": {"result/viz/", "pimper_bench/bench/heatmap.py"},
     "viser": {"result/viewer/"},
     "onnxruntime": {"priors/network.py"},
     "distributed": {"cli/batches/engines.py"},

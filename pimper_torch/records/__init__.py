@@ -1,5 +1,6 @@
 """Frozen data that travels between stages; no algorithms."""
 
+from pimper_torch.records.estimate import Estimate as Estimate
 from pimper_torch.records.failure import Failure as Failure
 from pimper_torch.records.failure import LeftOut as LeftOut
 from pimper_torch.records.finished import Closed as Closed
@@ -48,9 +49,5 @@ from pimper_torch.records.silhouettes import ContourRays as ContourRays
 from pimper_torch.records.silhouettes import Silhouettes as Silhouettes
 from pimper_torch.records.stored import load_record as load_record
 from pimper_torch.records.stored import save_record as save_record
-from pimper_torch.records.truth import Capture as Capture
-from pimper_torch.records.truth import DtuProtocol as DtuProtocol
-from pimper_torch.records.truth import Estimate as Estimate
-from pimper_torch.records.truth import Truth as Truth
 from pimper_torch.records.views import Cameras as Cameras
 from pimper_torch.records.views import Views as Views

@@ -45,13 +45,13 @@ LINES = {
     "paper": 1617,
     "priors": 768,
     "priors/prior_files": 390,
-    "records": 2565,
+    "records": 2493,
     "result": 1,
     "result/asset": 839,
     "result/relighting": 872,
     "result/report": 458,
     "result/viewer": 595,
-    "result/viz": 1250,
+    "result/viz": 1037,
     "runtime": 2177,
     "runtime/store": 363,
     "single_view": 4,
@@ -64,9 +64,9 @@ LINES = {
 
 # Numbers of module constants, in tuples and mappings, too; lines of signatures and of imports.
 BARS = {
-    "numbers in module constants": 923,
-    "lines of signatures": 6283,
-    "lines of imports": 4350,
+    "numbers in module constants": 916,
+    "lines of signatures": 6256,
+    "lines of imports": 4334,
 }
 
 

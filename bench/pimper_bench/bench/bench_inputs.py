@@ -16,13 +16,14 @@ from pimper_bench.metrics.similarity import pair_views
 from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.truth import Capture
 from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.method.chains.presets import load_config, make_chain
 from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, placed_scene
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.paper.triangulate import Triangulate
-from pimper_torch.records import Capture, CoarseMesh, Estimate, Record, SparseScene
+from pimper_torch.records import CoarseMesh, Estimate, Record, SparseScene
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.runtime.store import opened

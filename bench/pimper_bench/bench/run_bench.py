@@ -31,15 +31,7 @@ from pimper_bench.bench.bench_table import (
     with_published,
     write_json,
 )
-from pimper_bench.bench.measure import peak_memory, this_machine
-from pimper_bench.metrics.evaluation import Evaluation, evaluate
-from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
-from pimper_bench.metrics.similarity import transfer
-from pimper_bench.metrics.surface_distances import bounding_diagonal
-from pimper_torch.doors.io.meshes import read_mesh, write_ply
-from pimper_torch.doors.outputs.folders import written_whole
-from pimper_torch.records import Capture, Mesh, StageReport
-from pimper_torch.result.viz.heatmap import (
+from pimper_bench.bench.heatmap import (
     ErrorScale,
     MethodPanels,
     SceneRow,
@@ -51,6 +43,15 @@ from pimper_torch.result.viz.heatmap import (
     shading_in_view,
     surface_picture,
 )
+from pimper_bench.bench.measure import peak_memory, this_machine
+from pimper_bench.metrics.evaluation import Evaluation, evaluate
+from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
+from pimper_bench.metrics.similarity import transfer
+from pimper_bench.metrics.surface_distances import bounding_diagonal
+from pimper_bench.truth import Capture
+from pimper_torch.doors.io.meshes import read_mesh, write_ply
+from pimper_torch.doors.outputs.folders import written_whole
+from pimper_torch.records import Mesh, StageReport
 from pimper_torch.result.viz.tiles import encoded
 from pimper_torch.runtime.errors import PimperError, PimperWarning
 from pimper_torch.runtime.progress import listening

@@ -15,13 +15,13 @@ from torch import Tensor
 from pimper_bench import datasets
 from pimper_bench.datasets.posed import assemble
 from pimper_bench.datasets.sampling import LightOptions, read_shots
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.doors.exchange.nerfstudio import thinned
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.ground.radiometry.encoding import ResponseChoice, SaturationChoice
-from pimper_torch.records import Capture, Truth
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.reporting import stage
 

@@ -14,11 +14,11 @@ from torch.nn.functional import normalize
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.datasets.raster import nearest
 from pimper_bench.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 from pimper_torch.doors.io.decode import decode
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.records import Capture, Truth
 
 _ONE_VIEW, _MANY_VIEWS = "DiLiGenT", "DiLiGenT-MV"
 # Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.

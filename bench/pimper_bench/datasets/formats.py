@@ -17,6 +17,7 @@ from pimper_bench.datasets.posed import (
     image_files,
     mask_finder,
 )
+from pimper_bench.truth import Capture
 from pimper_torch.doors.camera_files import meshroom_sfm, metashape_xml, transforms_json
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
@@ -24,7 +25,7 @@ from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_r
 from pimper_torch.doors.io.decode import SUFFIXES, read_header
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.sfm.colmap import read_model
-from pimper_torch.records import Capture, Lens
+from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npy
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_bench.datasets.raster import read_photographs
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera
 from pimper_torch.doors.io.decode import SUFFIXES
@@ -18,7 +19,7 @@ from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding
 from pimper_torch.method.sfm.conventions.resized_pictures import resize_fits
 from pimper_torch.method.sfm.undistort import pinhole_for, undistort
-from pimper_torch.records import Cameras, Capture, Lens, Truth, Views
+from pimper_torch.records import Cameras, Lens, Views
 from pimper_torch.runtime.errors import InputError, some
 
 

@@ -16,7 +16,8 @@ from pimper_bench.metrics.surface_distances import (
     TrueSurface,
     true_surface,
 )
-from pimper_torch.records import Capture, DtuProtocol, Estimate, Record
+from pimper_bench.truth import Capture, DtuProtocol
+from pimper_torch.records import Estimate, Record
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import InputError
 

@@ -15,10 +15,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_bench.metrics.surface_distances import joined, sample_surface, true_surface
+from pimper_bench.truth import Capture
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.records import Cameras, Capture, Estimate, Mesh, Record
+from pimper_torch.records import Cameras, Estimate, Mesh, Record
 from pimper_torch.runtime.errors import InputError
 
 

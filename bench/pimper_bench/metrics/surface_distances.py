@@ -10,11 +10,12 @@ from scipy.stats import spearmanr
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_bench.truth import Capture
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Capture, Mesh, Record
+from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.runtime.errors import InputError
 
 

@@ -10,10 +10,11 @@ from torch.testing import assert_close
 from pimper_bench.cli import convert
 from pimper_bench.cli.convert import Source, cloud, readers
 from pimper_bench.datasets import read_colmap, read_idr, read_transforms
+from pimper_bench.truth import Truth
 from pimper_torch.cli.main import main
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import LINEAR, Encoding
-from pimper_torch.records import Mesh, Truth
+from pimper_torch.records import Mesh
 
 READERS = {"colmap": read_colmap, "idr": read_idr, "transforms": read_transforms}
 # From a camera with OpenGL's axes to the world: at (1, 2, 3 + number), looking along -z.

@@ -8,11 +8,12 @@ from pimper_bench.cli.evaluate import named_as
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.main import main
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
 from pimper_torch.doors.io.results import write_result
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.records import Capture, Estimate, Mesh, Truth, Views
+from pimper_torch.records import Estimate, Mesh, Views
 
 
 def run(*arguments):

@@ -9,12 +9,13 @@ from PIL import Image
 
 from pimper_bench.datasets import posed
 from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.method.sfm.undistort import undistort
-from pimper_torch.records import Cameras, Capture, Truth, Views
+from pimper_torch.records import Cameras, Views
 
 
 @pytest.fixture

@@ -5,8 +5,9 @@ import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.records import Cameras, Capture, Mesh, Truth, Views
+from pimper_torch.records import Cameras, Mesh, Views
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ from torch.testing import assert_close
 
 from pimper_bench.metrics import EvaluateConfig, evaluate, rows
 from pimper_bench.metrics.surface_distances import calibrate, sample_surface
-from pimper_torch.records import Estimate, Truth
+from pimper_bench.truth import Truth
+from pimper_torch.records import Estimate
 
 COUNT = 40_000
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_bench.metrics import TrueSurface
-from pimper_torch.records import Truth
+from pimper_bench.truth import Truth
 from pimper_torch.runtime.errors import InputError
 
 

@@ -4,7 +4,8 @@ from torch.testing import assert_close
 
 from pimper_bench.metrics import dtu_figures
 from pimper_bench.metrics.dtu_protocol import observed, supersample
-from pimper_torch.records import DtuProtocol, Mesh
+from pimper_bench.truth import DtuProtocol
+from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 
 

@@ -6,8 +6,8 @@ from pimper_bench.metrics import (
     compare_along_rays,
 )
 from pimper_bench.metrics.surface_distances import joined
+from pimper_bench.truth import Truth
 from pimper_torch.ground.geometry.visibility import cast_view
-from pimper_torch.records import Truth
 from pimper_torch.runtime.errors import InputError
 
 

@@ -6,9 +6,7 @@ import torch
 from matplotlib import colormaps
 from PIL import Image
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.records import Mesh
-from pimper_torch.result.viz.heatmap import (
+from pimper_bench.bench.heatmap import (
     MISSED,
     ErrorScale,
     MethodPanels,
@@ -21,6 +19,8 @@ from pimper_torch.result.viz.heatmap import (
     shading_in_view,
     surface_picture,
 )
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 
 SCALE = ErrorScale(clip=2.0, unit="% of the diagonal")
