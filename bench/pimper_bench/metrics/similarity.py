@@ -131,6 +131,11 @@ def _similarity(
         )
     rotation = nearest_rotation(correlation)
     scale = (rotation * _outer(target, source)).sum() / _spread(source)
+    if scale <= 0:
+        raise InputError(
+            f"the {len(source)} points or camera centres to align by have nothing in common with "
+            "the true ones: no similarity brings them nearer. Check that their names match."
+        )
     translation = target.mean(dim=0) - scale * rotation @ source.mean(dim=0)
     return rigid(scale * rotation, translation)
 

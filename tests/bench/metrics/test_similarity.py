@@ -86,6 +86,17 @@ def test_cameras_in_one_position_do_not_tell_the_scale():
         similarity_between_cameras(same, arc)
 
 
+def test_cameras_that_no_similarity_brings_nearer_are_refused():
+    truth = arc_cameras(5, width=64, height=48, focal_px=70.0, distance=4.0)
+    facing = truth.cam_from_world[:1, :3, :3].expand(5, 3, 3)
+    ours, turned = (
+        truth.replace(cam_from_world=rigid(facing, -(facing @ centers[..., None])[..., 0]))
+        for centers in (-truth.centers_world, truth.centers_world)
+    )
+    with pytest.raises(InputError, match="nothing in common"):
+        similarity_between_cameras(ours, turned)
+
+
 def test_unequal_numbers_of_cameras_are_refused():
     two, three = (arc_cameras(n, width=64, height=48, focal_px=70.0, distance=4.0) for n in (2, 3))
     with pytest.raises(InputError, match="2 cameras and 3 true ones"):
