@@ -30,8 +30,8 @@ from pimper_bench.truth import Capture
 from pimper_torch.doors.exchange.picture_files import file_names
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.chains.presets import load_chain, load_config
-from pimper_torch.method.chains.published import PublishedConfig
+from pimper_torch.method.chains.chain_config import PublishedConfig, load_config
+from pimper_torch.method.chains.presets import load_chain
 from pimper_torch.method.sfm.sparse_scene import write_model
 from pimper_torch.records import Cameras, Lens, Mesh, SparseScene
 from pimper_torch.result.viz.render import crop

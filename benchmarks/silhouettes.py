@@ -23,7 +23,8 @@ from torch.nn.functional import interpolate
 
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.priors.prior_files.read_silhouettes import read_silhouettes
 from pimper_torch.records import SilhouettePrior, Silhouettes, SparseScene

@@ -220,7 +220,8 @@ def lift():
     from pimper_bench.scenes.scene_lights import wandering_lights
     from pimper_bench.scenes.textures import random_speckle
     from pimper_torch.ground.geometry.rigid import rotate
-    from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+    from pimper_torch.method.patches.decompose import Decompose
+    from pimper_torch.method.patches.patches_config import DecomposeConfig
     from pimper_torch.method.patches.warp import Warp
     from pimper_torch.records import CoarseMesh, Mesh, PhotometricPatches
 

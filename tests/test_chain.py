@@ -29,7 +29,8 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.method.chains.coarse_to_fine import held_apart
 from pimper_torch.method.coarse.surface import CoarseSurface
-from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,

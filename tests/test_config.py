@@ -6,8 +6,7 @@ from typing import Literal
 import pytest
 import yaml
 
-from pimper_torch.method.chains.presets import load_config
-from pimper_torch.method.chains.published import PublishedConfig
+from pimper_torch.method.chains.chain_config import PublishedConfig, load_config
 from pimper_torch.runtime import config as config_module
 from pimper_torch.runtime.config import (
     build,

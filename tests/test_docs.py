@@ -25,7 +25,7 @@ from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_torch.cli.batches import task
 from pimper_torch.method.chains import presets
-from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.chains.chain_config import load_config
 from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.records import Silhouettes, SparseScene, Views

@@ -14,7 +14,8 @@ from pimper_torch.doors.io.reports import summary_report
 from pimper_torch.ground.linalg.prepared import SingularSystemError
 from pimper_torch.method.chains.photometric import Photometric
 from pimper_torch.method.fusion import estimate
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.warp import Warp
 from pimper_torch.method.photometry import factorize as factorization
 from pimper_torch.method.photometry.factorize import Factorize

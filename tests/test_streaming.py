@@ -8,7 +8,8 @@ import pimper_torch as pt
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.pyramids import prepare
 from pimper_torch.method.chains.photometric import Photometric
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.warp import Warp
 from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight

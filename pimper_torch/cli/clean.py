@@ -25,9 +25,8 @@ class _Job:
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``clean``, and tell how much was freed."""
-    job = checked(command, arguments)
     freed = clean_output(job.out)
     outcome = f"{freed / 1e6:.1f} MB freed" if freed else "nothing to remove"
     output.remark(f"{job.out}: {outcome}.")

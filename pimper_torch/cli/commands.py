@@ -1,7 +1,8 @@
 """Commands that other distributions bring.
 
 One brings them by entry points of the group ``pimper.commands``: the name is that of the command,
-the value the module that carries it out, with ``run`` and ``checked`` as those of this folder have.
+the value the module that carries it out. Its ``checked(command, arguments)`` reads and checks the
+arguments, and its ``run(job, output)`` does with them what was asked for.
 """
 
 from importlib.metadata import entry_points

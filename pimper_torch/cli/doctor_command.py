@@ -9,13 +9,10 @@ from typing import Annotated
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
-from pimper_torch.cli.doctor.checks import examine_folder
 from pimper_torch.cli.doctor.findings import Finding
-from pimper_torch.cli.doctor.machine import machine
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.photographs import list_images
+from pimper_torch.doors.io.photograph_files import list_images
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding
-from pimper_torch.runtime.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +33,12 @@ class _Job:
     photographs: Encoding = FROM_FILES
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``doctor``: tell each finding in a line, with what to do."""
-    job = checked(command, arguments)
+    from pimper_torch.cli.doctor.checks import examine_folder
+    from pimper_torch.cli.doctor.machine import machine
+    from pimper_torch.runtime.reporting import stage
+
     findings = list(machine())
     _tell(output, findings)
     if job.photos is not None:

@@ -3,19 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.exchange.layouts import Format, write_formats
-from pimper_torch.doors.exchange.result import read_result
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
-from pimper_torch.records.priors import Axes
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.runtime.reporting import stage
+
+# Those of `write_formats`, as a type checker sees.
+Format = Literal["colmap", "nerfstudio", "alicevision", "maps", "lights"]
+Axes = Literal["opengl", "opencv", "lub"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,9 +45,12 @@ class ExportJob:
     overwrite: Flag = False
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: ExportJob, output: Output) -> None:
     """Carry out ``export``: read the result, and write all formats or none."""
-    job = checked(command, arguments)
+    from pimper_torch.doors.exchange.layouts import write_formats
+    from pimper_torch.doors.exchange.result import read_result
+    from pimper_torch.runtime.reporting import stage
+
     with output.observer(), written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
         with stage("read") as told:
             result = read_result(job.result, job.photos)

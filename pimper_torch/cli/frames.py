@@ -6,17 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from PIL import Image
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.cli.video.choose import chosen, scanned
-from pimper_torch.cli.video.read import frame_pictures, luma_frames
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.progress import report
-from pimper_torch.runtime.reporting import stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,9 +35,14 @@ class _Job:
         require(3 <= self.count <= 10_000, "count", self.count, "3 to 10,000")
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``frames``."""
-    job = checked(command, arguments)
+    from PIL import Image
+
+    from pimper_torch.cli.video.choose import chosen, scanned
+    from pimper_torch.cli.video.read import frame_pictures, luma_frames
+    from pimper_torch.runtime.reporting import stage
+
     with output.observer():
         with stage("scan") as told:
             scan = scanned(luma_frames(job.video))

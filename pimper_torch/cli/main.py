@@ -19,13 +19,12 @@ import traceback
 import types
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import TextIO
 
 from pimper_torch.cli.commands import OF_BENCH, brought, listed
 from pimper_torch.cli.deaths import limit, write_report
-from pimper_torch.cli.light import absent
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.supervise import exit_code, stoppable
 from pimper_torch.doors.outputs.files import require_name
@@ -77,7 +76,7 @@ _COMMANDS = {
     "clean": "pimper_torch.cli.clean",
 }
 _READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
-_LIGHT = ("config",)  # carried out without torch, too
+_LIGHT = ("batch", "clean", "config")  # carried out without torch, too
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 # What no program can help.
@@ -181,18 +180,18 @@ def _run(command: str, home: str, arguments: list[str], output: Output, supervis
     try:
         for argument in arguments:
             require_name(argument, InputError)
-        if command not in _LIGHT:
-            _refuse_at_once(_READERS.get(home, home), command, arguments)
+        job = import_module(_READERS.get(home, home)).checked(command, arguments)
         if output.as_json:
             from pimper_torch.doors.io.version import versions
 
             output.event(
                 "start", command=command, arguments=arguments, versions=versions(), format=1
             )
-        with absent() if command in _LIGHT else nullcontext():
-            run = _loaded(home).run
-            with stoppable(repeat=not supervised):
-                run(command, arguments, output)
+        if command not in _LIGHT:
+            import torch  # noqa: F401 - before signals raise: half an import leaves odd errors
+        run = _loaded(home).run
+        with stoppable(repeat=not supervised):
+            run(job, output)
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
             raise error.__context__ from None
@@ -251,20 +250,6 @@ def _of_the_world(error: BaseException) -> str | None:
         advice = " Make room." if error.errno in _FULL else ""
         return f"{place}the system refuses ({error.strerror}); no result was written.{advice}"
     return None
-
-
-def _refuse_at_once(home: str, command: str, arguments: list[str]) -> None:
-    """Answer ``--help``, and refuse arguments, before torch is loaded."""
-    if "torch" in sys.modules:
-        return
-    try:
-        with warnings.catch_warnings(), absent(home.partition(".")[0]):
-            warnings.simplefilter("ignore")  # shown when the arguments are read in earnest
-            import_module(home).checked(command, arguments)
-    except (PimperError, BrokenPipeError):
-        raise
-    except Exception:
-        pass
 
 
 @contextmanager

@@ -10,8 +10,7 @@ import tyro
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.doors.outputs.files import file_written_whole, prepare_file
-from pimper_torch.doors.size.sheet import SIDE_MM, Paper, layout
-from pimper_torch.result.viz.marker_sheet import TITLE, write_sheet
+from pimper_torch.doors.size.sheet import SIDE_MM, TITLE, Paper, layout
 from pimper_torch.runtime.config import require
 
 
@@ -34,9 +33,10 @@ class _Job:
     overwrite: Flag = False
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``markers``."""
-    job = checked(command, arguments)
+    from pimper_torch.result.viz.marker_sheet import write_sheet
+
     with file_written_whole(job.out) as fresh:
         write_sheet(fresh, job.side_mm, job.paper)
     output.remark(

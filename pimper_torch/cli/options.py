@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
-from pimper_torch.doors.io.photographs import image_name, list_images
+from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.outputs.files import require_name
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart
 from pimper_torch.doors.size.given import (
@@ -21,15 +21,13 @@ from pimper_torch.doors.size.given import (
     measured_in,
     number_of,
 )
-from pimper_torch.method.chains.presets import Config, load_config
-from pimper_torch.method.chains.published import PublishedConfig
-from pimper_torch.method.coarse.reference import view_named
-from pimper_torch.priors.from_maps import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
+from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viewer.server import require_viser
-from pimper_torch.runtime.config import presets, require
+from pimper_torch.runtime.config import bytes_of, presets, require
 from pimper_torch.runtime.errors import ConfigError, InputError
-from pimper_torch.runtime.memory import bytes_of
+from pimper_torch.runtime.file_names import view_named
 
 
 def _number(word: str, option: str) -> float:

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -13,12 +12,13 @@ import torch
 from pimper_torch.cli.doctor.checks import examine_views
 from pimper_torch.cli.doctor.cost import planned
 from pimper_torch.cli.doctor.forecast import Forecast
-from pimper_torch.cli.options import Job, checked
+from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import tell_place
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.photographs import image_name, list_images, load_views
+from pimper_torch.doors.io.photograph_files import image_name, list_images
+from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result
 from pimper_torch.doors.outputs.folders import held_output
 from pimper_torch.doors.outputs.marker import STAGES
@@ -34,7 +34,7 @@ from pimper_torch.doors.size.given import (
 )
 from pimper_torch.doors.size.scale import Scale
 from pimper_torch.doors.size.scaled import scaled
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
@@ -42,16 +42,15 @@ from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene,
 from pimper_torch.result.viewer.show import COARSE, RESULT, add_found
 from pimper_torch.result.viewer.viewer import Viewer, opened
 from pimper_torch.result.viz.overview import draw_preview, headline
+from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution, cautioned
 from pimper_torch.runtime.ledger import closing_line
-from pimper_torch.runtime.memory import bytes_of
 from pimper_torch.runtime.reporting import accounted, reported, stage
 from pimper_torch.runtime.store import Store
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: Job, output: Output) -> None:
     """Carry out ``reconstruct`` or ``demo``."""
-    job = checked(command, arguments)
     _check_device(job.common.device)
     with opened() if job.common.view else nullcontext() as viewer:
         if viewer is not None:

@@ -13,7 +13,7 @@ import tyro
 
 from pimper_torch.cli.arguments import meanings, read_arguments, summary, value_of
 from pimper_torch.cli.output import Output
-from pimper_torch.method.chains.presets import Config, load_config
+from pimper_torch.method.chains.chain_config import Config, load_config
 from pimper_torch.runtime.config import presets, to_mapping, written
 from pimper_torch.runtime.errors import ConfigError
 
@@ -27,9 +27,8 @@ class _Job:
     path: tuple[str, ...] = ()
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``config``."""
-    job = checked(command, arguments)
     value: object = job.config
     owner = value
     for name in job.path:

@@ -4,17 +4,18 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.result.viewer.server import HOST, PORT, require_viser
-from pimper_torch.result.viewer.show import add_folder
-from pimper_torch.result.viewer.viewer import Viewer, opened
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from pimper_torch.result.viewer.viewer import Viewer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,9 +39,11 @@ class _Job:
         require(0 <= self.port <= 65_535, "port", self.port, "0 to 65535")
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``view``."""
-    job = checked(command, arguments)
+    from pimper_torch.result.viewer.show import add_folder
+    from pimper_torch.result.viewer.viewer import opened
+
     # Ctrl-C ends the page and no work.
     with opened(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
         tell_place(viewer, output, job.port)
@@ -48,7 +51,7 @@ def run(command: str, arguments: Sequence[str], output: Output) -> None:
         viewer.wait()
 
 
-def tell_place(viewer: Viewer, output: Output, port: int = PORT) -> None:
+def tell_place(viewer: "Viewer", output: Output, port: int = PORT) -> None:
     """Print the address of the page."""
     output.event("view", address=viewer.address)
     taken = f" (port {port} is taken)" if port not in (0, viewer.server.get_port()) else ""

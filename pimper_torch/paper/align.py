@@ -1,7 +1,6 @@
 """Alignment: bas-relief transforms that make neighbouring patches agree."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +9,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.linalg.sums import average
+from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.paper.seams import (
     Pulls,
     Seams,
@@ -22,7 +22,6 @@ from pimper_torch.paper.seams import (
     transformed,
 )
 from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.stage import Stage
 
@@ -96,29 +95,6 @@ _REWEIGHTINGS = 3
 # Lines of samples across each overlap, samples along each, and the distance of the outermost lines
 # from the edge in template samples: `paper` has overlaps of 6.
 _ROWS, _COLUMNS, _REACH = 3, 12, 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlignConfig:
-    """Settings of the alignment.
-
-    Attributes:
-        iterations: Rounds: meeting the overlaps as transformed so far, and solving.
-        anchor: Weight of a facet's vertex next to the agreement of a seam; less for points whose
-            uncertainty exceeds the disagreement at the seams.
-        prior: Weight that holds each transform at the identity. Where neighbours agree but
-            for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
-            4 %; where they agree in nothing, 1e-4 lets them be flattened.
-        scale_limit: Maximum factor by which a height field is flattened or stretched.
-    """
-
-    iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
-    anchor: Annotated[float, Range(least=0, most=1e12)] = 1.0
-    prior: Annotated[float, Range(above=0, most=1e12)] = 3e-4
-    scale_limit: Annotated[float, Range(above=1)] = 4.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -7,9 +7,6 @@ and G averaged over each face. S is the position of every vertex, so that the th
 three right-hand sides of one system.
 """
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -23,8 +20,8 @@ from pimper_torch.ground.linalg.continuation import about_mean
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.linalg.systems import solutions
 from pimper_torch.method.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
+from pimper_torch.paper.paper_config import RefineConfig
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.stage import Stage
 
 
@@ -63,22 +60,6 @@ def assemble(
     diagonal = torch.arange(mesh.count, device=mass.device)
     rows, cols = torch.cat([rows, diagonal]), torch.cat([cols, diagonal])
     return rows, cols, torch.cat([values, mass]), mass
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefineConfig:
-    """Settings of the refinement.
-
-    Attributes:
-        smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
-            ``1 / (r * spacing)^2``. Where G is constant, a wave of length ``w`` keeps
-            ``1 / (1 + (2 pi R / w)^2)`` of its height, with ``R = r sqrt(G / (1 - G))`` vertices.
-    """
-
-    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 2.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Refine(Stage):

@@ -1,8 +1,5 @@
 """Coarse mesh: a few hundred facets through the cloud, seen from the frontal view."""
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,8 +13,8 @@ from pimper_torch.ground.geometry.topology import face_components, face_edges
 from pimper_torch.method.coarse.reference import reference_view
 from pimper_torch.method.coarse.surface import smoothed_normals
 from pimper_torch.paper import cloud_filters
+from pimper_torch.paper.paper_config import TriangulateConfig
 from pimper_torch.records import Cameras, CoarseMesh, Mesh, SparseScene, Views
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -39,24 +36,6 @@ _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
 # On the border a facet is dropped with a smaller height over its longest edge in the image, or with
 # a smaller angle at a corner that it alone reaches, or with a smaller fraction of it on the object.
 _MIN_ALTITUDE, _MIN_TIP_DEG, _MIN_COVERAGE = 0.08, 45.0, 0.6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TriangulateConfig:
-    """Which points become vertices, and which triangles facets.
-
-    Attributes:
-        reference: Name or stem of the frontal photograph; empty chooses it.
-        num_points: About how many vertices to spread over the visible side.
-        fill: Put vertices on a smooth surface where the cloud has none.
-    """
-
-    reference: str = ""
-    num_points: Annotated[int, Range(least=4, most=1_000_000)] = 250  # the largest clouds
-    fill: bool = True
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Triangulate(Stage):

@@ -1,4 +1,6 @@
 """Conventions of guessed maps, found by the scene, and guesses of networks."""
 
-from pimper_torch.priors.network import priors_of as priors_of
-from pimper_torch.priors.settled import settled as settled
+import lazy_loader
+
+# When they are asked for, so that the command line reads settings of this room without torch.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,20 +10,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.records import DepthPrior, NormalPrior, SilhouettePrior
 from pimper_torch.records.priors import AXES, Axes
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError, some
 
-# Root mean squares that published estimators are off indoors. DSINE (CVPR 2024) has a mean of 16
-# degrees on NYUv2; Marigold (CVPR 2024) one of 5.5 % of depth once factor and offset are fitted.
-# Large errors are many.
-NORMALS_ERROR_DEG, DEPTH_ERROR = 25.0, 0.08
 # Lengths of vectors that are normals, blended where maps were resized. Grey, and the colour 0 that
 # marks nothing, are none.
 _SHORTEST, _LONGEST = 0.5, 1.5
 
-NormalAxes = Literal["auto", "opencv", "opengl", "lub", "dsine", "world"]
 _AXES: dict[NormalAxes, Axes | None] = {"auto": None, "dsine": "lub", "world": "opencv"}
 _AXES |= {axes: axes for axes in AXES}
 

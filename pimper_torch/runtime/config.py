@@ -1,6 +1,7 @@
 """Settings: YAML to nested frozen dataclasses, strictly.
 
-A setting is a field of the config dataclass beside its stage; its default is the method's.
+A setting is a field of a config dataclass in the room of its stage, in a module that imports no
+torch, such as ``sweep_config``; its default is the method's.
 A YAML file holds only what differs. Unknown keys and wrong types are refused when the file
 is read, impossible values when the dataclass is made (:func:`require_ranges`, :func:`require`).
 """
@@ -8,6 +9,7 @@ is read, impossible values when the dataclass is made (:func:`require_ranges`, :
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -21,6 +23,8 @@ import yaml
 from pimper_torch.runtime.errors import ConfigError
 
 Config = TypeVar("Config")
+
+_UNITS = {"MB": 10**6, "GB": 10**9}
 
 
 def require(ok: bool, field: str, value: object, needed: str) -> None:
@@ -73,6 +77,20 @@ def require_ranges(config: object, section: str = "") -> None:
             if isinstance(mark, Range) and value is not None:
                 needed = mark.needed(value)
                 require(not needed, _join(section, name), value, needed)
+
+
+def bytes_of(size: str, field: str = "max_memory") -> float:
+    """Read a size such as ``4GB`` or ``800 MB``; infinite where nothing is said.
+
+    >>> bytes_of("1.5 GB")
+    1500000000.0
+    """
+    if not size:
+        return math.inf
+    found = re.fullmatch(r"\s*(\d+\.?\d*)\s*([MG]B)\s*", size, re.IGNORECASE)
+    require(found is not None, field, size, "a size such as 4GB or 800MB")
+    assert found is not None
+    return float(found[1]) * _UNITS[found[2].upper()]
 
 
 def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Config:

@@ -7,8 +7,12 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Literal
 
 from pimper_torch.runtime.journal import current, writing
+
+OnFailure = Literal["skip", "fail"]
+"""Whether a patch, view or solver that fails is left out, or ends the run."""
 
 
 class PimperError(Exception):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,13 +20,13 @@ from pimper_torch.records.record import Record
 from pimper_torch.runtime.errors import (
     InputError,
     NumericalError,
+    OnFailure,
     OutOfMemoryError,
     ReconstructionError,
     caution,
 )
 from pimper_torch.runtime.journal import current, writing
 
-OnFailure = Literal["skip", "fail"]
 Result = TypeVar("Result")
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 

@@ -134,3 +134,14 @@ def _ambiguous(where: str, what: str, name: str, several: Sequence[str]) -> Inpu
         f"{where}: {name} may be any of {', '.join(several)} by its name; needed: one {what} for "
         "each photograph. Rename them, or give the folder under its own name."
     )
+
+
+def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
+    """Find the one photograph of a name, with its suffix or without."""
+    found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
+    if len(found) != 1:
+        raise InputError(
+            f"reference view: {len(found)} {of} are named {name!r}; needed: one of "
+            f"{', '.join(names)}."
+        )
+    return found[0]

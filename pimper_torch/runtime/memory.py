@@ -2,7 +2,6 @@
 
 import ctypes
 import math
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +12,6 @@ from torch.utils.checkpoint import checkpoint
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import forget_casters
 from pimper_torch.records import PatchSet
-from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.mapped import drop_pages
 
@@ -33,22 +31,6 @@ _BYTES_BY_BLOCKS, _BYTES_KEPT, _BYTES_OF_BLOCK = 750, 300, 1400
 # Vertices of the surface for each square of their spacing: 1.6 in the demo. Equilateral triangles
 # have 1.15, but an edge is cut as the finer of its facets asks for.
 _PER_SQUARE = 1.6
-
-_UNITS = {"MB": 10**6, "GB": 10**9}
-
-
-def bytes_of(size: str, field: str = "max_memory") -> float:
-    """Read a size such as ``4GB`` or ``800 MB``; infinite where nothing is said.
-
-    >>> bytes_of("1.5 GB")
-    1500000000.0
-    """
-    if not size:
-        return math.inf
-    found = re.fullmatch(r"\s*(\d+\.?\d*)\s*([MG]B)\s*", size, re.IGNORECASE)
-    require(found is not None, field, size, "a size such as 4GB or 800MB")
-    assert found is not None
-    return float(found[1]) * _UNITS[found[2].upper()]
 
 
 def largest_problem(limit: float, patches: PatchSet, scale: float, last: float) -> float:

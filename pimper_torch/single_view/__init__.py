@@ -1,4 +1,6 @@
 """One viewpoint, many lights: photometric stereo, normal integration, response curves."""
 
-from pimper_torch.single_view.integration import integrate_normal_map as integrate_normal_map
-from pimper_torch.single_view.photometric_stereo import photometric_stereo as photometric_stereo
+import lazy_loader
+
+# When they are asked for, so that the command line reads settings of this room without torch.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -58,7 +58,8 @@ def test_a_checkout_serves_without_being_installed_and_what_is_installed_comes_f
 
 def test_a_command_of_another_distribution_is_carried_out(tmp_path, capsys, monkeypatch):
     (tmp_path / "brushes.py").write_text(
-        "def run(command, arguments, output):\n    print(command, *arguments)\n"
+        "def checked(command, arguments):\n    return [command, *arguments]\n"
+        "def run(job, output):\n    print(*job)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     offer(monkeypatch, ("stroke", "brushes"))

@@ -23,8 +23,7 @@ from pimper_torch.doors.io.results import RESULT_NAMES, write_result
 from pimper_torch.doors.io.version import installed_version
 from pimper_torch.doors.outputs.marker import MARKER
 from pimper_torch.ground.radiometry import Encoding, linear_from_srgb
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig, load_config
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.records import LeftOut, Mesh, Silhouettes
 from pimper_torch.runtime.errors import PimperWarning, ReconstructionError

@@ -16,9 +16,7 @@ from pimper_torch.cli.batches import task
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.method.chains.presets import load_config
-from pimper_torch.method.chains.published import PublishedConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig, PublishedConfig, load_config
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.runtime.store import Store

@@ -8,9 +8,11 @@ from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.coarse.densify import DensifyConfig
-from pimper_torch.method.coarse.surface import CoarseSurfaceConfig
-from pimper_torch.method.coarse.trim import FineSurfaceConfig
+from pimper_torch.method.coarse.coarse_config import (
+    CoarseSurfaceConfig,
+    DensifyConfig,
+    FineSurfaceConfig,
+)
 from pimper_torch.records import Silhouettes
 
 SETTINGS = (

@@ -8,10 +8,11 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import face_components, face_pairs
+from pimper_torch.method.coarse.coarse_config import FineSurfaceConfig
 from pimper_torch.method.coarse.fine_surface import closed_surface, cropped
 from pimper_torch.method.coarse.oriented import no_points
 from pimper_torch.method.coarse.surface import CoarseSurface
-from pimper_torch.method.coarse.trim import FineSurfaceConfig, ViewCounts, seen_surface
+from pimper_torch.method.coarse.trim import ViewCounts, seen_surface
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.records import Support
 from pimper_torch.runtime.errors import ReconstructionError

@@ -9,7 +9,8 @@ from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.ground.geometry.visual_hull import Hull
-from pimper_torch.method.coarse.remesh import RemeshConfig, remesh, within
+from pimper_torch.method.coarse.coarse_config import RemeshConfig
+from pimper_torch.method.coarse.remesh import remesh, within
 from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
 from pimper_torch.runtime.errors import InputError

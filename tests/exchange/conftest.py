@@ -11,7 +11,7 @@ from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import Encoding, to_bytes
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.sparse_scene import assemble_scene
 from pimper_torch.records import LeftOut, Lens, Silhouettes

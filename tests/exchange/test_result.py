@@ -14,8 +14,8 @@ from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import Encoding
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.runtime.errors import InputError
 
 

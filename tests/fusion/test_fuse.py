@@ -13,8 +13,16 @@ from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.method.chains.photometric import warn_of_priors
 from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights, Term, TouchedRays
+from pimper_torch.method.fusion.fuse import Fuse
+from pimper_torch.method.fusion.fuse_config import KINDS, FuseConfig
+from pimper_torch.method.fusion.terms import (
+    TERMS,
+    KeptSlopes,
+    Normals,
+    SweptHeights,
+    Term,
+    TouchedRays,
+)
 from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
@@ -443,3 +451,7 @@ def test_a_run_tells_how_far_guesses_are_from_the_photographs_and_warns(swept):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_priors(right)
+
+
+def test_settings_know_the_kinds_of_terms():
+    assert tuple(TERMS) == KINDS

@@ -12,10 +12,12 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.method.fusion.estimate import fuse_terms
-from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.fusion.fuse import Fuse
+from pimper_torch.method.fusion.fuse_config import FuseConfig
 from pimper_torch.method.fusion.problem import pose
 from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -50,7 +50,7 @@ from pimper_torch.doors.io.responses import read_curve
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.colmap import read_model, reconstruction_of, write_binary
 from pimper_torch.method.sfm.existing import existing_ways
 from pimper_torch.method.sfm.model import SparseModel

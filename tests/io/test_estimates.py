@@ -8,8 +8,8 @@ from torch.testing import assert_close
 from pimper_torch.doors.io import results
 from pimper_torch.doors.io.estimates import estimate_of, read_estimate
 from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.runtime.errors import InputError
 
 

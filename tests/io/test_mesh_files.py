@@ -11,7 +11,7 @@ from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.results import write_result
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.records import Mesh
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import ConfigError
 

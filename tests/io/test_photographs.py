@@ -11,7 +11,8 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.photographs import list_images, load_views, read_mask
+from pimper_torch.doors.io.photograph_files import list_images
+from pimper_torch.doors.io.photographs import load_views, read_mask
 from pimper_torch.ground.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.method.sfm.lenses import choose_lenses
 from pimper_torch.runtime.errors import InputError, PimperWarning

@@ -8,7 +8,8 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_torch.doors.io.decode import decode, read_header, rotated
-from pimper_torch.doors.io.photographs import list_images, load_views
+from pimper_torch.doors.io.photograph_files import list_images
+from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.radiometry import Encoding, Linear, srgb_from_linear
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import XYZ_TO_CAMERA, write_dng

@@ -26,7 +26,8 @@ from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Mesh, Silhouettes
-from pimper_torch.result.asset.finish import MeshFiles, written_channels
+from pimper_torch.result.asset.finish import written_channels
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.progress import listening

@@ -5,7 +5,8 @@ from twins import using
 
 from pimper_torch.ground.geometry.pyramids import prepare
 from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.method.patches.warp import Warp, WarpConfig
+from pimper_torch.method.patches.patches_config import WarpConfig
+from pimper_torch.method.patches.warp import Warp
 from pimper_torch.method.sweep.costs import Hypotheses, costs_of
 from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Mesh

@@ -4,8 +4,9 @@ import trimesh
 from surfaces import surface_of
 from torch.testing import assert_close
 
-from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.faults import diagonal
+from pimper_torch.method.meshing.meshing_config import ExtractConfig
 from pimper_torch.runtime.errors import ReconstructionError
 from tests.meshing.sheets import sheet_of
 

@@ -14,15 +14,10 @@ from pimper_torch.ground.geometry.topology import (
     face_edges,
     vertex_components,
 )
-from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.faults import faults
-from pimper_torch.method.meshing.repair import (
-    Repair,
-    RepairConfig,
-    least_bent,
-    repair,
-    surroundings,
-)
+from pimper_torch.method.meshing.meshing_config import ExtractConfig, RepairConfig
+from pimper_torch.method.meshing.repair import Repair, least_bent, repair, surroundings
 from pimper_torch.records import Mesh
 
 OLD = ExtractConfig(overturned="all")

@@ -2,7 +2,8 @@ import pytest
 import torch
 from slopes import normals_from_slopes
 
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -1,7 +1,8 @@
 import torch
 
 from pimper_torch.paper.cloud_filters import facets_under
-from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate
 
 
 def test_the_coarse_mesh_carries_what_is_known_of_its_points(dome_cloud):

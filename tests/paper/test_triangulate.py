@@ -6,12 +6,8 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import half_edges
 from pimper_torch.paper.cloud_filters import delaunay, fill_pixels, interpolate_inverse_depth
-from pimper_torch.paper.triangulate import (
-    Triangulate,
-    TriangulateConfig,
-    largest_component,
-    peel,
-)
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate, largest_component, peel
 from pimper_torch.runtime.errors import ReconstructionError
 
 

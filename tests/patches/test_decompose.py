@@ -4,13 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.patches.decompose import (
-    Decompose,
-    DecomposeConfig,
-    enlarge,
-    group_by_size,
-    views_facing,
-)
+from pimper_torch.method.patches.decompose import Decompose, enlarge, group_by_size, views_facing
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.runtime.errors import ReconstructionError
 
 

@@ -6,7 +6,8 @@ from torch.testing import assert_close
 from pimper_bench.scenes.procedural_meshes import table
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.template_normals import coarse_normals, transferred_normals
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.transfer import transfer
 from pimper_torch.method.patches.warp import Warp
 from pimper_torch.records import CoarseMesh, Mesh

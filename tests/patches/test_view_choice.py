@@ -10,7 +10,8 @@ from pimper_bench.scenes.scene_cameras import turntable_directions
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig, views_facing
+from pimper_torch.method.patches.decompose import Decompose, views_facing
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.view_choice import best_views, view_blocks, view_weights
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
 

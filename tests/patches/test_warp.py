@@ -4,8 +4,9 @@ from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.pyramids import look_up, pyramid_level
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.method.patches.warp import Warp, WarpConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig, WarpConfig
+from pimper_torch.method.patches.warp import Warp
 from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.runtime.reporting import figures

@@ -16,8 +16,9 @@ from pimper_torch.method.photometry.factor_priors import (
     SurfaceNormals,
     views_worth,
 )
-from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
+from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.records import PatchPriors
 from pimper_torch.runtime.errors import ConfigError
 from tests.photometry.test_factorize import median_error

@@ -8,11 +8,12 @@ from torch.nn.functional import pad
 from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.template_normals import coarse_normals
-from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.chains.chain_config import load_config
 from pimper_torch.method.photometry import factorize
-from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.method.photometry.light_field import LightField, harmonics
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig, FitLightConfig
 from pimper_torch.records import PatchStatus, PatchViews
 from pimper_torch.runtime.errors import ConfigError, PimperWarning
 

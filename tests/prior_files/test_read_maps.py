@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from pimper_torch.doors.exchange.openexr import read_exr, write_exr
 from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.priors.from_maps import NORMALS_ERROR_DEG
+from pimper_torch.priors.map_config import NORMALS_ERROR_DEG
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError

@@ -14,8 +14,8 @@ from pimper_torch.method.sfm.sparse_scene import (
     reprojection_errors,
     write_model,
 )
-from pimper_torch.method.silhouettes.cues import cues_of
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.method.silhouettes.cues import SilhouetteDetails, cues_of
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):

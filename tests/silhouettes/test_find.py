@@ -6,7 +6,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.supporting_plane import Plane, fixation
 from pimper_torch.method.silhouettes import cuts, find
-from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cues import Cues, SilhouetteDetails, cues_of
 from pimper_torch.method.silhouettes.cuts import Cuts, cuts_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.method.silhouettes.parallax import (
@@ -14,7 +14,7 @@ from pimper_torch.method.silhouettes.parallax import (
     room_agreement,
     working_pictures,
 )
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 

@@ -3,9 +3,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.method.silhouettes.cues import SilhouetteDetails
 from pimper_torch.method.silhouettes.cuts import Cuts
 from pimper_torch.method.silhouettes.reliability import agreement_of, repaired
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteDetails
 
 VIEWS = 8
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import nn
 
-from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
+from pimper_torch.method.fusion.fuse import Fuse
+from pimper_torch.method.fusion.fuse_config import FuseConfig
 from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.runtime.store import digest, opened
 

@@ -3,7 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.method.patches.warp import Warp
-from pimper_torch.method.sweep.sweep import Sweep, SweepConfig
+from pimper_torch.method.sweep.sweep import Sweep
+from pimper_torch.method.sweep.sweep_config import SweepConfig
 from pimper_torch.records import SweptPatches
 
 

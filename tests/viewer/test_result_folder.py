@@ -13,7 +13,7 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
 from pimper_torch.doors.io import results
 from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.records import Mesh
 from pimper_torch.result.viewer.show import add_folder, show
 from pimper_torch.runtime.errors import InputError, PimperWarning

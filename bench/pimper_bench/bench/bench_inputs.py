@@ -19,7 +19,8 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture
 from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.chains.presets import load_config, make_chain
+from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, placed_scene
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.paper.triangulate import Triangulate

@@ -19,9 +19,8 @@ from pimper_torch.runtime.store.user_cache import user_cache
 _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: "_Job", output: Output) -> None:
     """Carry out ``bench``."""
-    job = checked(command, arguments)
     with output.observer() as observer:
         table = run_bench(
             job.config, job.out, observer=observer, overwrite=job.overwrite, cache=job.cache

@@ -102,9 +102,8 @@ class ConvertJob:
     options: Annotated[ReadOptions, tyro.conf.arg(name="")] = ReadOptions()
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: ConvertJob, output: Output) -> None:
     """Carry out ``convert``: read, write whole or not at all, and say what came."""
-    job = checked(command, arguments)
     with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
         with output.observer(), stage("read") as told:
             capture = read(job)

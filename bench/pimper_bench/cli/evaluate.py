@@ -73,9 +73,8 @@ class EvaluateJob:
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = _DEFAULT
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: EvaluateJob, output: Output) -> None:
     """Carry out ``evaluate``."""
-    job = checked(command, arguments)
     config = job.config
     estimate = read_estimate(job.result)
     capture, maps, protocol = read_truth(job, estimate, config)

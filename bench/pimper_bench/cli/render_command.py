@@ -42,9 +42,8 @@ class _Job:
     config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: _Job, output: Output) -> None:
     """Carry out ``render``."""
-    job = checked(command, arguments)
     with output.observer(), stage("render") as told:
         render_scene(
             job.scene, job.out, job.config, processes=job.processes, overwrite=job.overwrite

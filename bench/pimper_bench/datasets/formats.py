@@ -22,7 +22,8 @@ from pimper_torch.doors.camera_files import meshroom_sfm, metashape_xml, transfo
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
-from pimper_torch.doors.io.decode import SUFFIXES, read_header
+from pimper_torch.doors.io.decode import read_header
+from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Lens

@@ -13,7 +13,7 @@ from pimper_bench.datasets.raster import read_photographs
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera
-from pimper_torch.doors.io.decode import SUFFIXES
+from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding

@@ -152,9 +152,9 @@ class _Job:
     cpus_per_task: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(given: tuple[_Job, list[str]], output: Output) -> None:
     """Carry out ``batch``: a line an object, and a table at the end."""
-    job, settings = checked(command, arguments)
+    job, settings = given
     shown: AbstractContextManager[Listener] = Lines(output.shows("info"))
     shown = nullcontext(TryEvents(output.event)) if output.as_json else shown
     try:

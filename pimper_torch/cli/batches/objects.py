@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pimper_torch.cli.light import absent
+from pimper_torch.cli.options import every_option
 from pimper_torch.doors.outputs.files import require_name
 from pimper_torch.runtime.errors import ConfigError, InputError, some
 
@@ -149,8 +149,6 @@ def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list
 
 def _kinds() -> dict[str, str]:
     """Return what follows every option of ``pimper reconstruct``, of any preset."""
-    with absent():
-        from pimper_torch.cli.options import every_option
     return {name: one.value for one in every_option("reconstruct") for name in one.names}
 
 

@@ -12,7 +12,9 @@ from PIL import Image
 
 from pimper_torch.cli.batches.objects import Object
 from pimper_torch.cli.batches.task import Outcome, Task, is_whole
-from pimper_torch.cli.light import absent
+from pimper_torch.cli.doctor.cost import estimate
+from pimper_torch.cli.doctor.machine import available_gb
+from pimper_torch.cli.options import check, inputs_of, parse
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, PimperError
 
@@ -51,42 +53,37 @@ def planned_batch(
         mem_gb: Memory that a run takes; the estimate unless given.
     """
     out = out.absolute()
-    with absent():
-        # With their own classes where torch is not loaded: they leave this block as plain values.
-        from pimper_torch.cli.doctor.cost import estimate
-        from pimper_torch.cli.options import check, inputs_of, parse
+    read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
 
-        read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
+    def one(thing: Object) -> Task | Outcome:
+        given = (*settings, *thing.settings)
+        own = tuple(word for word in given if word != _REPLACES)
+        words = (*own, *((_REPLACES,) if overwrite or own != given else ()))
+        photos, target = Path(thing.photos).absolute(), out / thing.name
+        try:
+            job = replace(read(words), photos=photos, out=target)
+            seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))
+            task = Task(
+                name=thing.name,
+                arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
+                out=target,
+                key=_key(own, inputs_of(job).values()),
+                limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
+                mem_gb=mem_gb or gigabytes,
+                threads=1,
+            )
+            if is_whole(task):
+                return Outcome(name=thing.name, status="kept")
+            check(job)
+        except ConfigError as error:
+            raise ConfigError(f"{thing.where or thing.name}: {error}") from error
+        except PimperError as error:
+            return Outcome(name=thing.name, status="failed", message=str(error))
+        return task
 
-        def one(thing: Object) -> Task | Outcome:
-            given = (*settings, *thing.settings)
-            own = tuple(word for word in given if word != _REPLACES)
-            words = (*own, *((_REPLACES,) if overwrite or own != given else ()))
-            photos, target = Path(thing.photos).absolute(), out / thing.name
-            try:
-                job = replace(read(words), photos=photos, out=target)
-                seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))
-                task = Task(
-                    name=thing.name,
-                    arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
-                    out=target,
-                    key=_key(own, inputs_of(job).values()),
-                    limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
-                    mem_gb=mem_gb or gigabytes,
-                    threads=1,
-                )
-                if is_whole(task):
-                    return Outcome(name=thing.name, status="kept")
-                check(job)
-            except ConfigError as error:
-                raise ConfigError(f"{thing.where or thing.name}: {error}") from error
-            except PimperError as error:
-                return Outcome(name=thing.name, status="failed", message=str(error))
-            return task
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # each run warns of its own
-            found = [one(thing) for thing in objects]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # each run warns of its own
+        found = [one(thing) for thing in objects]
     return Plan(
         tasks=tuple(each for each in found if isinstance(each, Task)),
         settled=tuple(each for each in found if isinstance(each, Outcome)),
@@ -95,8 +92,6 @@ def planned_batch(
 
 def runs_at_once(gigabytes: Sequence[float]) -> int:
     """Return how many runs fit the free memory and the cores of this machine."""
-    with absent():
-        from pimper_torch.cli.doctor.machine import available_gb
     most = available_gb()
     together = accumulate(sorted(gigabytes, reverse=True)[: usable_cores()])
     # A fifth is left to what else runs.

@@ -1,9 +1,12 @@
 """Estimates of a run's time and memory."""
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from pimper_torch.cli.doctor.findings import Finding
-from pimper_torch.cli.doctor.photograph import Photograph
+
+if TYPE_CHECKING:
+    from pimper_torch.cli.doctor.photograph import Photograph
 
 # Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
 # photographs of 900x600, 13.0 megapixels in all) 112 s and 2.06 GB, the jar (30 of 1600x1200, 57.6
@@ -67,7 +70,7 @@ def planned(
     return [*stages, ("extract", 0.5 + 18.0 * one * scales[-1] ** 2), *finish]
 
 
-def cost(photographs: Sequence[Photograph], available_gb: float | None) -> Iterator[Finding]:
+def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Iterator[Finding]:
     """Report the estimate, and whether the memory is there."""
     if not photographs:
         return

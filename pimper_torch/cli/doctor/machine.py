@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import torch
-
 from pimper_torch.cli.doctor.findings import Finding
 from pimper_torch.doors.io.version import versions
 from pimper_torch.runtime.cores import usable_cores
@@ -14,6 +12,8 @@ from pimper_torch.runtime.cores import usable_cores
 
 def machine() -> Iterator[Finding]:
     """Report versions, device, threads and memory."""
+    import torch
+
     told = ", ".join(f"{name} {version}" for name, version in versions().items())
     yield Finding("installed", "ok", told)
     cuda = torch.cuda.is_available()

@@ -3,6 +3,6 @@
 from pimper_torch.doors.exchange.layouts import write_formats
 from pimper_torch.doors.exchange.result import Result, read_result
 from pimper_torch.doors.io.results import write_result
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.asset.mesh_files import MeshFiles
 
 __all__ = ["MeshFiles", "Result", "read_result", "write_formats", "write_result"]

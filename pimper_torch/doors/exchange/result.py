@@ -12,7 +12,8 @@ from torch import Tensor
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.io.estimates import mask_path, read_lights, read_reference
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.photographs import image_name, list_images, load_views, read_mask
+from pimper_torch.doors.io.photograph_files import image_name, list_images
+from pimper_torch.doors.io.photographs import load_views, read_mask
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.method.sfm.model import SparseModel

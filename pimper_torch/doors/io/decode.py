@@ -15,8 +15,9 @@ from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageErr
 from torch import Tensor
 
 from pimper_torch.doors.io import profiles, tiff
-from pimper_torch.doors.io.extras import extra_of, format_of, read_heic, read_heic_header
+from pimper_torch.doors.io.extras import extra_of, format_of
 from pimper_torch.doors.io.header import Header, focal_from_exif
+from pimper_torch.doors.io.heic import read_heic, read_heic_header
 from pimper_torch.doors.io.raw import read_raw, read_raw_header
 from pimper_torch.ground.radiometry.colour import SILENT, Colour
 from pimper_torch.records import Record
@@ -24,7 +25,6 @@ from pimper_torch.runtime.errors import InputError
 
 Result = TypeVar("Result")
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published data sets
 # Choices: the largest sensors have 151 million pixels, in files of 1 GB at most; no photograph of
 # more than 32 million has less than a bit in 25 samples: pictures made to exhaust memory do.

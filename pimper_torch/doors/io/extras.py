@@ -1,21 +1,14 @@
-"""Formats that need a package more than the others, which may be absent; HEIC, by libheif."""
+"""Formats of photographs, and those that need a package more, which may be absent."""
 
 import re
-from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import numpy as np
-from PIL import ExifTags, Image
-
-from pimper_torch.doors.io.header import Header, focal_from_exif
-from pimper_torch.doors.io.profiles import colour_of_codes, colour_of_exif, read_profile
-from pimper_torch.ground.radiometry.colour import SILENT, Colour
 from pimper_torch.runtime.errors import InputError
 
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"),
@@ -82,57 +75,3 @@ def _is_there(module: str) -> bool:
         return find_spec(module) is not None
     except ValueError:  # half imported, or taken away on purpose
         return False
-
-
-def read_heic_header(path: Path | str) -> Header:
-    """Read what the primary picture of a HEIC file is, without its pixels.
-
-    The file's own rotation is applied; EXIF's, which only repeats it, is not.
-    """
-    opened = _opened(path)
-    image = opened[opened.primary_index]
-    info: Mapping[str, Any] = image.info
-    exif = Image.Exif()
-    if isinstance(info.get("exif"), bytes):
-        exif.load(info["exif"])
-    colour = _colour(info)
-    bits = int(info.get("bit_depth", 8))
-    return Header(
-        width=image.size[0],
-        height=image.size[1],
-        orientation=1,
-        focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), *image.size),
-        channels=3 if image.mode.startswith("RGB") else 1,
-        deep=bits > 8,
-        full=255 if bits <= 8 else (2**bits - 1) << (16 - bits),
-        colour=colour_of_exif(exif) if colour is SILENT else colour,
-    )
-
-
-def read_heic(path: Path | str) -> np.ndarray:
-    """Decode the primary picture at its full depth, ``height width channel``; opacity last."""
-    opened = _opened(path)
-    image = opened[opened.primary_index]
-    if image.mode.partition(";")[0] in ("RGBa", "La"):
-        raise InputError(
-            f"{path}: has colours multiplied by their opacity; needed: a photograph without "
-            "transparency. Save it as PNG."
-        )
-    # A copy, made while the file that owns the memory is alive.
-    return np.array(image, copy=True)
-
-
-def _opened(path: Path | str) -> Any:  # noqa: ANN401 - of a package that may be absent
-    heif = load_extra("heic", path)
-    return heif.open_heif(Path(path).read_bytes(), convert_hdr_to_8bit=False, bgr_mode=False)
-
-
-def _colour(info: Mapping[str, Any]) -> Colour:
-    profile, codes = info.get("icc_profile"), info.get("nclx_profile")
-    if isinstance(profile, bytes) and profile:
-        return read_profile(profile)
-    if not isinstance(codes, Mapping):
-        return SILENT
-    # Its matrix and range are undone by the decoder.
-    primaries, curve = codes["color_primaries"], codes["transfer_characteristics"]
-    return colour_of_codes(int(primaries), int(curve), "HEIC's nclx")

@@ -24,7 +24,7 @@ from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
 from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
-from pimper_torch.result.asset.finish import MeshFiles
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.asset.write import write_asset, write_asset_obj
 from pimper_torch.result.report.page import asset_within, write_page
 from pimper_torch.result.report.predictions import predictions

@@ -1,8 +1,6 @@
 """The real size of a result: from lengths that are known, and markers that were printed."""
 
-from pimper_torch.doors.size.find_scale import find_scale as find_scale
-from pimper_torch.doors.size.given import CameraDistance as CameraDistance
-from pimper_torch.doors.size.given import Mark as Mark
-from pimper_torch.doors.size.given import ScaleBar as ScaleBar
-from pimper_torch.doors.size.scale import Scale as Scale
-from pimper_torch.doors.size.scaled import scaled as scaled
+import lazy_loader
+
+# When they are asked for, so that the command line reads settings of this room without torch.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,6 +14,9 @@ Paper = Literal["a4", "letter"]
 
 PAPERS_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 
+TITLE = "pimper_torch sheet of markers"
+"""Of the PDF; tells that a file was written here."""
+
 MIN_SIDE_MM, MAX_SIDE_MM, SIDE_MM = 10, 36, 30
 _NUMBERS = 16  # of one sheet: a frame of 4 by 6
 _ACROSS, _DOWN = 4, 6

@@ -11,6 +11,10 @@ ResponseChoice = Literal["auto", "srgb", "linear"] | float | Path
 # A whole number is one of a file's levels.
 SaturationChoice = Literal["auto"] | float | tuple[float | int, float | int, float | int]
 
+# Radiance from which a pixel counts as saturated, 1 being the level itself: JPEG moves what was
+# 255 down by two levels, which in sRGB are 0.018 of radiance.
+SATURATED = 0.98
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Encoding:

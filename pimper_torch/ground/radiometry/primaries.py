@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.ground.radiometry.saturation import SATURATED
+from pimper_torch.ground.radiometry.encoding import SATURATED
 
 # Columns are the primaries of sRGB in XYZ, adapted to D50 as profiles hold them (ICC, "sRGB").
 _SRGB_D50 = torch.tensor(

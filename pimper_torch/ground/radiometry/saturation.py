@@ -6,10 +6,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-# Radiance from which a pixel counts as saturated, 1 being the level itself: JPEG moves what was
-# 255 down by two levels, which in sRGB are 0.018 of radiance.
-SATURATED = 0.98
-
 # A pile-up is a level that so many photographs share, with so many pixels each. A face of one
 # brightness, in a rendering without noise, has another in each.
 _PHOTOGRAPHS, PIXELS = 2, 8

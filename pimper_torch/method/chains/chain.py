@@ -13,7 +13,6 @@ from pimper_torch.ground.kernels.compile import compile_ahead
 from pimper_torch.method.chains.running import Running
 from pimper_torch.method.coarse.depth_points import depth_points
 from pimper_torch.method.coarse.given_mesh import prepared
-from pimper_torch.method.coarse.reference import view_named
 from pimper_torch.method.sfm.poses import with_poses
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.sfm.sparse_scene import sound
@@ -40,12 +39,14 @@ from pimper_torch.records import (
     Textured,
     Views,
 )
-from pimper_torch.result.asset.finish import MeshFiles, Simplify
+from pimper_torch.result.asset.finish import Simplify
 from pimper_torch.result.asset.make import Texture
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.relighting.held_out import Relight, judge_textures
 from pimper_torch.runtime.config import nearest
-from pimper_torch.runtime.errors import ConfigError, InputError
-from pimper_torch.runtime.failures import OnFailure, collecting, distinct, warn_of
+from pimper_torch.runtime.errors import ConfigError, InputError, OnFailure
+from pimper_torch.runtime.failures import collecting, distinct, warn_of
+from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import left_out_of
 from pimper_torch.runtime.reporting import Observer, Silent, gathered, recorded, stage
 from pimper_torch.runtime.stage import Stage, check_handed

@@ -2,37 +2,33 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
 
 import torch
 from torch import nn
 
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.pyramids import prepare
-from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.method.chains.chain import Chain, Step
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.chains.photometric import Factorizing, Photometric, Sweeping, Warping
 from pimper_torch.method.chains.running import Running
-from pimper_torch.method.coarse.remesh import Remesh, RemeshConfig
-from pimper_torch.method.coarse.surface import CoarseSurface, CoarseSurfaceConfig
-from pimper_torch.method.fusion.fuse import Fuse, FuseConfig
-from pimper_torch.method.meshing.extract import Extract, ExtractConfig
+from pimper_torch.method.coarse.remesh import Remesh
+from pimper_torch.method.coarse.surface import CoarseSurface
+from pimper_torch.method.fusion.fuse import Fuse
+from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.repair import Repair
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.method.patches.warp import Warp, WarpConfig
-from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight, Illumination
 from pimper_torch.method.photometry.gauge import FixGauge
 from pimper_torch.method.photometry.lights import thinned
 from pimper_torch.method.sfm.poses import one_view_a_pose
 from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.method.silhouettes.trace import TraceContours
-from pimper_torch.method.sweep.sweep import Sweep, SweepConfig
+from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import (
     Cameras,
@@ -48,9 +44,8 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.records.scene_parts import with_views
-from pimper_torch.runtime.config import Range, require, require_ranges
-from pimper_torch.runtime.failures import OnFailure
-from pimper_torch.runtime.memory import bytes_of, largest_problem
+from pimper_torch.runtime.config import bytes_of, require
+from pimper_torch.runtime.memory import largest_problem
 from pimper_torch.runtime.reporting import Observer
 from pimper_torch.runtime.store import Store, opened
 
@@ -84,48 +79,6 @@ def held_apart(
         with_views(scene, ~out).replace(unregistered=scene.unregistered),
         with_views(scene, out).replace(unregistered=()),
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoarseToFineConfig:
-    """The settings of every stage of the chain from coarse to fine, in the order they run.
-
-    Attributes:
-        chain: Which chain these are the settings of.
-        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
-        max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
-            the first pass.
-        hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
-        scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
-        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-            ``encoding``.
-    """
-
-    chain: ClassVar[str] = "coarse-to-fine"
-    on_failure: OnFailure = "skip"
-    max_memory: str = ""
-    hold_out: Annotated[int, Range(least=0, most=1_000_000)] = 0
-    scales: tuple[float, ...] = (0.25, 0.5, 1.0)
-    photographs: Encoding = field(default_factory=Encoding)
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
-    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
-    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
-    warp: WarpConfig = field(default_factory=WarpConfig)
-    light: FitLightConfig = field(default_factory=FitLightConfig)
-    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
-    sweep: SweepConfig = field(default_factory=SweepConfig)
-    fuse: FuseConfig = field(default_factory=FuseConfig)
-    remesh: RemeshConfig = field(default_factory=RemeshConfig)
-    extract: ExtractConfig = field(default_factory=ExtractConfig)
-
-    def __post_init__(self) -> None:
-        bytes_of(self.max_memory)
-        require_ranges(self)
-        require(self.hold_out != 1, "hold_out", self.hold_out, "0, or 2 at least")
-        # Photographs hold nothing between their pixels, and memory goes with the square.
-        sound = bool(self.scales) and all(0 < scale <= 4 for scale in self.scales)
-        require(sound, "scales", self.scales, "one at least, above 0 and at most 4 each")
 
 
 class CoarseToFine(Chain):

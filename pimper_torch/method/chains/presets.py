@@ -5,42 +5,15 @@ from pathlib import Path
 
 from torch import nn
 
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFine, CoarseToFineConfig
-from pimper_torch.method.chains.published import Published, PublishedConfig
-from pimper_torch.runtime.config import build, find_config, overlay, read_mapping, require
+from pimper_torch.method.chains.chain_config import (
+    Config,
+    PublishedConfig,
+    load_config,
+)
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.method.chains.published import Published
 from pimper_torch.runtime.reporting import Observer
 from pimper_torch.runtime.store import Store
-
-Config = CoarseToFineConfig | PublishedConfig
-
-
-def load_config(
-    name_or_path: str | Path = "default", changes: Mapping[str, object] | None = None
-) -> Config:
-    """Read a preset, or a YAML file of one's own, which holds only what differs.
-
-    Args:
-        name_or_path: ``"default"``, ``"paper"``, ``"fast"``, or a file. Its ``chain`` says which
-            chain it is for: ``coarse-to-fine`` unless given, or ``published``.
-        changes: Laid over the file, nested by stage like it.
-
-    Raises:
-        ConfigError: Names the file or `changes`, section and key, and the nearest valid one.
-    """
-    path = find_config(name_or_path)
-    settings = read_mapping(path)
-    config = _built(settings, str(path))
-    return _built(overlay(settings, changes), "changes") if changes else config
-
-
-def _built(settings: Mapping[str, object], where: str) -> Config:
-    """Make the config of the chain that settings are for."""
-    chain = settings.get("chain", CoarseToFineConfig.chain)
-    found = [config for config in (CoarseToFineConfig, PublishedConfig) if config.chain == chain]
-    names = f"{CoarseToFineConfig.chain} or {PublishedConfig.chain}"
-    require(len(found) == 1, f"{where}: chain", chain, names)
-    config: type[Config] = found[0]
-    return build(config, settings, where)
 
 
 def make_chain(

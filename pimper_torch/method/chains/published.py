@@ -1,33 +1,29 @@
 """The published chain: every facet by itself, then all joined."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 from torch import nn
 
 from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.method.chains.chain import Chain, Step
+from pimper_torch.method.chains.chain_config import PublishedConfig
 from pimper_torch.method.chains.photometric import Factorizing, Warping
 from pimper_torch.method.chains.running import Running
-from pimper_torch.method.coarse.surface import CoarseSurface, CoarseSurfaceConfig
-from pimper_torch.method.meshing.extract import Extract, ExtractConfig
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
-from pimper_torch.method.patches.warp import Warp, WarpConfig
-from pimper_torch.method.photometry.factorize import Factorize, FactorizeConfig
-from pimper_torch.method.photometry.fit_light import FitLight, FitLightConfig, Illumination
+from pimper_torch.method.coarse.surface import CoarseSurface
+from pimper_torch.method.meshing.extract import Extract
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.photometry.factorize import Factorize
+from pimper_torch.method.photometry.fit_light import FitLight, Illumination
 from pimper_torch.method.photometry.gauge import FixGauge
 from pimper_torch.method.sfm.poses import one_view_a_pose
 from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.paper.align import Align, AlignConfig
+from pimper_torch.paper.align import Align
 from pimper_torch.paper.integrate import Integrate
-from pimper_torch.paper.refine import Refine, RefineConfig
-from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig
+from pimper_torch.paper.refine import Refine
+from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import (
     CoarseMesh,
@@ -39,36 +35,8 @@ from pimper_torch.records import (
     Surface,
     Views,
 )
-from pimper_torch.runtime.failures import OnFailure
 from pimper_torch.runtime.reporting import Observer
 from pimper_torch.runtime.store import Store, opened
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PublishedConfig:
-    """The settings of every stage of the published chain, in the order they run.
-
-    Attributes:
-        chain: Which chain these are the settings of.
-        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
-        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-            ``encoding``.
-    """
-
-    chain: ClassVar[str] = "published"
-    on_failure: OnFailure = "skip"
-    photographs: Encoding = field(default_factory=Encoding)
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    silhouettes: SilhouetteConfig = field(default_factory=SilhouetteConfig)
-    triangulate: TriangulateConfig = field(default_factory=TriangulateConfig)
-    coarse_surface: CoarseSurfaceConfig = field(default_factory=CoarseSurfaceConfig)
-    decompose: DecomposeConfig = field(default_factory=DecomposeConfig)
-    warp: WarpConfig = field(default_factory=WarpConfig)
-    light: FitLightConfig = field(default_factory=FitLightConfig)
-    factorize: FactorizeConfig = field(default_factory=FactorizeConfig)
-    align: AlignConfig = field(default_factory=AlignConfig)
-    refine: RefineConfig = field(default_factory=RefineConfig)
-    extract: ExtractConfig = field(default_factory=ExtractConfig)
 
 
 class Published(Chain):

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.window_matching import (
     Matcher,
     MatchingLevel,
@@ -23,7 +23,6 @@ from pimper_torch.method.coarse.window_matching import (
     shifted,
 )
 from pimper_torch.records import Record, SparseScene
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.failures import solved_or
 from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.memory import release_memory
@@ -48,30 +47,6 @@ _MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
 # windows has a peak a pixel or two wide. Over the whole range; around a field from the coarser
 # resolution; around the best of either.
 _WHOLE_STEP, _NEAR_STEP, _LAST_STEP = 0.7, 0.8, 0.5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DensifyConfig:
-    """The resolutions at which depth maps are searched.
-
-    Attributes:
-        coarsest_px: Longer side of the photographs, about, where the whole range of depths
-            is searched.
-        levels: How often the resolution doubles from there, that included.
-        max_hypotheses: Of the search of the whole range.
-    """
-
-    coarsest_px: Annotated[int, Range(least=32, most=65_535)] = 100
-    levels: Annotated[int, Range(least=1, most=16)] = 3
-    max_hypotheses: Annotated[int, Range(least=8, most=10_000)] = 160
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
-
-    def factors(self, longest_px: int) -> tuple[int, ...]:
-        """Return by how much photographs of that size are reduced, the coarsest first."""
-        coarsest = max(1, round(longest_px / self.coarsest_px))
-        return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(self.levels)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

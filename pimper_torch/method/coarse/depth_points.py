@@ -16,13 +16,8 @@ from pimper_torch.ground.geometry.lens_models import photographed
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.ground.geometry.supporting_plane import fixation
-from pimper_torch.method.coarse.densify import (
-    DensifyConfig,
-    DepthMaps,
-    agreeing,
-    depth_maps,
-    nearest_pixels,
-)
+from pimper_torch.method.coarse.coarse_config import DensifyConfig
+from pimper_torch.method.coarse.densify import DepthMaps, agreeing, depth_maps, nearest_pixels
 from pimper_torch.method.coarse.window_matching import Matcher, Windows, pair
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import caution

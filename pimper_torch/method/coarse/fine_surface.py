@@ -15,7 +15,7 @@ from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.method.coarse import trim
-from pimper_torch.method.coarse.densify import DensifyConfig
+from pimper_torch.method.coarse.coarse_config import DensifyConfig, FineSurfaceConfig
 from pimper_torch.method.coarse.oriented import (
     OrientedPoints,
     matched_cloud,
@@ -67,7 +67,7 @@ def fine_surface(
     reliable: Int[Tensor, " reliable"],
     contours: Contours,
     densify: DensifyConfig,
-    config: trim.FineSurfaceConfig,
+    config: FineSurfaceConfig,
 ) -> FineSurface:
     """Put a surface through matched points and contours, smooth where there are neither.
 

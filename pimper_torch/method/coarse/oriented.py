@@ -12,7 +12,8 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.coarse.densify import DensifyConfig, DepthMaps, depth_maps
+from pimper_torch.method.coarse.coarse_config import DensifyConfig
+from pimper_torch.method.coarse.densify import DepthMaps, depth_maps
 from pimper_torch.method.coarse.window_matching import shifted
 from pimper_torch.records import Cameras, Record, SparseScene
 from pimper_torch.runtime.ledger import leave_out

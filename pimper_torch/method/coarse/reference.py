@@ -1,9 +1,7 @@
 """The reference view: the frontal one, or the one that a setting names."""
 
-from collections.abc import Sequence
-
 from pimper_torch.records import SparseScene
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.file_names import view_named
 
 
 def reference_view(scene: SparseScene, name: str = "") -> int:
@@ -17,14 +15,3 @@ def reference_view(scene: SparseScene, name: str = "") -> int:
         shared = (observed.mT @ observed).fill_diagonal_(0)
         return int(shared.sqrt().sum(dim=1).argmax())
     return view_named(name, scene.views.names, "registered photographs")
-
-
-def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
-    """Find the one photograph of a name, with its suffix or without."""
-    found = [index for index, known in enumerate(names) if name in (known, known.rsplit(".", 1)[0])]
-    if len(found) != 1:
-        raise InputError(
-            f"reference view: {len(found)} {of} are named {name!r}; needed: one of "
-            f"{', '.join(names)}."
-        )
-    return found[0]

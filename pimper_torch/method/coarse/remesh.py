@@ -1,8 +1,5 @@
 """Remeshing: facets that the surface departs from are split, unseen ones dropped."""
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -13,9 +10,9 @@ from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
 from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.method.coarse import splitting
+from pimper_torch.method.coarse.coarse_config import RemeshConfig
 from pimper_torch.method.coarse.trim import enclosed_holes
 from pimper_torch.records import CoarseMesh, Mesh, Surface, SweptPatches
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -27,32 +24,6 @@ _ON_EDGE = 1e-6
 # A facet whose corners would move stays where its area falls below this fraction, or its longest
 # side grows so many times: it collapses, or has an outlier for a corner. Choices.
 _MIN_AREA, _MAX_STRETCH = 0.05, 4.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RemeshConfig:
-    """Which facets are split, and which dropped.
-
-    Attributes:
-        max_departure: Distance, in samples, that nine in ten of a facet's subdivided mesh vertices
-            may lie off its plane.
-        max_spread_deg: Root mean square angle of the surface's normals within a facet.
-        min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
-            never split.
-        max_facets: The worst facets are split first, as long as there are no more than so many
-            afterwards.
-        max_hole: Facets without data stay when neighbours enclose them and they have no more
-            than this fraction of the mesh's area together.
-    """
-
-    max_departure: Annotated[float, Range(above=0)] = 2.0
-    max_spread_deg: Annotated[float, Range(above=0, most=180)] = 12.0
-    min_samples: Annotated[float, Range(above=0, most=1e9)] = 12.0
-    max_facets: Annotated[int, Range(least=1, most=1_000_000)] = 5000
-    max_hole: Annotated[float, Range(least=0, below=1)] = 0.02
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "remesh")
 
 
 class Remesh(Stage):

@@ -1,8 +1,5 @@
 """The coarse mesh: a surface through the cloud and the contours, simplified to facets."""
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,14 +12,17 @@ from pimper_torch.ground.geometry.projection import triangulation_angles
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_edges
-from pimper_torch.method.coarse.densify import DensifyConfig
+from pimper_torch.method.coarse.coarse_config import (
+    CoarseSurfaceConfig,
+    DensifyConfig,
+    FineSurfaceConfig,
+)
 from pimper_torch.method.coarse.fine_surface import fine_surface
 from pimper_torch.method.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.method.coarse.oriented import pixel_size
 from pimper_torch.method.coarse.reference import reference_view
-from pimper_torch.method.coarse.trim import FineSurfaceConfig, min_fraction, supported_components
+from pimper_torch.method.coarse.trim import min_fraction, supported_components
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -34,26 +34,6 @@ _ON_FACET_PX = 4.0
 # Choices: two views of a wrong match always agree, three seldom; narrower angles leave depth
 # uncertain.
 _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoarseSurfaceConfig:
-    """The reference view and the size of the coarse mesh.
-
-    Attributes:
-        reference: Name or stem of the frontal photograph; empty chooses it.
-        num_facets: About so many are left after simplification.
-        levels: Resolutions of the depth maps, the longer side of the first about 100 pixels, each
-            other one twice that before.
-    """
-
-    reference: str = ""
-    num_facets: Annotated[int, Range(least=4, most=1_000_000)] = 3000
-    levels: int = 3
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "coarse_surface")
-        DensifyConfig(levels=self.levels)
 
 
 class CoarseSurface(Stage):

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,11 +14,11 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.sums import total
+from pimper_torch.method.coarse.coarse_config import FineSurfaceConfig
 from pimper_torch.method.coarse.densify import DepthMaps
 from pimper_torch.method.coarse.oriented import OrientedPoints
 from pimper_torch.method.coarse.window_matching import MatchingLevel
 from pimper_torch.records import ContourPoints, Record, Support
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import num_workers, side_by_side
 
@@ -42,25 +41,6 @@ _MOST_THROUGH = 0.25
 # points, with all connected to it that are further than the second. Spans over gaps in potatoes
 # stay, and surface in the air beside the object is dropped (benchmarks/README.md, ablations).
 _GAP_PX, _MARGIN_PX = 40.0, 10.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FineSurfaceConfig:
-    """Which holes of the surface are closed.
-
-    Attributes:
-        hole_px: Side of a square as large as the largest hole that is closed whatever made it,
-            pixels of the finest depth maps. Strips along a border that are narrower go, where
-            they are small or unsupported.
-        max_unseen: Fraction of the area seen that a hole may have which only lack of views made,
-            such as the bottom of a deep concavity, to be closed.
-    """
-
-    hole_px: Annotated[float, Range(least=0)] = 24.0
-    max_unseen: Annotated[float, Range(least=0, below=1)] = 0.02
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "fine_surface")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

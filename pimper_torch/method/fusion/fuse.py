@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Annotated, cast
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,6 +35,7 @@ from pimper_torch.method.fusion.blocks import (
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.method.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error
+from pimper_torch.method.fusion.fuse_config import FuseConfig
 from pimper_torch.method.fusion.normal_bias import CoarsePart, NormalBias, normal_bias
 from pimper_torch.method.fusion.problem import FINEST, Problem, laid, pose
 from pimper_torch.method.fusion.terms import (
@@ -48,7 +49,7 @@ from pimper_torch.method.fusion.terms import (
     rotation,
 )
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
-from pimper_torch.runtime.config import Range, require, require_ranges
+from pimper_torch.runtime.config import require
 from pimper_torch.runtime.failures import solved_or
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import release_memory
@@ -57,41 +58,6 @@ from pimper_torch.runtime.stage import Stage
 # Errors that facets share are estimated on a subdivided mesh so many times as coarse. The noise
 # factors of the demo's last pass are found within 15 % on one four times as coarse, too.
 _COARSER = 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FuseConfig:
-    """Which terms take part, and how the noise of each kind is estimated.
-
-    Attributes:
-        samples_per_vertex: Template samples between neighbouring vertices of the surface.
-            Time and memory fall with its square.
-        terms: Kinds of evidence, in the order that they are summed up, see
-            :mod:`~pimper_torch.method.fusion.terms`.
-        bias_iterations: How often the tilt that the normals of a facet have in common, and the
-            variance of the error that its swept heights have in common, are estimated; 0 takes
-            all errors for independent.
-        noise_iterations: Solves in which the noise of each kind of terms is estimated and
-            outliers lose weight: for each estimate of the tilt, and for the expected error, on a
-            coarser subdivided mesh, and once at full size. The coarse shape takes one more.
-        error_draws: Of noise, for the expected error of every vertex; its relative standard error
-            is one over the square root of twice as many, a quarter for 8. 0 gives none.
-    """
-
-    samples_per_vertex: float = 1.0
-    terms: tuple[str, ...] = tuple(TERMS)
-    bias_iterations: Annotated[int, Range(least=0, most=1000)] = 2
-    noise_iterations: Annotated[int, Range(least=1, most=1000)] = 3
-    error_draws: Annotated[int, Range(least=0, most=1000)] = 8
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "fuse")
-        each = self.samples_per_vertex
-        # The number of vertices goes with the square: 16 a sample tell all that it says.
-        sound = 0.25 <= each <= 65_535
-        require(sound, "fuse.samples_per_vertex", each, "at least 0.25, at most 65,535")
-        known = set(self.terms) <= set(TERMS) and len(set(self.terms)) == len(self.terms) > 0
-        require(known, "fuse.terms", self.terms, f"some of {', '.join(TERMS)}, each once")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

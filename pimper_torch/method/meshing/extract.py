@@ -1,8 +1,5 @@
 """Extraction: the joined surface in, one connected mesh out."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -12,8 +9,8 @@ from pimper_torch.ground.geometry.surfaces import component_areas
 from pimper_torch.ground.geometry.topology import face_components, vertex_fans
 from pimper_torch.method.meshing.borders import protruding
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
+from pimper_torch.method.meshing.meshing_config import ExtractConfig
 from pimper_torch.records import Mesh, Surface
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -25,35 +22,6 @@ _TOOTH = 0.6
 # skull's flaps 3 in 4 faces have more than 8, of its other faces the median has 1; with 5 the
 # flaps go, and 8 % of what is cut without this limit stays.
 _UNSURE = 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExtractConfig:
-    """Criteria for the parts of the surface to keep.
-
-    Attributes:
-        max_expected_error: Faces with a vertex that is expected to be further off are cut out;
-            a fraction of the surface's extent (diagonal of its bounding box). Infinite keeps all.
-        max_hole: Connected vertices without support stay, as a filled hole, when they
-            extend over no more than this fraction of the surface's extent (both diagonals
-            of bounding boxes).
-        max_stretch: Longest edge of a face, in multiples of the surface's median edge;
-            longer ones are spikes or cliffs. Infinite keeps all.
-        overturned: Which of the faces turned more than 90 degrees from the mean of their facet
-            are left out: those that a fold bounds, as the others are on facets that bend far;
-            all; or none.
-        min_piece: Fraction of the largest connected component's area that another one needs to
-            be kept; 1 keeps the largest only.
-    """
-
-    max_expected_error: Annotated[float, Range(above=0)] = 0.02
-    max_hole: Annotated[float, Range(least=0)] = 1.0
-    max_stretch: Annotated[float, Range(above=1)] = 10.0
-    overturned: Literal["folded", "all", "none"] = "folded"
-    min_piece: Annotated[float, Range(least=0, most=1)] = 0.01
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Extract(Stage):

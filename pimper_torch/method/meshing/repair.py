@@ -4,8 +4,6 @@ The faces stay as they are, so that a closed surface stays closed.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,8 +14,8 @@ from pimper_torch.ground.geometry import topology
 from pimper_torch.ground.geometry.surfaces import side_lengths, vertex_normals
 from pimper_torch.ground.linalg.systems import solutions
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
+from pimper_torch.method.meshing.meshing_config import RepairConfig
 from pimper_torch.records import Surface
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
@@ -72,24 +70,6 @@ def least_bent(
 # Rings of sound vertices that a component with defects may take in, one at a time: with twice the
 # samples a pixel, 6 left 5 openings in a skull's orbit, and 12 none (commit 3dadfd4).
 _RINGS = 12
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RepairConfig:
-    """Which faces are defective, and how far a component of them may extend to be repaired.
-
-    Attributes:
-        max_extent: Diagonal of a repaired component's bounding box, as a fraction of the
-            surface's; 0 repairs nothing.
-        max_stretch: Longest edge of a face, in multiples of the surface's median edge; longer
-            ones are spikes.
-    """
-
-    max_extent: Annotated[float, Range(least=0)] = 0.1
-    max_stretch: Annotated[float, Range(above=1)] = 10.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "repair")
 
 
 class Repair(Stage):

@@ -1,8 +1,5 @@
 """Decomposition: every facet of the coarse mesh becomes a patch with a template."""
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -12,40 +9,14 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.transfer import transfer
 from pimper_torch.method.patches.view_choice import view_blocks
 from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.failures import skipped_patches
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.stage import Stage
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DecomposeConfig:
-    """Spacing of a facet's samples, and their reach over its edges.
-
-    Attributes:
-        samples_per_pixel: Template samples per pixel of the reference view; the paper's
-            zeta, made independent of the scene's unit.
-        overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
-        num_views: Largest number of views of a facet. Where more face one, each is seen in its best
-            ones, spread in direction, which it shares with a block of facets.
-        max_samples: Of all facets in all views that they face, ``num_views`` at most: where there
-            would be more, samples lie further apart. Bounds time and memory; infinite for no limit.
-        bucket_entries: Samples times views of templates that are batched together: few enough
-            for a processor's cache.
-    """
-
-    samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
-    overlap_samples: Annotated[float, Range(least=1, most=65_535)] = 2.0  # the widest photograph
-    num_views: Annotated[int, Range(least=3, most=100_000)] = 40
-    max_samples: Annotated[float, Range(least=1)] = 4.5e7
-    bucket_entries: Annotated[int, Range(least=1, most=100_000_000)] = 300_000  # 100 bytes each
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
 
 
 class Decompose(Stage):

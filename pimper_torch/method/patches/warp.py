@@ -1,9 +1,8 @@
 """Registration: every view resampled on every template, the matrices J and D."""
 
 import math
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,7 +33,7 @@ from pimper_torch.ground.kernels.arrays import (
     pulled_back,
 )
 from pimper_torch.ground.kernels.switch import compiled_for
-from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.template_priors import merged
 from pimper_torch.records import (
     Cameras,
@@ -45,7 +44,6 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
-from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.failures import over_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import side_by_side
@@ -168,32 +166,6 @@ def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
     """Return the site nearest to each of a row of samples."""
     index = torch.arange(sites, dtype=torch.float32)[None, None]
     return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WarpConfig:
-    """Which samples a view is allowed to contribute.
-
-    Attributes:
-        dark_level: Radiance at or below which a sample is missing; 1 is saturation.
-        saturation_level: Radiance at or above which a pixel of any channel is missing.
-        max_tilt_deg: A facet turned further from a view is not used there.
-        occlusion_stride: Samples between the rays that test for occlusion.
-    """
-
-    dark_level: Annotated[float, Range(least=0, below=1)] = 0.01
-    saturation_level: float = SATURATED
-    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
-    occlusion_stride: Annotated[int, Range(least=1, most=65_535)] = 4
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
-        require(
-            self.saturation_level > self.dark_level,
-            "saturation_level",
-            self.saturation_level,
-            f"above dark_level {self.dark_level}",
-        )
 
 
 class Warp(Stage):

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal, cast
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,6 +33,7 @@ from pimper_torch.method.photometry.light_field import (
     harmonics,
     is_strong,
 )
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.sample_estimates import (
     Rows,
     fit_albedo,
@@ -57,7 +58,7 @@ from pimper_torch.records import (
     StopCause,
     Templates,
 )
-from pimper_torch.runtime.config import Range, require, require_ranges
+from pimper_torch.runtime.config import require
 from pimper_torch.runtime.failures import over_patches, skipped_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import recomputed
@@ -82,49 +83,6 @@ LOSSES: dict[str, Callable[..., Loss]] = {
 TO_CONVERGENCE = 300, 1e-9
 
 _COARSE_NORMALS = "These patches keep the coarse mesh's normals"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FactorizeConfig:
-    """Settings of :class:`Factorize`.
-
-    The published method is ``solver="balm"``, ``loss="squares"``, and no priors: ``light_prior=0``
-    and ``geometry_weight=0``.
-
-    Attributes:
-        solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
-            eliminated; ``"balm"``, augmented Lagrangian.
-        light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in
-            units of the patch's own data; 0 leaves them free, 1e6 fixes them.
-        geometry_weight: Weight of the prior of normals, whose mean is the coarse ones, in units
-            of one view.
-        loss: ``"cauchy"``, by which highlights and shadows lose weight; ``"geman-mcclure"``, by
-            which they lose it faster; ``"huber"``, more slowly; or ``"squares"``.
-        loss_scale: Of the loss, in standard deviations of the patch's residuals; 0 for that at
-            which it is 95 % efficient on Gaussian noise.
-        min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
-            and the lights take their share.
-        min_light_variation: Minimum third singular value of a patch's lights, over the first;
-            about the smaller extent, in radians, of the light's directions.
-        max_iterations: Of the solver.
-        tolerance: Relative change at which a patch has converged: of its objective with variable
-            projection, of its shading vectors with BALM.
-    """
-
-    solver: Literal["variable-projection", "balm"] = "variable-projection"
-    light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
-    geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
-    loss: Literal["squares", "cauchy", "huber", "geman-mcclure"] = "cauchy"
-    loss_scale: Annotated[float, Range(least=0, most=1e12)] = 0.0
-    min_views: Annotated[int, Range(least=3, most=100_000)] = 4
-    min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
-    max_iterations: Annotated[int, Range(least=1, most=100_000)] = 60
-    tolerance: Annotated[float, Range(above=0, most=1)] = 1e-3
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "factorize")
-        require(self.solver in SOLVERS, "factorize.solver", self.solver, " or ".join(SOLVERS))
-        require(self.loss in LOSSES, "factorize.loss", self.loss, " or ".join(LOSSES))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

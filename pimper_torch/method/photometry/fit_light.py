@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
@@ -14,9 +13,9 @@ from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.method.photometry.factor_priors import RELATIVE_NOISE
 from pimper_torch.method.photometry.light_field import LightField, harmonics, rotate_lights
 from pimper_torch.method.photometry.lights import light_of_mesh
+from pimper_torch.method.photometry.photometry_config import FitLightConfig
 from pimper_torch.method.photometry.sample_estimates import initial_shading, rows_of
 from pimper_torch.records import PatchPriors, PatchViews, Record
-from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.stage import Stage
 
 # Guessed normals suit the photographs better if residuals fall below this fraction: a choice. True
@@ -27,36 +26,6 @@ _GUESS_GAIN = 0.95
 # Information of the surface's normals where guesses stand beside them: a choice, 5.4 degrees, as
 # much as the weight of their prior says.
 _SURFACE_INFORMATION = 0.1 / RELATIVE_NOISE**2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FitLightConfig:
-    """Settings of :class:`FitLight`.
-
-    The published method is ``model="soft"``, ``colours=False`` and ``shadows=False``.
-
-    Attributes:
-        model: ``"soft"``, first-order harmonics per view, constant over the scene;
-            ``"point_light"``, ambient light and a near point light with attached shadows;
-            ``"room"``, a near point light in a room that is lit, whose light is second-order
-            harmonics shared by the views up to exposure; ``"auto"``, the simplest that predicts
-            radiance left out of the fit.
-        colours: Whether views may have light of unlike colour, where that predicts radiance left
-            out of the fit, and be exposed unlike by 1.5 stops or more.
-        shadows: Whether the surface casts shadows, whose samples the factorization leaves out.
-            Needs a surface that is nearly right.
-        min_views: Views a sample must be seen in.
-    """
-
-    model: Literal["auto", "soft", "point_light", "room"] = "auto"
-    colours: bool = True
-    shadows: bool = True
-    min_views: Annotated[int, Range(least=3, most=100_000)] = 4
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "light")
-        models = ("auto", "soft", "point_light", "room")
-        require(self.model in models, "light.model", self.model, " or ".join(models))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from pimper_torch.method.photometry.factorize import FactorizeConfig
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.status import warn_of_undetermined
 from pimper_torch.records import PatchStatus, PhotometricPatches
 from pimper_torch.runtime.ledger import leave_out

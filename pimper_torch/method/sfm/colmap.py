@@ -15,19 +15,6 @@ from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.model_files import read_files, sound_model
 from pimper_torch.runtime.errors import OutputError
 
-CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-)
-"""COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
-
 
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model, text or binary.

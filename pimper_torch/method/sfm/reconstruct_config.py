@@ -3,13 +3,25 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from pimper_torch.method.sfm.colmap import CAMERA_MODELS
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.cores import usable_cores
 
 # Verified matches below which a pair of photographs does not count, and points of the model that a
 # view must see to be added, and to stay in it: COLMAP's own.
 MIN_MATCHES, MIN_POINTS = 15, 30
+
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+)
+"""COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

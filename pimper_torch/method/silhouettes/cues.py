@@ -1,7 +1,7 @@
 """Cues about the object before any view is cut."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 
 import torch
@@ -15,19 +15,51 @@ from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import (
     Fixation,
     Plane,
+    PlaneSearch,
     fixation,
     supporting_plane,
     well_tracked,
 )
 from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.method.silhouettes import parallax
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import by_view
 
 FEW = 3  # soft masks: fewer have no majority
 _SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SilhouetteDetails:
+    """Settings of the search for silhouettes that all photographs share.
+
+    See :class:`~pimper_torch.method.silhouettes.find.FindSilhouettes`. Chosen on the four rendered
+    scenes and the skull (``benchmarks/silhouettes.py``).
+
+    Attributes:
+        iterations: Of cutting and voting after the first cut.
+        disagreeing: Fraction of the views that may see a voxel of the hull outside.
+        min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
+            view is not reliable.
+        max_exposed: Fraction of a view's silhouette that may show a background for certain: the
+            supporting plane, or a room at rest. True masks show up to 0.001, masks 20 px of 640 too
+            wide 0.007 to 0.19 (mug, potatoes and scorpion, two of them on turntables).
+        min_held: Fraction of the object's points that a view's silhouette must hold. True masks
+            hold 0.948 and more, masks 20 px too narrow 0.50 to 0.80 (mug, potatoes).
+        min_overlap: Intersection over union of silhouettes and projections, in the median, below
+            which silhouettes are not reliable.
+    """
+
+    iterations: int = 2
+    num_voxels: int = 500_000
+    disagreeing: float = 0.05
+    plane: PlaneSearch = field(default_factory=PlaneSearch)
+    min_covered: float = 0.9
+    max_exposed: float = 0.01
+    min_held: float = 0.9
+    min_overlap: float = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_hull
-from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cues import Cues, SilhouetteDetails, cues_of
 from pimper_torch.method.silhouettes.cuts import Cuts, cut_in_iterations
 from pimper_torch.method.silhouettes.reliability import (
     Agreement,
@@ -15,7 +15,7 @@ from pimper_torch.method.silhouettes.reliability import (
     contradictory,
     silhouettes_of,
 )
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig, SilhouetteDetails
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.records.scene_parts import OneAPose, with_views
 from pimper_torch.runtime.errors import InputError, caution

@@ -12,8 +12,8 @@ from pimper_torch.ground.geometry.opencv import blind_holes, components_of, sign
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.method.silhouettes.cues import SilhouetteDetails
 from pimper_torch.method.silhouettes.cuts import Cuts, is_deep
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteDetails
 from pimper_torch.records import Cameras, Record, Silhouettes, Views
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, zeros

@@ -1,8 +1,6 @@
 """The stage that finds heights by a sweep along normals, under the fitted light."""
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +10,7 @@ from pimper_torch.ground.geometry.pyramids import Sources, prepare
 from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.method.sweep.costs import STEP, Hypotheses, costs_of
 from pimper_torch.method.sweep.minimum import parabola_minimum, posterior_variance
+from pimper_torch.method.sweep.sweep_config import SweepConfig
 from pimper_torch.method.sweep.windows import level_weight, window_mean, window_size
 from pimper_torch.records import (
     Cameras,
@@ -25,7 +24,6 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
-from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.failures import over_patches, skipped_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import side_by_side
@@ -43,27 +41,6 @@ _NO_HEIGHTS = "These patches keep their template's heights there"
 # Of the robust cost, in standard deviations of the patch's residuals: a choice (2.385 is 95 %
 # efficient on Gaussian noise).
 _LOSS_SCALE = 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SweepConfig:
-    """Which heights are tried, and in how many views they are compared.
-
-    Attributes:
-        steps: Tried on each side of the template.
-        num_views: Largest number of views that a sample is compared in: the best by angle,
-            resolution and light of those that have it.
-        min_views: A sample that fewer usable views have, of distinct poses, gets no height.
-    """
-
-    steps: Annotated[int, Range(least=1, most=1000)] = 4
-    num_views: Annotated[int, Range(least=2, most=100_000)] = 16
-    min_views: Annotated[int, Range(least=2)] = 3
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "sweep")
-        least = self.min_views
-        require(self.num_views >= least, "sweep.num_views", self.num_views, "min_views or more")
 
 
 class Sweep(Stage):

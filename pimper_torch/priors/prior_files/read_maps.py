@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from pimper_torch.priors import from_maps
+from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.priors.prior_files.folder import read_maps, single
 from pimper_torch.records import DepthPrior, NormalPrior, Views
 from pimper_torch.runtime.errors import InputError
@@ -14,9 +15,9 @@ from pimper_torch.runtime.errors import InputError
 def read_normals(
     folder: Path | str,
     views: Views,
-    axes: from_maps.NormalAxes = "auto",
+    axes: NormalAxes = "auto",
     *,
-    error_deg: float = from_maps.NORMALS_ERROR_DEG,
+    error_deg: float = NORMALS_ERROR_DEG,
     undistorted: bool = False,
 ) -> NormalPrior:
     """Read normals of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
@@ -50,7 +51,7 @@ def read_depth(
     *,
     along: Literal["axis", "ray"] = "axis",
     gauge: Literal["scene", "scale", "affine"] = "affine",
-    error: float = from_maps.DEPTH_ERROR,
+    error: float = DEPTH_ERROR,
     undistorted: bool = False,
 ) -> DepthPrior:
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.

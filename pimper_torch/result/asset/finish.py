@@ -1,8 +1,5 @@
 """Finish of a surface before it is written: fewer vertices, and caps where it is open."""
 
-from dataclasses import dataclass
-from typing import Literal
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,8 +10,8 @@ from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.method.meshing.closing import closed
 from pimper_torch.method.meshing.simplify import simplify
 from pimper_torch.records import Closed, Finished, Mesh
+from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import base_color
-from pimper_torch.runtime.config import require
 from pimper_torch.runtime.stage import Stage
 
 # What people can edit, and browsers draw at once.
@@ -23,25 +20,6 @@ _FACES = 50_000
 # Steps that the eye hardly sees on a rendered surface, and errors far below what these two
 # figures are known to.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeshFiles:
-    """Form in which the surface is written.
-
-    Attributes:
-        faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a
-            sample's spacing and 1.5 degrees.
-        formats: Beside PLY and GLB, which are always written.
-    """
-
-    faces: int | Literal["all"] | None = None
-    watertight: bool = False
-    formats: tuple[Literal["stl", "obj"], ...] = ()
-
-    def __post_init__(self) -> None:
-        few = self.faces is not None and self.faces != "all" and self.faces < 4
-        require(not few, "faces", self.faces, "all, or 4 at least, those of a tetrahedron")
 
 
 class Simplify(Stage):

@@ -4,13 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pimper_torch.doors.size.aruco import CELLS, cells_of
-from pimper_torch.doors.size.sheet import PAPERS_MM, SIDE_MM, Paper, layout
+from pimper_torch.doors.size.sheet import PAPERS_MM, SIDE_MM, TITLE, Paper, layout
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-TITLE = "pimper_torch sheet of markers"
-"""Of the PDF; tells that a file was written here."""
 
 _RULER_MM = 100
 # White cells are drawn along rows and along columns: viewers leave hairlines between shapes that

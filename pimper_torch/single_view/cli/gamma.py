@@ -3,29 +3,30 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.photographs import list_images, load_views, read_mask
-from pimper_torch.doors.io.responses import CONTRADICTED
+from pimper_torch.doors.io.photograph_files import list_images
 from pimper_torch.ground.radiometry import LINEAR
 from pimper_torch.runtime.errors import InputError, caution, held
-from pimper_torch.runtime.reporting import stage
-from pimper_torch.single_view.factorization.estimate_gamma import (
-    GammaEstimate,
-    gamma_of_photographs,
-)
+
+if TYPE_CHECKING:
+    from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 
 # A standard response whose residual is below this multiple of the best is recommended: a choice.
 _AS_GOOD = 1.05
 
 
-def run(command: str, arguments: Sequence[str], output: Output) -> None:
+def run(job: "_Job", output: Output) -> None:
     """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`."""
-    job = checked(command, arguments)
+    from pimper_torch.doors.io.photographs import load_views, read_mask
+    from pimper_torch.doors.io.responses import CONTRADICTED
+    from pimper_torch.runtime.reporting import stage
+    from pimper_torch.single_view.factorization.estimate_gamma import gamma_of_photographs
+
     with output.observer(), stage("read"), held() as messages:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
     for message in messages:
@@ -66,7 +67,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
     return job
 
 
-def advice(found: GammaEstimate) -> str:
+def advice(found: "GammaEstimate") -> str:
     """Return the option of `pimper reconstruct` for the response; empty if it is not determined."""
     if not found.determined:
         return ""

@@ -12,7 +12,7 @@ from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.main import main
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
 from pimper_torch.doors.io.results import write_result
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFineConfig
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.records import Estimate, Mesh, Views
 
 

@@ -3,7 +3,8 @@ import torch
 from scipy.spatial import Delaunay
 
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

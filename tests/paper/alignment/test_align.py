@@ -3,7 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.paper.align import Align, AlignConfig
+from pimper_torch.paper.align import Align
+from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.records import AlignStatus, Mesh
 from tests.paper.alignment.caps import (
     by_facet,

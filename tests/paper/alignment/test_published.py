@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.paper.align import Align, AlignConfig
+from pimper_torch.paper.align import Align
+from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.paper.seams import Pulls, solve_transforms
 from tests.paper.alignment.caps import by_facet, random_transforms, spoiled, waves
 

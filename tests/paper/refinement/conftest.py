@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

@@ -5,7 +5,8 @@ from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.surfaces import unit_face_normals
 from pimper_torch.ground.geometry.topology import half_edges
 from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.paper.refine import Refine, RefineConfig
+from pimper_torch.paper.paper_config import RefineConfig
+from pimper_torch.paper.refine import Refine
 
 SPACING = 0.02
 

@@ -1,0 +1,177 @@
+"""Which files of a folder are photographs, in the order of their names."""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from pimper_torch.doors.io.extras import (
+    HEIC_SUFFIXES,
+    RAW_SUFFIXES,
+    SUFFIXES,
+    extra_of,
+    is_installed,
+    load_extra,
+)
+from pimper_torch.runtime.errors import InputError, caution, some
+
+MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
+# What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
+_PICTURES = re.compile(
+    r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
+    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif)",
+    re.IGNORECASE,
+)
+_VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
+
+# Which of several files of one name is read: the extra that they need; least first.
+_RANKS = {"raw": 0, "": 1, "heic": 2}
+_DEVELOPED = (".png", ".tif", ".tiff")
+_MORE = "HEIC and camera raw where their extras are installed"
+
+
+def image_name(path: Path | str, folder: Path | str) -> str:
+    """Return the name of an image of a folder, with the folder inside that it lies in."""
+    return Path(path).relative_to(folder).as_posix()
+
+
+def list_images(folder: Path | str) -> list[Path]:
+    """List the image files of a folder in natural order: ``img2`` before ``img10``.
+
+    Of a folder that holds none, those of the folders inside, if three at least hold some: each
+    holds the photographs of one pose of the camera.
+
+    Raises:
+        InputError: No such folder, no images in it, or two of one stem.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        _refuse_video([folder])
+        found = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {found}; needed: a folder of images.")
+    try:
+        entries = _visible(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
+    paths = _readable(entries)
+    if not paths:
+        inside = [path for path in sorted(entries) if path.is_dir() and _holds_images(path)]
+        if len(inside) >= MIN_PHOTOGRAPHS:
+            paths = [image for one in inside for image in _readable(_visible(one))]
+    if not paths:
+        for path in sorted(entries):
+            if path.is_file() and (extra := extra_of(path)):
+                load_extra(extra, path)  # refuses what needs a package that is absent
+        _refuse_video(entries)
+        content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
+        raise InputError(
+            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
+            f"{_MORE}; or those in three folders inside at least, one a pose of the camera."
+        )
+    paths.sort(key=lambda path: _natural(image_name(path, folder)))
+    stems: dict[Path, Path] = {}
+    for path in paths:
+        other = stems.setdefault(path.with_suffix(""), path)
+        if other is not path:
+            raise InputError(
+                f"{path.parent}: {other.name} and {path.name} differ only in their suffix; masks "
+                "and results go by the name without it. Rename or remove one."
+            )
+    return paths
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if not path.name.startswith(".")]
+
+
+def _readable(entries: Sequence[Path]) -> list[Path]:
+    """Choose the image files, one of those that a camera writes of one photograph.
+
+    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF beside raw are
+    taken for developed on purpose.
+    """
+    ranks: dict[str, dict[Path, int]] = defaultdict(dict)
+    for path in entries:
+        suffix = path.suffix.lower()
+        if suffix in (*SUFFIXES, *HEIC_SUFFIXES, *RAW_SUFFIXES) and path.is_file():
+            extra = "" if suffix in SUFFIXES else extra_of(path)
+            if not extra or is_installed(extra):
+                ranks[path.stem.casefold()][path] = _RANKS[extra]
+    chosen: list[Path] = []
+    for twins in ranks.values():
+        developed = any(path.suffix.lower() in _DEVELOPED for path in twins)
+        best = max(min(twins.values()), _RANKS[""] if developed else 0)
+        chosen += [path for path, rank in twins.items() if rank == best]
+    return chosen
+
+
+def _refuse_video(entries: Sequence[Path]) -> None:
+    """State what makes photographs of the first video."""
+    for path in sorted(entries):
+        if path.is_file() and _VIDEO.fullmatch(path.suffix):
+            raise InputError(
+                f"{path}: is a video; needed: a folder of images. `pimper frames {path} -o "
+                "photos/` chooses photographs out of it."
+            )
+
+
+def tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
+    """Warn of what looks like photographs and is not read, kind by kind with its count."""
+    names = {path.relative_to(folder).parts[0] for path in read}
+    raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
+    kinds: Counter[str] = Counter()
+    examples: list[str] = []
+    twins: list[str] = []
+    lacking: set[str] = set()
+    for path in sorted(folder.iterdir()):
+        suffix = path.suffix.lower()
+        if path.name.startswith(".") or path.name in names:
+            continue
+        if path.is_symlink() and not path.exists():
+            kind = "broken link"
+        elif path.is_dir():
+            kind = "folder of images" if _holds_images(path) else ""
+        elif path.stem.casefold() in raw and suffix in (*SUFFIXES, *HEIC_SUFFIXES):
+            twins.append(path.name)
+            continue
+        else:
+            known = _PICTURES.fullmatch(suffix) or _VIDEO.fullmatch(suffix)
+            kind = suffix[1:].upper() if known else ""
+            extra = extra_of(path) if known else ""
+            if extra and not is_installed(extra):
+                lacking.add(extra)
+        if kind:
+            kinds[kind] += 1
+            examples.append(path.name)
+    if twins:
+        caution(
+            f"{folder}: {some(twins)} were not read, as camera raw of the same names was. Move the "
+            "raw away to read them.",
+            stacklevel=3,
+        )
+    if kinds:
+        counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
+        hint = "".join(
+            f' `pip install "pimper_torch[{extra}]"` reads {extra}.' for extra in sorted(lacking)
+        )
+        caution(
+            f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
+            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside.{hint} Convert or move "
+            "what belongs to the photographs.",
+            stacklevel=3,
+        )
+
+
+def _holds_images(folder: Path) -> bool:
+    try:
+        suffixes = {path.suffix.lower() for path in folder.iterdir()}
+    except OSError:
+        return False
+    return any(suffix in SUFFIXES or _PICTURES.fullmatch(suffix) for suffix in suffixes)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort digits as numbers; the name itself settles ``1`` against ``01``."""
+    pieces = re.split(r"([0-9]+)", name)
+    key = [(int(piece), "") if piece.isdigit() else (0, piece.lower()) for piece in pieces]
+    return [*key, (0, name)]

@@ -1,0 +1,59 @@
+"""Settings of patches and of their warp."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.runtime.config import Range, require, require_ranges
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecomposeConfig:
+    """Spacing of a facet's samples, and their reach over its edges.
+
+    Attributes:
+        samples_per_pixel: Template samples per pixel of the reference view; the paper's
+            zeta, made independent of the scene's unit.
+        overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
+        num_views: Largest number of views of a facet. Where more face one, each is seen in its best
+            ones, spread in direction, which it shares with a block of facets.
+        max_samples: Of all facets in all views that they face, ``num_views`` at most: where there
+            would be more, samples lie further apart. Bounds time and memory; infinite for no limit.
+        bucket_entries: Samples times views of templates that are batched together: few enough
+            for a processor's cache.
+    """
+
+    samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
+    overlap_samples: Annotated[float, Range(least=1, most=65_535)] = 2.0  # the widest photograph
+    num_views: Annotated[int, Range(least=3, most=100_000)] = 40
+    max_samples: Annotated[float, Range(least=1)] = 4.5e7
+    bucket_entries: Annotated[int, Range(least=1, most=100_000_000)] = 300_000  # 100 bytes each
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarpConfig:
+    """Which samples a view is allowed to contribute.
+
+    Attributes:
+        dark_level: Radiance at or below which a sample is missing; 1 is saturation.
+        saturation_level: Radiance at or above which a pixel of any channel is missing.
+        max_tilt_deg: A facet turned further from a view is not used there.
+        occlusion_stride: Samples between the rays that test for occlusion.
+    """
+
+    dark_level: Annotated[float, Range(least=0, below=1)] = 0.01
+    saturation_level: float = SATURATED
+    max_tilt_deg: Annotated[float, Range(above=0, below=90)] = 75.0
+    occlusion_stride: Annotated[int, Range(least=1, most=65_535)] = 4
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        require(
+            self.saturation_level > self.dark_level,
+            "saturation_level",
+            self.saturation_level,
+            f"above dark_level {self.dark_level}",
+        )

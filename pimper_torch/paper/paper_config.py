@@ -1,0 +1,63 @@
+"""Settings of the published method's own stages."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pimper_torch.runtime.config import Range, require_ranges
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriangulateConfig:
+    """Which points become vertices, and which triangles facets.
+
+    Attributes:
+        reference: Name or stem of the frontal photograph; empty chooses it.
+        num_points: About how many vertices to spread over the visible side.
+        fill: Put vertices on a smooth surface where the cloud has none.
+    """
+
+    reference: str = ""
+    num_points: Annotated[int, Range(least=4, most=1_000_000)] = 250  # the largest clouds
+    fill: bool = True
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignConfig:
+    """Settings of the alignment.
+
+    Attributes:
+        iterations: Rounds: meeting the overlaps as transformed so far, and solving.
+        anchor: Weight of a facet's vertex next to the agreement of a seam; less for points whose
+            uncertainty exceeds the disagreement at the seams.
+        prior: Weight that holds each transform at the identity. Where neighbours agree but
+            for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
+            4 %; where they agree in nothing, 1e-4 lets them be flattened.
+        scale_limit: Maximum factor by which a height field is flattened or stretched.
+    """
+
+    iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
+    anchor: Annotated[float, Range(least=0, most=1e12)] = 1.0
+    prior: Annotated[float, Range(above=0, most=1e12)] = 3e-4
+    scale_limit: Annotated[float, Range(above=1)] = 4.0
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefineConfig:
+    """Settings of the refinement.
+
+    Attributes:
+        smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
+            ``1 / (r * spacing)^2``. Where G is constant, a wave of length ``w`` keeps
+            ``1 / (1 + (2 pi R / w)^2)`` of its height, with ``R = r sqrt(G / (1 - G))`` vertices.
+    """
+
+    smoothing_radius_samples: Annotated[float, Range(above=0, most=65_535)] = 2.0
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
