@@ -1,6 +1,7 @@
-"""Points of the cloud: reliable ones, a well-spread subset, and vertices filled in between them."""
+"""Points of the cloud: those that agree with their neighbours, and a well-spread subset.
 
-import math
+Numbers are choices, the same for all photographs.
+"""
 
 import numpy as np
 import torch
@@ -8,10 +9,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 from torch import Tensor
 
-from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import barycentric_2d
-from pimper_torch.method.coarse.surface import point_covariances
-from pimper_torch.records import Cameras, CoarseMesh, FacetPoints, Mesh, SparseScene
+from pimper_torch.records import Cameras
 
 
 def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:
@@ -25,20 +24,17 @@ def behind_others(
     pixels: Float[Tensor, "point 2"],
     points_cam: Float[Tensor, "point 3"],
     observed: Bool[Tensor, " point"],
-    *,
-    neighbours: int,
-    slope: float,
 ) -> Bool[Tensor, " point"]:
     """Find points that a nearer surface occludes in the image, or probably does.
 
-    Of the nearest points in the image those count that are nearer to the camera by more than
-    ``slope`` times their lateral distance. If three or more leave no open half-plane, the point is
+    Of the 24 nearest points in the image those count that are nearer to the camera by more than 3
+    times their lateral distance. If three or more leave no open half-plane, the point is
     occluded. If they are all on one side, as beside a contour or where the surface is steep, it is
     occluded only if the view has no observation of it.
     """
-    nearest = nearest_in_image(pixels, neighbours)
+    nearest = nearest_in_image(pixels, 24)
     steps = points_cam[nearest] - points_cam[:, None]
-    front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > slope)
+    front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > 3.0)
     count = front.sum(dim=1)
     aside = pixels[nearest] - pixels[:, None]
     angle = torch.atan2(aside[..., 1], aside[..., 0])
@@ -54,33 +50,34 @@ def neighbours_agree(
     pixels: Float[Tensor, "point 2"],
     points_cam: Float[Tensor, "point 3"],
     *,
-    neighbours: int,
-    max_slope: float,
-    max_deviation: float,
+    neighbours: int = 12,
+    max_slope: float = 6.0,
 ) -> Bool[Tensor, " point"]:
     """Find points that lie on the same surface as those around them in the image.
 
     A point of another surface is steep against most of them: ``|dz|`` over the lateral distance
     exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more than
-    ``max_deviation`` of the neighbourhood's radius. The worst are dropped first, in rounds, so that
+    half the neighbourhood's radius. The worst are dropped first, in rounds, so that
     one outlier does not take its neighbours along.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
+    neighbours = min(neighbours, len(pixels) - 1)
     for fraction in (0.9, 0.75, 0.6, 0.5):
         index = keep.nonzero()[:, 0]
         if len(index) <= neighbours:
             break
         nearest = nearest_in_image(pixels[index], neighbours)
         steep = _steepness(points_cam[index], nearest) > max_slope
-        off = _deviation(points_cam[index], nearest) > max_deviation
+        off = _deviation(points_cam[index], nearest) > 0.5
         keep[index[(steep.float().mean(dim=1) > fraction) | off]] = False
     return keep
 
 
-def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor, "point {count}"]:
-    """List every point's nearest others."""
+def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor, "point near"]:
+    """List every point's nearest others, ``count`` or all of them."""
     coordinates = pixels.detach().cpu().numpy()
-    _, index = cKDTree(coordinates).query(coordinates, k=list(range(2, count + 2)))
+    ranks = list(range(2, min(count, len(pixels) - 1) + 2))
+    _, index = cKDTree(coordinates).query(coordinates, k=ranks)
     return torch.as_tensor(index, device=pixels.device)
 
 
@@ -95,12 +92,11 @@ def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
     return marked.to(pixels.device)
 
 
-def well_accompanied(
-    pixels: Float[Tensor, "point 2"], max_isolation: float
-) -> Bool[Tensor, " point"]:
+def well_accompanied(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
     """Find all points but isolated corners of the hull, one hull after another.
 
-    Isolation is the distance to the third nearest point over the median of its neighbours'.
+    Isolated are those farther from their third nearest point than 3 times the median of its
+    neighbours.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     while keep.sum() > 8:
@@ -108,7 +104,7 @@ def well_accompanied(
         nearest = nearest_in_image(pixels[index], 8)
         third = (pixels[index[nearest[:, 2]]] - pixels[index]).norm(dim=-1)
         isolation = third / third[nearest].median(dim=1).values.clamp_min(1e-9)
-        alone = on_hull(pixels[index]) & (isolation > max_isolation)
+        alone = on_hull(pixels[index]) & (isolation > 3.0)
         if not alone.any():
             break
         keep[index[alone]] = False
@@ -177,56 +173,6 @@ def _deviation(
     return plane[:, 2].abs().to(points_cam.dtype)
 
 
-def fill_pixels(
-    pixels: Float[Tensor, "point 2"], faces: Int[Tensor, "face 3"], edge_px: float
-) -> Float[Tensor, "filled 2"]:
-    """Return pixels of a triangular grid, inside facets and away from their vertices."""
-    known = pixels.detach().cpu().double().numpy()
-    low, high = known.min(axis=0), known.max(axis=0)
-    rows = np.arange(low[1], high[1], edge_px * math.sqrt(3) / 2)
-    columns = np.arange(low[0], high[0], edge_px)
-    grid = np.concatenate(
-        [
-            np.stack([columns + (index % 2) * edge_px / 2, np.full_like(columns, v)], axis=1)
-            for index, v in enumerate(rows)
-        ]
-        or [np.zeros((0, 2))]
-    )
-    distance, _ = cKDTree(known).query(grid)
-    proposed = torch.from_numpy(grid[distance > 0.8 * edge_px]).to(pixels)
-    return proposed[facets_under(proposed, pixels[faces]) >= 0]
-
-
-def interpolate_inverse_depth(
-    pixels: Float[Tensor, "point 2"],
-    inverse_depth: Float[Tensor, " point"],
-    wanted: Float[Tensor, "filled 2"],
-    smoothing: float,
-) -> Float[Tensor, " filled"]:
-    """Evaluate a smoothing thin-plate spline of inverse depth, which is affine on a plane.
-
-    Args:
-        smoothing: Relative to the spread of the values.
-    """
-    if len(wanted) == 0:
-        return wanted.new_zeros(0)
-    # Local, as it takes long to load and other chains do without.
-    from scipy.interpolate import RBFInterpolator
-
-    known = pixels.detach().cpu().double().numpy()
-    values = inverse_depth.detach().cpu().double().numpy()
-    center, unit = known.mean(axis=0), known.std() + 1e-12
-    spline = RBFInterpolator(
-        (known - center) / unit,
-        values,
-        neighbors=min(50, len(known)),  # more hardly change a value, and cost their cube
-        smoothing=smoothing,
-        kernel="thin_plate_spline",
-    )
-    at = (wanted.detach().cpu().double().numpy() - center) / unit
-    return torch.from_numpy(spline(at)).to(inverse_depth)
-
-
 def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
     """Triangulate points of an image, so that faces show their front to its camera."""
     simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
@@ -235,39 +181,6 @@ def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
     ab, ac = b - a, c - a
     rotated = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
     return torch.where(rotated[:, None], faces.flip(1), faces)
-
-
-def with_cloud(
-    scene: SparseScene,
-    reliable: Int[Tensor, " reliable"],
-    mesh: Mesh,
-    reference: int,
-    source: Int[Tensor, " vertex"],
-) -> CoarseMesh:
-    """Return a coarse mesh of facets and the points of the cloud on them, with covariances.
-
-    Args:
-        source: The point of the cloud at each vertex, -1 for none.
-    """
-    is_point = source >= 0
-    at_vertices = point_covariances(scene, source.clamp_min(0))
-    between = reliable[~torch.isin(reliable, source)]
-    camera = scene.cameras.cam_from_world[reference], scene.cameras.intrinsics[reference]
-    pixels, _ = project(scene.points_world[between], *camera)
-    corners, _ = project(mesh.vertices_world[mesh.faces], *camera)
-    facet = facets_under(pixels, corners)
-    between, facet = between[facet >= 0], facet[facet >= 0]
-    return CoarseMesh(
-        mesh=mesh,
-        reference=reference,
-        is_point=is_point,
-        covariance_world=torch.where(is_point[:, None, None], at_vertices, 0),
-        points=FacetPoints(
-            points_world=scene.points_world[between],
-            covariance_world=point_covariances(scene, between),
-            facet=facet,
-        ),
-    )
 
 
 def facets_under(

@@ -13,12 +13,10 @@ class TriangulateConfig:
     Attributes:
         reference: Name or stem of the frontal photograph; empty chooses it.
         num_points: About how many vertices to spread over the visible side.
-        fill: Put vertices on a smooth surface where the cloud has none.
     """
 
     reference: str = ""
     num_points: Annotated[int, Range(least=4, most=1_000_000)] = 250  # the largest clouds
-    fill: bool = True
 
     def __post_init__(self) -> None:
         require_ranges(self)
