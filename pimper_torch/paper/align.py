@@ -19,7 +19,6 @@ from pimper_torch.paper.seams import (
     mismatches,
     seam_stiffness,
     solve_transforms,
-    transformed,
 )
 from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
 from pimper_torch.runtime.progress import report
@@ -73,18 +72,6 @@ def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
             spread = along.mT @ covariance[faces[facet]].double() @ along
             variance[facet] = spread[..., 0, 0].clamp_min(0)
     return Anchors(samples=samples, variance=variance, known=known)
-
-
-def anchor_certainty(
-    variance: Float[Tensor, "*batch"], noise: Float[Tensor, ""]
-) -> Float[Tensor, "*batch"]:
-    r"""Return the weight of anchors, :math:`s^2 / (s^2 + \sigma^2)`: 1 for an exact one.
-
-    Args:
-        variance: :math:`\sigma^2` of each point, along the height field's z.
-        noise: s, the height fields' own error, from the disagreement at the seams.
-    """
-    return noise.square() / (noise.square() + variance)
 
 
 # Solves within the first round, so that weights that depend on the answer settle; later
@@ -180,7 +167,12 @@ class Align(Stage):
             status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
         aligned = (status == int(AlignStatus.ALIGNED))[:, None]
         if not bool(aligned.all()):
-            on_mesh = self._on_mesh(problem, pulls, transforms)
+            # Every height field where its own anchors alone have it.
+            nothing = torch.zeros_like(pulls.curvature)
+            on_mesh = solve_transforms(
+                pulls, identity.expand_as(transforms), nothing[:, 0], nothing
+            )
+            on_mesh = _limit_scales(on_mesh, config.scale_limit)
             transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
                 pulls = self._met(problem, depths, transforms)
@@ -191,23 +183,11 @@ class Align(Stage):
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _on_mesh(
-        self, problem: _Problem, pulls: Pulls, transforms: Float[Tensor, "face 4"]
-    ) -> Float[Tensor, "face 4"]:
-        """Put every height field where its own anchors alone have it."""
-        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
-        everyone = torch.ones_like(transforms[:, 0])
-        held = self._anchored(pulls, problem, _noise(pulls, distance), everyone)
-        nothing = torch.zeros_like(distance[:, 0]), torch.zeros_like(pulls.curvature)
-        identity = transforms.new_tensor([0, 0, 1, 0]).expand_as(transforms)
-        found = solve_transforms(held, identity, *nothing)
-        return _limit_scales(found, self.config.scale_limit)
-
     def _met(
         self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
     ) -> Pulls:
-        """Meet the overlaps as transformed so far, and list what follows from that."""
-        seams, unit = problem.seams, problem.unit
+        """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
+        seams, unit, vertices = problem.seams, problem.unit, problem.vertices
         overlaps = meet_overlaps(
             seams, problem.patches, depths.buckets, transforms * problem.in_scene
         )
@@ -215,7 +195,7 @@ class Align(Stage):
         prior = unit.new_full((4,), self.config.prior)
         prior[3] = torch.inf  # patches do not move along their normals
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
-        corners = _with_one(problem.vertices.samples / unit)
+        corners = _with_one(vertices.samples / unit)
         pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
@@ -227,29 +207,19 @@ class Align(Stage):
             corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
         )
-        distance = mismatches(pulls, transforms).norm(dim=-1).detach()
-        touching = seams.facets[met.any(dim=1)].flatten()
-        moves = torch.zeros_like(corners[:, 0, 0]).index_fill(0, touching, 1)
-        return self._anchored(pulls, problem, _noise(pulls, distance), moves)
-
-    def _anchored(
-        self,
-        pulls: Pulls,
-        problem: _Problem,
-        noise: Float[Tensor, ""],
-        moves: Float[Tensor, " face"],
-    ) -> Pulls:
-        """Add what holds height fields to vertices, for the patches that may move."""
-        vertices, coarse = problem.vertices, problem.patches.coarse
-        # Vertices that were filled in between points of the cloud are guesses.
-        is_point = coarse.is_point[coarse.mesh.faces]
-        certain = anchor_certainty(vertices.variance / problem.unit.square(), noise)
-        weight = torch.where(is_point, certain, 0.1) * vertices.known
-        return pulls.replace(corner_weight=self.config.anchor * weight * moves[:, None])
+        noise = _noise(pulls, mismatches(pulls, transforms).norm(dim=-1).detach()).square()
+        # The weight of an exact anchor is 1. Vertices that are no points of the cloud are guesses.
+        certain = noise / (noise + vertices.variance / unit.square())
+        coarse = problem.patches.coarse
+        weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * vertices.known
+        return pulls.replace(corner_weight=self.config.anchor * weight)
 
     def _solve_round(
         self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
     ) -> Float[Tensor, "face 4"]:
+        touching = pulls.facets[(pulls.weight > 0).any(dim=1)].flatten()
+        moves = torch.zeros_like(transforms[:, 0]).index_fill(0, touching, 1)
+        pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
         for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
             terms = _curvature_terms(pulls, transforms, distance)
@@ -309,7 +279,9 @@ def _apply(
     buckets = []
     for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
         own = transforms[templates.facet]
-        depth = transformed(templates.points_patch.double(), height_field.depth.double(), own)
+        hx, hy, hz, h0 = own[:, :, None, None].unbind(dim=1)
+        x, y, _ = templates.points_patch.double().unbind(dim=-1)
+        depth = hx * x + hy * y + hz * height_field.depth.double() + h0
         # Transforms chain: whoever aligns twice still learns the way from the first height field.
         chained = own[:, 2:3] * height_field.transform + own * own.new_tensor([1, 1, 0, 1])
         buckets.append(

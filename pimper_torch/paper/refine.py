@@ -8,7 +8,7 @@ three right-hand sides of one system.
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -35,31 +35,6 @@ def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
     tensor([0.7071, 0.5000, 0.0000])
     """
     return (barycentric - barycentric.roll(1, dims=-1)).abs().sum(dim=-1).sqrt() / 2
-
-
-def assemble(
-    subdivision: Subdivision, fidelity: Float[Tensor, " facet"], supported: Bool[Tensor, " vertex"]
-) -> tuple[
-    Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"], Float[Tensor, " vertex"]
-]:
-    """Return the entries of ``M + L``, duplicates included, and the diagonal of ``M``; float64.
-
-    The normal equations of the energy are ``(M + L) S = M (union)``. Constant to autograd.
-
-    Args:
-        fidelity: Lambda of each facet, 1/length^2.
-        supported: Where the union is known. Elsewhere the mass is nearly zero.
-    """
-    weights = seam_weight(subdivision.barycentric.double())
-    mesh = elements(subdivision.points.detach().double(), subdivision.faces)
-    mass = lumped_mass(mesh, fidelity.double()[subdivision.face_facet])
-    # A little mass ties what no patch supports to the flat facets: the system is definite.
-    mass = mass * (1 - weights) * torch.where(supported, 1, 1e-9)
-    seams = weights[subdivision.faces].mean(dim=1)
-    rows, cols, values = cotangent_laplacian(mesh, seams, 1e-4)  # needles are taken as wider
-    diagonal = torch.arange(mesh.count, device=mass.device)
-    rows, cols = torch.cat([rows, diagonal]), torch.cat([cols, diagonal])
-    return rows, cols, torch.cat([values, mass]), mass
 
 
 class Refine(Stage):
@@ -123,15 +98,29 @@ def smooth_seams(
 ) -> Float[Tensor, "vertex 3"]:
     """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.
 
+    The normal equations are ``(M + L) S = M (union)``, M the lumped mass and L the Laplacian.
+
     Args:
         points: The union of the patches at each vertex.
-        supported: Where the union is known.
+        supported: Where the union is known. Elsewhere the mass is nearly zero.
         radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
     """
     fidelity = (radius * spacing.double()) ** -2
-    rows, cols, values, mass = assemble(subdivision, fidelity, supported)
-    rhs = mass[:, None] * points.double()
-    (found,) = solutions(rows, cols, values, rhs, what="the refinement")
+    weights = seam_weight(subdivision.barycentric.double())
+    mesh = elements(subdivision.points.detach().double(), subdivision.faces)
+    mass = lumped_mass(mesh, fidelity[subdivision.face_facet])
+    # A little mass ties what no patch supports to the flat facets: the system is definite.
+    mass = mass * (1 - weights) * torch.where(supported, 1, 1e-9)
+    seams = weights[subdivision.faces].mean(dim=1)
+    rows, cols, values = cotangent_laplacian(mesh, seams, 1e-4)  # needles are taken as wider
+    diagonal = torch.arange(mesh.count, device=mass.device)
+    (found,) = solutions(
+        torch.cat([rows, diagonal]),
+        torch.cat([cols, diagonal]),
+        torch.cat([values, mass]),
+        mass[:, None] * points.double(),
+        what="the refinement",
+    )
     return found
 
 

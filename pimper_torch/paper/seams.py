@@ -5,6 +5,7 @@ The unknown of a patch is :math:`h_\mu = (h_x, h_y, h_z, h_0)`; its height field
 of the mesh, so that all terms, and their weights, have no unit.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.height_fields import intersect_height_field
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.ground.geometry.topology import face_pairs
+from pimper_torch.ground.geometry.topology import face_counts, face_edges
 from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths, Templates
@@ -28,7 +29,7 @@ class Seams(Record):
         origins: A point of each ray, world; rows are lines parallel to the edge.
         directions: Of all rays of a seam: the bisector of the two inward normals; unit.
         normals: Inward unit normals of the two facets, world.
-        seam_of: The seams of every facet, -1 for an edge without a neighbour.
+        seam_of: The seam at each edge of a facet, opposite to its corners; -1 without a neighbour.
         place_of: Index of each seam and side in ``seam_of``, flattened.
     """
 
@@ -62,12 +63,18 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     Args:
         reach_samples: Distance of the outermost lines from the edge, in template samples.
     """
-    frames, spacing = _by_facet(patches)
+    frames = _by_facet(patches, [one.patch_from_world for one in patches.buckets]).double()
+    spacing = _by_facet(patches, [one.spacing for one in patches.buckets]).double()
     vertices = patches.coarse.mesh.vertices_world.double()
-    facets, ends = face_pairs(patches.coarse.mesh.faces)
+    edges, edge_of = face_edges(patches.coarse.mesh.faces)
+    shared = face_counts(edge_of) == 2
+    seam_of = torch.where(shared, shared.cumsum(dim=0) - 1, -1)[edge_of]
+    place = edge_of.flatten().argsort(stable=True)
+    place_of = place[seam_of.flatten()[place] >= 0].reshape(-1, 2)
+    facets = place_of // 3
     normals = frames[facets, 2, :3]
     directions = normalize(normals.sum(dim=1), dim=-1)
-    start, end = vertices[ends].unbind(dim=1)
+    start, end = vertices[edges[shared]].unbind(dim=1)
     edge_lengths = (end - start).norm(dim=-1)
     across = normalize(torch.linalg.cross(directions, end - start), dim=-1)
 
@@ -76,7 +83,6 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     reach = reach_samples * spacing[facets].mean(dim=1)
     on_edge = start[:, None] + along[:, None] * (end - start)[:, None]
     beside = (reach[:, None] * offset)[..., None] * across[:, None]
-    seam_of, place_of = _places(facets, len(frames))
     return Seams(
         facets=facets,
         origins=on_edge[:, None] + beside[:, :, None],
@@ -102,16 +108,12 @@ def meet_overlaps(
         _meet_bucket(seams, templates, depths, transforms[templates.facet])
         for templates, depths in zip(patches.buckets, buckets, strict=True)
     ]
-    facets = torch.cat([templates.facet for templates in patches.buckets])
-    position = torch.empty_like(facets)
-    position[facets] = torch.arange(len(facets), device=facets.device)
-    rows, columns = seams.origins.shape[1:3]
-
-    def pick(parts: list[Tensor]) -> Tensor:
-        by_place = torch.cat(parts)[position].flatten(0, 1)[seams.place_of]
-        return by_place.reshape(*seams.place_of.shape, rows, columns, *by_place.shape[3:])
-
-    samples, feet, met = (pick(list(parts)) for parts in zip(*found, strict=True))
+    samples, feet, met = (
+        _by_facet(patches, parts)
+        .flatten(0, 1)[seams.place_of]
+        .unflatten(2, seams.origins.shape[1:3])
+        for parts in zip(*found, strict=True)
+    )
     return Overlaps(samples=samples, feet=feet, met=met.all(dim=1))
 
 
@@ -130,12 +132,16 @@ def _meet_bucket(
     directions = rotate(patch_from_world, directions_world.flatten(1, 2))
     # A ray meets the transformed height field where the ray transformed back meets the height
     # field.
+    hx, hy, hz, h0 = transforms[:, :, None].unbind(dim=1)
+    height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
+    sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]
     points, hit = intersect_height_field(
         depths.depth,
         depths.valid,
         templates.origin.double(),
         templates.spacing.double(),
-        *_transformed_back(origins, directions, transforms),
+        torch.cat([origins[..., :2], (height / hz)[..., None]], dim=-1),
+        torch.cat([directions[..., :2], (sinking / hz)[..., None]], dim=-1),
     )
     feet = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], dim=-1)
     shape = (count, 3, origins_world.shape[2])
@@ -146,51 +152,10 @@ def _meet_bucket(
     )
 
 
-def _transformed_back(
-    origins: Float[Tensor, "patch ray 3"],
-    directions: Float[Tensor, "patch ray 3"],
-    transforms: Float[Tensor, "patch 4"],
-) -> tuple[Float[Tensor, "patch ray 3"], Float[Tensor, "patch ray 3"]]:
-    hx, hy, hz, h0 = transforms[:, :, None].unbind(dim=1)
-    height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
-    sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]
-    return (
-        torch.cat([origins[..., :2], (height / hz)[..., None]], dim=-1),
-        torch.cat([directions[..., :2], (sinking / hz)[..., None]], dim=-1),
-    )
-
-
-def transformed(
-    points: Float[Tensor, "patch height width 3"],
-    depth: Float[Tensor, "patch height width"],
-    transforms: Float[Tensor, "patch 4"],
-) -> Float[Tensor, "patch height width"]:
-    """Apply bas-relief transforms: ``h . (x, y, z, 1)``; x and y are taken from ``points``."""
-    hx, hy, hz, h0 = transforms[:, :, None, None].unbind(dim=1)
-    return hx * points[..., 0] + hy * points[..., 1] + hz * depth + h0
-
-
-def _by_facet(patches: PatchSet) -> tuple[Float[Tensor, "face 4 4"], Float[Tensor, " face"]]:
+def _by_facet(patches: PatchSet, parts: Iterable[Tensor]) -> Tensor:
+    """Join values of all buckets in the order of the facets."""
     order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
-    frames = torch.cat([templates.patch_from_world for templates in patches.buckets])
-    spacing = torch.cat([templates.spacing for templates in patches.buckets])
-    return frames[order].double(), spacing[order].double()
-
-
-def _places(
-    facets: Int[Tensor, "seam 2"], count: int
-) -> tuple[Int[Tensor, "face 3"], Int[Tensor, "seam 2"]]:
-    """Number the seams of each facet from 0."""
-    facet = facets.reshape(-1)
-    order = torch.argsort(facet, stable=True)
-    per_facet = torch.bincount(facet, minlength=count)
-    first = torch.cumsum(per_facet, dim=0) - per_facet
-    rank = torch.empty_like(facet)
-    rank[order] = torch.arange(len(facet), device=facet.device) - first[facet[order]]
-    place = 3 * facet + rank
-    seam_of = torch.full((3 * count,), -1, dtype=torch.long, device=facet.device)
-    seam_of[place] = torch.arange(len(facets), device=facet.device).repeat_interleave(2)
-    return seam_of.reshape(count, 3), place.reshape(-1, 2)
+    return torch.cat(list(parts))[order]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -279,8 +244,6 @@ def solve_transforms(
             :class:`~pimper_torch.paper.align.Align`.
     """
     free = torch.nonzero(pulls.prior_weight.isfinite()).flatten()
-    if len(free) == 0:
-        return transforms
     identity = pulls.prior_weight.new_tensor([0, 0, 1, 0])
     fixed = torch.where(pulls.prior_weight.isfinite(), 0, transforms)
     samples, corners = pulls.samples[..., free], pulls.corners[..., free]
@@ -308,24 +271,16 @@ def solve_transforms(
     rhs = rhs.index_add(0, first, wanted[:, 0]).index_add(0, second, wanted[:, 1])
 
     every = torch.arange(len(transforms), device=first.device)
-    rows, cols, values = scatter_blocks(
-        torch.cat([every, first, second]),
-        torch.cat([every, second, first]),
-        torch.cat([diagonal, cross, cross.mT]),
+    unknown = torch.arange(rhs.numel(), device=first.device).reshape(rhs.shape)
+    blocks = torch.cat([diagonal, cross, cross.mT])
+    rows = unknown[torch.cat([every, first, second]), :, None].expand_as(blocks)
+    cols = unknown[torch.cat([every, second, first]), None].expand_as(blocks)
+    factor = SparseCholesky(
+        rows.flatten(),
+        cols.flatten(),
+        blocks.flatten(),
+        rhs.numel(),
+        "the alignment of the patches",
     )
-    factor = SparseCholesky(rows, cols, values, rhs.numel(), "the alignment of the patches")
     found = factor.solve(rhs.reshape(-1))
     return fixed.index_copy(1, free, found.reshape(len(transforms), -1))
-
-
-def scatter_blocks(
-    block_rows: Int[Tensor, " block"],
-    block_cols: Int[Tensor, " block"],
-    blocks: Float[Tensor, "block unknown unknown"],
-) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-    """Return rows, columns and values of a sparse matrix of small dense blocks, with duplicates."""
-    side = blocks.shape[-1]
-    within = torch.arange(side, device=blocks.device)
-    rows = (side * block_rows[:, None, None] + within[:, None]).expand(blocks.shape)
-    cols = (side * block_cols[:, None, None] + within).expand(blocks.shape)
-    return rows.reshape(-1), cols.reshape(-1), blocks.reshape(-1)
