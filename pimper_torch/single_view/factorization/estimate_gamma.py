@@ -20,7 +20,12 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.ground.linalg.robust import (
+    CAUCHY_TUNING,
+    cauchy_weights,
+    robust_deviation,
+    with_slope,
+)
 from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record, Views
@@ -77,8 +82,8 @@ def fit_encoded(
     if start is not None:
         about, weight, left = start.predicted, mask * start.weight, start.left
     for iteration in range(iterations + 1):
-        rate = _derivative(response, about)
-        target = response.linear_from_encoded(about) + rate * (problem.encoded - about)
+        linear, rate = with_slope(response.linear_from_encoded, about)
+        target = linear + rate * (problem.encoded - about)
         heavy = weight / rate.square()
         heavy = heavy / heavy.max()
         if left is None:
@@ -87,8 +92,7 @@ def fit_encoded(
         matrix = low_rank.low_rank_problem(target[None], heavy[None], left[None])
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
-        linear = left @ solved.shading[0]
-        about = response.encoded_from_linear(linear).clamp_min(0.02)
+        about = response.encoded_from_linear(left @ solved.shading[0]).clamp_min(0.02)
         residual = mask * (problem.encoded - about)
         if problem.scale and iteration < iterations:
             weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
@@ -97,15 +101,6 @@ def fit_encoded(
         loss = problem.scale**2 * torch.log1p(loss / problem.scale**2)
     assert left is not None, "there is one round at least"
     return EncodedFit(predicted=about, loss=loss, weight=weight, left=left)
-
-
-def _derivative(
-    response: Response, encoded: Float[Tensor, "view sample"]
-) -> Float[Tensor, "view sample"]:
-    with torch.enable_grad():
-        at = encoded.detach().requires_grad_()
-        (rate,) = torch.autograd.grad(response.linear_from_encoded(at).sum(), at)
-    return rate
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
@@ -124,7 +119,7 @@ def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
 def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
     """Return the residuals' robust standard deviation, corrected for the degrees of freedom."""
     residual = (problem.encoded - fit.predicted)[problem.used]
-    size = float(robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool)))
+    size = float(robust_deviation(residual, residual.isfinite()))
     free = max(freedom(problem.used, problem.rank), 1)
     return size * (int(problem.used.sum()) / free) ** 0.5
 
@@ -148,9 +143,9 @@ _MIN_SCALE = 5e-4
 
 # The estimate is checked without these fractions of the entries, the darkest: a choice.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
-# Difference from the estimate of the brighter entries, in its standard errors, above which the
-# standard error grows, and above which the brighter entries replace the estimate: choices.
-_SUSPECT_ERRORS, _MAX_ERRORS = 2.0, 3.0
+# Difference from the estimate of the brighter entries, in its standard errors, above which they
+# replace the estimate: a choice.
+_MAX_ERRORS = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -181,12 +176,9 @@ class GammaEstimate(Record):
         )
         if self.determined:
             return f"{found}."
-        noisy = self.residual > _MAX_RESIDUAL
-        why = (
-            "shadows, highlights, another curve or a camera that moved leave more than noise"
-            if noisy
-            else "light or surfaces vary too little"
-        )
+        why = "light or surfaces vary too little"
+        if self.residual > _MAX_RESIDUAL:
+            why = "shadows, highlights, another curve or a camera that moved leave more than noise"
         return f"gamma is not determined by these photographs, {why} ({found})."
 
 
@@ -215,22 +207,35 @@ def estimate_gamma(
         raise InputError(
             f"rank is {rank}; needed: 3 for distant point lights, 4 with ambient light."
         )
-    values = encoded[seen]
-    if not bool(values.isfinite().all()):
+    outside = int((seen & ~((encoded >= 0) & (encoded <= 1))).sum())
+    if outside:
         raise InputError(
-            f"{int((~values.isfinite()).sum())} encoded values are no numbers; needed: numbers, or "
-            "`seen` false for these."
-        )
-    if values.numel() and not 0 <= float(values.min()) <= float(values.max()) <= 1:
-        raise InputError(
-            f"encoded values reach from {float(values.min()):.4g} to {float(values.max()):.4g}; "
-            "needed: fractions of the files' full scale, 0 to 1."
+            f"{outside} encoded values are not from 0 to 1; needed: fractions of the files' full "
+            "scale, or `seen` false for these."
         )
     with torch.no_grad():
         problem = _problem(encoded, seen, rank)
         for _ in range(2):  # the first still starts from a selection by noisy values
             problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
-        return _estimate_of(_consistent_minimum(problem))
+        found = _consistent_minimum(problem)
+        residual, linear, srgb = (
+            residual_spread(found.problem, fit)
+            for fit in (
+                found.fit,
+                fit_encoded(found.problem, Linear(), found.fit, 2),
+                fit_encoded(found.problem, Srgb(), found.fit, 2),
+            )
+        )
+        sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
+        return GammaEstimate(
+            gamma=found.gamma,
+            standard_error=found.error,
+            determined=sure and residual < _MAX_RESIDUAL,
+            residual=residual,
+            residual_linear=linear,
+            residual_srgb=srgb,
+            entries=int(found.problem.used.sum()),
+        )
 
 
 def gamma_of_photographs(
@@ -262,17 +267,17 @@ def gamma_of_photographs(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Minimum(Record):
-    """The minimum of the loss over gamma, and its standard error.
-
-    Attributes:
-        inner: Whether it is not at an end of the range.
-    """
+    """The minimum of the loss over gamma, and its standard error."""
 
     problem: EncodedMatrix
     gamma: float
     fit: EncodedFit
-    inner: bool
     error: float
+
+    @property
+    def inner(self) -> bool:
+        """Whether it is not at an end of the range."""
+        return MIN_GAMMA * 1.01 < self.gamma < MAX_GAMMA / 1.01
 
 
 def _problem(
@@ -311,9 +316,7 @@ def _chosen_by_fit(
     if int(used.any(dim=0).sum()) <= 4 * problem.rank:
         used = problem.used
     residual = (encoded - predicted)[used]
-    scale = CAUCHY_TUNING * float(
-        robust_deviation(residual, torch.ones_like(residual, dtype=torch.bool))
-    )
+    scale = CAUCHY_TUNING * float(robust_deviation(residual, residual.isfinite()))
     return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
 
 
@@ -326,7 +329,8 @@ def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, Encode
     for exponent in trials.tolist():
         former = fits[-1] if fits else None
         fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, iterations))
-    best = min(range(_TRIALS), key=lambda trial: float(fits[trial].loss.sum()))
+    losses = [float(fit.loss.sum()) for fit in fits]
+    best = losses.index(min(losses))
     return float(trials[best]), fits[best]
 
 
@@ -342,13 +346,8 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     gamma = math.exp(found.x)
     fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
-    return _Minimum(
-        problem=problem,
-        gamma=gamma,
-        fit=fit,
-        inner=MIN_GAMMA * 1.01 < gamma < MAX_GAMMA / 1.01,
-        error=_standard_error(problem, gamma, fit),
-    )
+    error = _standard_error(problem, gamma, fit)
+    return _Minimum(problem=problem, gamma=gamma, fit=fit, error=error)
 
 
 def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
@@ -366,14 +365,13 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
         if freedom(used, problem.rank) < 100:  # no reliable standard error
             break
         found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
-    for position, estimate in enumerate(found):
-        brighter = [one for one in found[position + 1 :] if one.inner]
-        apart = [(abs(one.gamma - estimate.gamma), one.error) for one in brighter]
-        rounding = 1e-3 * estimate.gamma
-        if all(gap <= _MAX_ERRORS * error + rounding for gap, error in apart):
-            excess = [gap - _SUSPECT_ERRORS * error for gap, error in apart]
-            return estimate.replace(error=math.hypot(estimate.error, max([0.0, *excess])))
-    raise AssertionError("nothing contradicts the last estimate")
+    while any(
+        abs(one.gamma - found[0].gamma) > _MAX_ERRORS * one.error + 1e-3 * found[0].gamma
+        for one in found[1:]
+        if one.inner
+    ):
+        found = found[1:]
+    return found[0]
 
 
 def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
@@ -393,21 +391,3 @@ def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> fl
     # On data without noise everything but the curvature is rounding.
     curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
     return noise / curvature if curved else math.inf
-
-
-def _estimate_of(found: _Minimum) -> GammaEstimate:
-    """Return the estimate, with residuals under the linear and the sRGB response."""
-    problem = found.problem
-    residual = residual_spread(problem, found.fit)
-    linear = fit_encoded(problem, Linear(), found.fit, 2)
-    srgb = fit_encoded(problem, Srgb(), found.fit, 2)
-    sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
-    return GammaEstimate(
-        gamma=found.gamma,
-        standard_error=found.error,
-        determined=sure and residual < _MAX_RESIDUAL,
-        residual=residual,
-        residual_linear=residual_spread(problem, linear),
-        residual_srgb=residual_spread(problem, srgb),
-        entries=int(problem.used.sum()),
-    )
