@@ -56,22 +56,15 @@ def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Te
     so on; then every pixel is assigned to the nearest cluster within the radius.
 
     Args:
-        radiance: Linear, of two channels or more.
+        radiance: Linear, of two channels or more; all pixels of one channel are one cluster.
 
     Returns:
         Labels of the pixels, the largest group's 0; -1 for pixels in no group.
     """
-    if radiance.shape[1] < 2:
-        raise InputError(
-            f"images have {radiance.shape[1]} channel; needed: two at least, pixels of one paint "
-            "are grouped by colour. Use another method for grey images."
-        )
     colour, known = chromaticities(radiance)
     labels = torch.full_like(known, -1, dtype=torch.int64)
-    if not bool(known.any()):
-        raise InputError("no pixel inside the mask is bright in all channels; needed: some.")
     colour = colour[:, known].mT.double().contiguous()
-    sample = colour[:: -(-len(colour) // 2000)]  # all are then assigned
+    sample = colour[:: max(1, -(-len(colour) // 2000))]  # all are then assigned
     # In logarithm of colour: a few times its noise, less than half the distance of paints.
     radius = 0.05
     neighbours = torch.cdist(sample, sample) < radius
@@ -169,24 +162,23 @@ def albedo_entropy(
 
 
 def _minimized(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Float[Tensor, " 3"]:
-    few, few_labels = _subsampled(b, labels, _FEW_PIXELS)
+    few, many = (slice(None, None, -(-len(labels) // limit)) for limit in (_FEW_PIXELS, 20_000))
     tilts = torch.linspace(-_MAX_TILT, _MAX_TILT, _TILTS).to(b)
     flat, steep = (torch.tensor(value).to(b).log() for value in (_MIN_LAMBDA, _MAX_LAMBDA))
     lambdas = torch.linspace(float(flat), float(steep), _LAMBDAS).to(b)
     grid = torch.cartesian_prod(tilts, tilts, lambdas)
-    best = grid[albedo_entropy(few, few_labels, grid, _FIRST_WIDTH).argsort()[:_CANDIDATES]]
+    best = grid[albedo_entropy(b[:, few], labels[few], grid, _FIRST_WIDTH).argsort()[:_CANDIDATES]]
     step = torch.stack([tilts[1] - tilts[0], tilts[1] - tilts[0], lambdas[1] - lambdas[0]]) / 2
     narrow = _FIRST_WIDTH
     while narrow > _LAST_WIDTH:
-        best, entropy = _local_search(few, few_labels, best, step, narrow)
+        best, entropy = _local_search(b[:, few], labels[few], best, step, narrow)
         best = torch.unique(best[entropy.argsort()[: -(-len(best) // 2)]], dim=0)
         step, narrow = step / 2, narrow / 1.4142
-    final = albedo_entropy(few, few_labels, best, _LAST_WIDTH).argmin()
-    many, many_labels = _subsampled(b, labels, 20_000)
+    final = albedo_entropy(b[:, few], labels[few], best, _LAST_WIDTH).argmin()
     best = best[final][None]
     # Down to a step that changes albedo by a tenth of the kernel.
     while float(step.max()) > _LAST_WIDTH / 10:
-        best, _ = _local_search(many, many_labels, best, step, _LAST_WIDTH)
+        best, _ = _local_search(b[:, many], labels[many], best, step, _LAST_WIDTH)
         step = step / 2
     return best[0]
 
@@ -245,10 +237,3 @@ def _entropy(
         histogram.scatter_add_(1, index + shift, fraction)
     probability = histogram / b.shape[1]
     return -torch.special.xlogy(probability, probability).sum(dim=1)
-
-
-def _subsampled(
-    b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"], limit: int
-) -> tuple[Tensor, Tensor]:
-    every = -(-b.shape[1] // limit)
-    return b[:, ::every], labels[::every]

@@ -8,14 +8,12 @@ That they belong to a depth :math:`z(x, y)` with slopes :math:`-n_x/n_z, -n_y/n_
 .. math:: (a_2 \wedge a_3) \cdot (s \wedge \partial_x s)
           + (a_3 \wedge a_1) \cdot (s \wedge \partial_y s) = 0,
 
-in whatever dimension ``s`` has. Albedo drops out, as :math:`s \wedge s = 0`.
+Albedo drops out, as :math:`s \wedge s = 0`.
 
-Source: Yuille & Snow, Shape and albedo from multiple images using integrability, CVPR 1997, for
-three dimensions.
+Source: Yuille & Snow, Shape and albedo from multiple images using integrability, CVPR 1997.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,22 +42,22 @@ class Curls(Record):
             up to a factor.
     """
 
-    across: Float[Tensor, "equation pair"]
-    down: Float[Tensor, "equation pair"]
+    across: Float[Tensor, "equation 3"]
+    down: Float[Tensor, "equation 3"]
     weight: Float[Tensor, " equation"]
-    noise: Float[Tensor, "pair pair"]
+    noise: Float[Tensor, "3 3"]
 
 
 def wedge(
-    one: Float[Tensor, "*batch size"], other: Float[Tensor, "*batch size"]
-) -> Float[Tensor, "*batch pair"]:
+    one: Float[Tensor, "*batch 3"], other: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
     """Return the bivector of two vectors: ``u_i v_j - u_j v_i`` for i < j."""
-    first, second = _pairs(one.shape[-1])
+    first, second = [0, 0, 1], [1, 2, 2]
     return one[..., first] * other[..., second] - one[..., second] * other[..., first]
 
 
 def curls(
-    pseudo: Float[Tensor, "size pixel"],
+    pseudo: Float[Tensor, "3 pixel"],
     weight: Float[Tensor, " pixel"],
     mask: Bool[Tensor, "height width"],
 ) -> Curls:
@@ -82,8 +80,8 @@ def curls(
     inverse = torch.where(known, 1 / torch.where(known, length, 1), 0)
     unit = s * inverse
     # Noise of the direction is proportional to 1 / length; the weight is bounded at the median.
-    centre = length[known].median() if known.any() else length.new_ones(())
-    reliability = torch.where(known, w * (length / centre).clamp_max(1) ** 2, 0)
+    bounded = (length / length[known].median()).clamp_max(1)
+    reliability = torch.where(known, w * bounded**2, 0)
     raster, heavy = s.new_zeros(*mask.shape, len(s)), s.new_zeros(mask.shape)
     raster[mask], heavy[mask] = unit.mT, reliability
     size = float(mask.sum()) ** 0.5
@@ -94,21 +92,22 @@ def curls(
     down = (wedge(a, c) + wedge(b, d)) / 2
     least = -max_pool2d(-heavy[None], step + 1, stride=1)[0]  # over all pixels of a square
     ones = torch.ones_like(down[..., :1])
-    blocks = _pooled(torch.cat([across, down, ones], dim=-1), least, block)
+    heavy = torch.cat([across, down, ones], dim=-1) * least[..., None]
+    padded = pad(heavy.movedim(-1, 0), (0, -least.shape[1] % block, 0, -least.shape[0] % block))
+    blocks = avg_pool2d(padded[None], block)[0].flatten(1).mT * block**2
     total = blocks[:, -1]
     some = total > 0
-    pairs = across.shape[-1]
-    if int(some.sum()) < 2 * pairs:
+    if int(some.sum()) < 6:
         raise InputError(
             f"integrability: {int(some.sum())} squares of {block} x {block} pixels have normals; "
-            f"needed: {2 * pairs} or more. Widen the mask."
+            "needed: 6 or more. Widen the mask."
         )
     mean = blocks[some, :-1] / total[some, None]
     axes = torch.eye(len(s)).to(s)
     parts = [wedge(unit.mT, (inverse * axis[:, None]).mT) for axis in axes]
     return Curls(
-        across=mean[:, :pairs],
-        down=mean[:, pairs:],
+        across=mean[:, :3],
+        down=mean[:, 3:],
         weight=total[some],
         noise=torch.stack([(reliability[:, None] * part).mT @ part for part in parts]).sum(dim=0),
     )
@@ -147,7 +146,6 @@ def integrable(
 def _least(equations: Curls) -> Float[Tensor, " both"]:
     """Solve by reweighted total least squares."""
     both = torch.cat([equations.across, equations.down], dim=1)
-    pairs = equations.across.shape[1]
     # ``across`` and ``down`` are uncorrelated.
     metric = torch.kron(torch.eye(2).to(both), equations.noise)
     metric = metric + 1e-12 * metric.diagonal().mean() * torch.eye(len(metric)).to(metric)
@@ -159,7 +157,7 @@ def _least(equations: Curls) -> Float[Tensor, " both"]:
         scale = CAUCHY_TUNING * robust_deviation(residual, weight > 0)
         weight = equations.weight * cauchy_weights(residual, scale)
     second = vectors[:, 1]
-    terms = full * torch.kron(torch.eye(2), torch.ones(pairs, pairs)).to(full)
+    terms = full * torch.kron(torch.eye(2), torch.ones(3, 3)).to(full)
     # The curl of the second best solution, as a fraction of its terms, is rounding.
     if not float(second @ full @ second) > 1e-12 * float(second @ terms @ second):
         raise InputError(
@@ -169,22 +167,7 @@ def _least(equations: Curls) -> Float[Tensor, " both"]:
     return vectors[:, 0]
 
 
-def _pairs(size: int) -> tuple[list[int], list[int]]:
-    pairs = list(combinations(range(size), 2))
-    return [first for first, _ in pairs], [second for _, second in pairs]
-
-
 def _vector(bivector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
     """Return the vector dual to a bivector of space."""
     xy, xz, yz = bivector
     return torch.stack([yz, -xz, xy])
-
-
-def _pooled(
-    values: Float[Tensor, "height width channel"], weight: Float[Tensor, "height width"], block: int
-) -> Float[Tensor, "square channel"]:
-    """Sum values by weight over squares."""
-    height, width = weight.shape
-    heavy = (values * weight[..., None]).movedim(-1, 0)
-    padded = pad(heavy, (0, -width % block, 0, -height % block))
-    return avg_pool2d(padded[None], block)[0].flatten(1).mT * block**2

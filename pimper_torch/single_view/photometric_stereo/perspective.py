@@ -21,7 +21,7 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
@@ -144,8 +144,15 @@ def _between(
     rays = _rays(mask, intrinsics)[whole].mT
     (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
     rows = integrability_equations(b, fx * bu, skew * bu + fy * bv, rays)
-    noise_covariance = _noise_of_crosses(b, size_raster[whole], white @ white.mT)
-    by_u, by_v = _by_derivatives(rays, intrinsics)
+    # Noise of the factors is white; after whitening it has a covariance, and normalization
+    # divides it by the vectors' length. Of the cross product of each vector with it:
+    cross = torch.linalg.cross(torch.eye(3).to(b)[None], b.mT[:, None], dim=-1)
+    noise_covariance = cross @ (white @ white.mT) @ cross.mT
+    noise_covariance = noise_covariance / size_raster[whole].square()[:, None, None]
+    # The coefficients of noise of b_u and of b_v, for each row of P.
+    x, y, one = rays
+    by_u = torch.stack([fx * one, skew * one, -x * fx - y * skew], dim=1)
+    by_v = torch.stack([0 * one, fy * one, -y * fy], dim=1)
     weight = torch.ones_like(b[0])
     for _ in range(4):
         cofactors, ratio = _least(rows, weight, noise_covariance, by_u, by_v)
@@ -160,13 +167,7 @@ def _between(
             "least); needed: a surface unlike a ball or any quadric, or less noise. Raise "
             "`radius`, or factorize without perspective and resolve the bas-relief ambiguity."
         )
-    inverse, trouble = torch.linalg.inv_ex(cofactors)
-    if int(trouble) != 0 or not bool(inverse.isfinite().all()):
-        raise InputError(
-            "the integrability of the surface determines no invertible matrix; needed: a curved "
-            "surface and three point lights at least that are not in one plane."
-        )
-    return inverse.mT @ white
+    return torch.linalg.inv(cofactors).mT @ white
 
 
 def _least(
@@ -191,38 +192,6 @@ def _least(
     return least, float(ratios[1] / max(ratios[0], 1e-300))
 
 
-def _noise_of_crosses(
-    b: Float[Tensor, "3 pixel"], size: Float[Tensor, " pixel"], covariance: Float[Tensor, "3 3"]
-) -> Float[Tensor, "pixel 3 3"]:
-    """Return the covariance of the cross product of each vector with noise.
-
-    Noise of the factors is white; after whitening it has the given covariance, and normalization
-    divides it by the vectors' length.
-    """
-    zero = torch.zeros_like(b[0])
-    x, y, z = b
-    cross = torch.stack(
-        [
-            torch.stack([zero, -z, y], dim=-1),
-            torch.stack([z, zero, -x], dim=-1),
-            torch.stack([-y, x, zero], dim=-1),
-        ],
-        dim=-2,
-    )
-    return cross @ covariance @ cross.mT / size.square()[:, None, None]
-
-
-def _by_derivatives(
-    rays: Float[Tensor, "3 pixel"], intrinsics: Float[Tensor, "3 3"]
-) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Return the coefficients of noise of b_u and of b_v, for each row of P."""
-    (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
-    x, y, _ = rays
-    by_u = torch.stack([fx + 0 * x, skew + 0 * x, -x * fx - y * skew], dim=1)
-    by_v = torch.stack([0 * x, fy + 0 * x, -y * fy], dim=1)
-    return by_u, by_v
-
-
 def _derivatives(
     raster: Float[Tensor, "channel height width"], radius: int
 ) -> tuple[Float[Tensor, "channel height width"], ...]:
@@ -240,6 +209,5 @@ def _derivatives(
 def _rays(
     mask: Bool[Tensor, "height width"], intrinsics: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "height width 3"]:
-    pixels = pixel_centers(mask.shape[1], mask.shape[0], intrinsics)
-    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
-    return homogeneous @ torch.linalg.inv(intrinsics).mT
+    pixels = homogeneous(pixel_centers(mask.shape[1], mask.shape[0], intrinsics))
+    return pixels @ torch.linalg.inv(intrinsics).mT

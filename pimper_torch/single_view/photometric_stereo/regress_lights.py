@@ -12,15 +12,15 @@ Optical Engineering 19(1), 1980.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.method.photometry.bilinear import Factors
 from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
 
 # The scale of the weights starts at this multiple and is multiplied by the second per iteration,
@@ -29,14 +29,16 @@ _WIDEST, _NARROWING = 4.0, 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Regressed(Record):
-    """The result of a regression.
+class Factored(Record):
+    """Lights, and the shading vectors that explain photographs under them.
 
     Attributes:
+        lights: ``L``; orthonormal columns where they are factors of the photographs.
         shading: ``b`` of every pixel; zero without samples.
-        weight: Final weight of each sample; 0 where it lies in shadow.
+        weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
+    lights: Float[Tensor, "view unknown"]
     shading: Float[Tensor, "unknown pixel"]
     weight: Float[Tensor, "view pixel"]
 
@@ -47,7 +49,7 @@ def regress(
     lights: Float[Tensor, "view unknown"],
     *,
     robust: bool = True,
-) -> Regressed:
+) -> Factored:
     r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
 
     Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
@@ -90,7 +92,7 @@ def reweigh(
     lit = predicted > 0
     residual = torch.where(lit, radiance - predicted, radiance)
     seen = (weight > 0) & lit
-    level = radiance[seen].abs().mean() if seen.any() else radiance.new_ones(())
+    level = radiance[seen].abs().mean().nan_to_num(nan=1.0)
     scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
     # Far below the 4e-3 of 8-bit steps.
     return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)), lit
@@ -125,9 +127,10 @@ def _fit(
     x: Float[Tensor, "view pixel"],
     weight: Float[Tensor, "view pixel"],
     rows: Float[Tensor, "view unknown"],
-) -> Regressed:
+) -> Factored:
     factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
-    return Regressed(shading=factored.solve(rows.mT @ (weight * x)), weight=weight)
+    shading = factored.solve(rows.mT @ (weight * x))
+    return Factored(lights=rows, shading=shading, weight=weight)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -137,16 +140,12 @@ class StereoSolution(Record):
     Attributes:
         normals: Unit, in the frame of the lights; zero where a pixel is black.
         weight: Final weight of each sample; 0 where missing or in shadow.
-        applied: The transformation that resolved an ambiguity, if any.
-        free: The remaining ambiguity, in words.
     """
 
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
     lights: Float[Tensor, "view 3"]
     weight: Float[Tensor, "view pixel"]
-    applied: BasRelief | None = None
-    free: str = "nothing"
 
 
 def calibrated_stereo(
@@ -200,9 +199,8 @@ def _shared(
     eye = torch.eye(3).to(inner)
     root = torch.linalg.cholesky_ex(inner + 1e-12 * scale[:, None, None] * eye).L
     white = root.mT @ vectors
-    if white.shape[2] == 1:
-        lead = white[..., 0]
-    else:
+    lead = white[..., 0]
+    if white.shape[2] > 1:
         lead = torch.linalg.eigh(white @ white.mT).eigenvectors[..., -1]
     normal = torch.linalg.solve_triangular(root.mT, lead[..., None], upper=True)[..., 0]
     size = normal.norm(dim=1, keepdim=True)
@@ -216,24 +214,9 @@ def _shared(
     return normal.mT, (sign * albedo).clamp_min(0).mT
 
 
-# Steps of variable projection: for the first solution, and after every change of weights: choices.
-_FIRST_STEPS, _NEXT_STEPS = 100, 5
-_WIDEST_FACTORED, _NARROWING_FACTORED = 4.0, 0.8
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Factored(Record):
-    """Factors of the photographs.
-
-    Attributes:
-        lights: ``L``, orthonormal columns.
-        shading: ``S``; the noise of its components is white.
-        weight: Final weight of each sample; 0 where missing or in shadow.
-    """
-
-    lights: Float[Tensor, "view rank"]
-    shading: Float[Tensor, "rank pixel"]
-    weight: Float[Tensor, "view pixel"]
+# Steps of variable projection: for the first solution, and after every change of weights, whose
+# scale narrows more slowly than in a regression: choices.
+_FIRST_STEPS, _NEXT_STEPS, _NARROWING_FACTORED = 100, 5, 0.8
 
 
 def factorize_photographs(
@@ -267,46 +250,31 @@ def factorize_photographs(
             left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
             return Factored(lights=left, shading=left.mT @ x, weight=given)
         # Lights are estimated from these, shading for all.
-        some = usable[evenly(len(usable), 4000).to(usable.device)]
+        spaced = torch.linspace(0, len(usable) - 1, min(len(usable), 4000)).round().long()
+        some = usable[spaced.to(usable.device)]
         first = given[:, some]
         if robust:
             first = first * brightness(x[:, some], seen[:, some])
-        begin = _filled(x[:, some], first, rank)
-        problem = low_rank_problem(x[None, :, some], first[None], begin[None])
-        left = solve_variable_projection(problem, _FIRST_STEPS).lights[0]
-        if robust:
-            left = _settle(x[:, some], given[:, some], first, left)
-        found = regress(x, given, left, robust=robust)
-        return Factored(lights=left, shading=found.shading, weight=found.weight)
+        # Missing samples start as the view's times the pixel's brightness.
+        fraction = first / first.amax().clamp_min(1e-300)
+        filled = fraction * x[:, some] + (1 - fraction) * brightness_guess(x[:, some], first)
+        left = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
+        left = _projected(x[:, some], first, left, _FIRST_STEPS).lights[0]
+        heavy = first
+        for iteration in range(20 if robust else 0):
+            solved = _projected(x[:, some], heavy, left, _NEXT_STEPS)
+            left = solved.lights[0]
+            widen = max(1.0, _WIDEST * _NARROWING_FACTORED**iteration)
+            predicted = left @ solved.shading[0]
+            reliability, lit = reweigh(x[:, some], given[:, some], predicted, widen)
+            heavy = reliability * lit
+        return regress(x, given, left, robust=robust)
 
 
-def _settle(
+def _projected(
     x: Float[Tensor, "view pixel"],
-    given: Float[Tensor, "view pixel"],
-    first: Float[Tensor, "view pixel"],
+    weight: Float[Tensor, "view pixel"],
     left: Float[Tensor, "view rank"],
-) -> Float[Tensor, "view rank"]:
-    """Alternate weights and factors, the scale of the weights falling to its final value."""
-    weight = first
-    for iteration in range(20):
-        problem = low_rank_problem(x[None], weight[None], left[None])
-        solved = solve_variable_projection(problem, _NEXT_STEPS)
-        left = solved.lights[0]
-        widen = max(1.0, _WIDEST_FACTORED * _NARROWING_FACTORED**iteration)
-        reliability, lit = reweigh(x, given, left @ solved.shading[0], widen)
-        weight = reliability * lit
-    return left
-
-
-def _filled(
-    x: Float[Tensor, "view pixel"], weight: Float[Tensor, "view pixel"], rank: int
-) -> Float[Tensor, "view rank"]:
-    """Impute missing samples by view's times pixel's brightness, and take singular vectors."""
-    fraction = weight / weight.amax().clamp_min(1e-300)
-    filled = fraction * x + (1 - fraction) * brightness_guess(x, weight)
-    return torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
-
-
-def evenly(count: int, most: int) -> Int[Tensor, " chosen"]:
-    """Return indices spaced evenly over ``range(count)``."""
-    return torch.linspace(0, count - 1, min(count, most)).round().long()
+    steps: int,
+) -> Factors:
+    return solve_variable_projection(low_rank_problem(x[None], weight[None], left[None]), steps)

@@ -54,8 +54,8 @@ class PhotometricStereo(Record):
     lights: Float[Tensor, "view 3"]
     lit: Bool[Tensor, "view height width"]
     valid: Bool[Tensor, "height width"]
-    applied: bas_relief.BasRelief | None
-    free: str
+    applied: bas_relief.BasRelief | None = None
+    free: str = "nothing"
 
 
 def photometric_stereo(
@@ -102,8 +102,7 @@ def photometric_stereo(
     """
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
-    _refuse_shapes(images, mask, lights, weight)
-    _refuse_settings(method, resolve, lights, intrinsics)
+    _refuse(images, mask, method, resolve, lights, intrinsics, weight)
     with torch.no_grad():
         given = images.new_ones(len(images), *mask.shape) if weight is None else weight
         samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
@@ -117,6 +116,7 @@ def photometric_stereo(
             )
         heavy = heavy[used]
         radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
+        applied, free = None, "nothing"
         if lights is not None:
             _refuse_plane(lights[used])
             found = calibrated_stereo(radiance, heavy, lights[used].double(), robust=robust)
@@ -125,11 +125,14 @@ def photometric_stereo(
             whole[:, :, mask] = radiance
             shading, own = factorize_in_perspective(whole, mask, intrinsics.double(), heavy > 0)
             factors = Factored(lights=own.double(), shading=shading.double(), weight=heavy)
-            found = _lambertian(radiance, factors, None, _FACTOR)
+            found, free = _lambertian(radiance, factors), _FACTOR
         else:
             by = resolve or METHODS[method][0]
-            found = _integrable(radiance, heavy, mask, by, robust)
-        return _spread_out(found, heavy, mask, used, like=images)
+            factors, applied = _integrable(radiance, heavy, mask, by, robust)
+            found = _lambertian(radiance, factors)
+            free = f"bas-relief, {_FACTOR}" if by == "rounded" else _FACTOR
+        spread = _spread_out(found, heavy, mask, used, like=images)
+        return spread.replace(applied=applied, free=free)
 
 
 _FACTOR = "a factor between albedo and light"
@@ -141,7 +144,7 @@ def _integrable(
     mask: Bool[Tensor, "height width"],
     resolve: str,
     robust: bool,
-) -> StereoSolution:
+) -> tuple[Factored, bas_relief.BasRelief]:
     """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
     enough, spanned = determined(factors.weight, factors.lights)
@@ -159,31 +162,22 @@ def _integrable(
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
     relief = bas_relief.convex(relief, shading, reliability, mask)
     moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
-    free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
-    return _lambertian(radiance, moved, relief, free)
+    return moved, relief
 
 
-def _lambertian(
-    radiance: Float[Tensor, "view channel pixel"],
-    factors: Factored,
-    applied: bas_relief.BasRelief | None,
-    free: str,
-) -> StereoSolution:
+def _lambertian(radiance: Float[Tensor, "view channel pixel"], factors: Factored) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""
     size = factors.shading.norm(dim=0)
     normals = factors.shading / torch.where(size > 0, size, 1)
     shade = (factors.lights @ normals).clamp_min(0)
     albedo = chromatic_albedo(radiance, factors.weight, shade)
     length = factors.lights.norm(dim=1)
-    shining = length[length > 0]
-    factor = shining.median() if len(shining) else length.new_ones(())
+    factor = length[length > 0].median().nan_to_num(nan=1.0)
     return StereoSolution(
         normals=normals,
         albedo=albedo * factor,
         lights=factors.lights / factor,
         weight=factors.weight,
-        applied=applied,
-        free=free,
     )
 
 
@@ -196,17 +190,16 @@ def _spread_out(
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
     enough, spanned = determined(found.weight, found.lights)
+    rows, (y, x) = used.nonzero(), mask.nonzero(as_tuple=True)
     valid = torch.zeros_like(mask)
-    valid[mask] = enough & spanned & (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
+    valid[y, x] = enough & spanned & (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
     normals = like.new_zeros(*mask.shape, 3)
-    normals[mask] = found.normals.mT.to(like)
+    normals[y, x] = found.normals.mT.to(like)
     albedo = like.new_zeros(*mask.shape, len(found.albedo))
-    albedo[mask] = found.albedo.mT.to(like)
-    lit = torch.zeros(len(used), *mask.shape, dtype=torch.bool, device=mask.device)
-    agreeing = lit[used]
-    agreeing[:, mask] = (given > 0) & (found.weight >= 0.5 * given)
-    lit[used] = agreeing
-    lights = like.new_zeros(len(used), found.lights.shape[1])
+    albedo[y, x] = found.albedo.mT.to(like)
+    lit = valid.new_zeros(len(used), *mask.shape)
+    lit[rows, y, x] = (given > 0) & (found.weight >= 0.5 * given)
+    lights = like.new_zeros(len(used), 3)
     lights[used] = found.lights.to(like)
     return PhotometricStereo(
         normals=normals,
@@ -214,58 +207,52 @@ def _spread_out(
         lights=lights,
         lit=lit,
         valid=valid,
-        applied=found.applied,
-        free=found.free,
     )
 
 
-def _refuse_shapes(
-    images: Tensor, mask: Tensor, lights: Tensor | None, weight: Tensor | None
+def _refuse(
+    images: Tensor,
+    mask: Tensor,
+    method: str,
+    resolve: str | None,
+    lights: Tensor | None,
+    intrinsics: Tensor | None,
+    weight: Tensor | None,
 ) -> None:
-    if images.shape[2:] != mask.shape:
-        raise InputError(
-            f"photometric stereo: images are {tuple(images.shape[2:])} and the mask is "
-            f"{tuple(mask.shape)}; needed: one size. Resize the mask."
-        )
-    if not bool(mask.any()):
-        raise InputError(
-            "photometric stereo: the mask is empty; needed: pixels of the object. Is it inverted?"
-        )
-    if lights is not None and len(lights) != len(images):
-        raise InputError(
-            f"photometric stereo: {len(lights)} lights for {len(images)} photographs; needed: one "
-            "for each."
-        )
-    if weight is not None:
-        if weight.shape != (len(images), *mask.shape):
-            raise InputError(
-                f"photometric stereo: weights are {tuple(weight.shape)}; needed: "
-                f"{(len(images), *mask.shape)}, one a sample."
-            )
-        if not bool(((weight >= 0) & weight.isfinite()).all()):
-            raise InputError("photometric stereo: weights must be finite and not negative.")
-
-
-def _refuse_settings(
-    method: str, resolve: str | None, lights: Tensor | None, intrinsics: Tensor | None
-) -> None:
-    if method == "calibrated" and lights is None:
-        raise InputError(f"{method}: there are no lights; needed: one direction a photograph.")
-    if method != "calibrated" and lights is not None:
-        raise InputError(f"{method}: finds the lights itself. Leave them out, or use calibrated.")
-    if method == "perspective" and intrinsics is None:
-        raise InputError(f"{method}: there are no intrinsics; needed: those of the camera.")
-    if method != "perspective" and intrinsics is not None:
-        raise InputError(f"{method}: is orthographic. Leave intrinsics out.")
-    if resolve is not None and resolve not in METHODS[method]:
-        raise InputError(
-            f"{method}: resolve is {resolve!r}; needed: {', '.join(METHODS[method]) or 'none'}."
-        )
+    size, seen, count = tuple(mask.shape), tuple(images.shape[2:]), len(images)
+    num_lights = 0 if lights is None else len(lights)
+    given = torch.ones(count, *size) if weight is None else weight
+    resolvers = METHODS[method]
+    for wrong, found, needed in (
+        (seen != size, f"images are {seen}, the mask {size}", "one size; resize the mask"),
+        (not mask.any(), "the mask is empty", "pixels of the object; is it inverted?"),
+        (
+            num_lights != (count if method == "calibrated" else 0),
+            f"{num_lights} lights for {count} photographs",
+            "one for each if they are known (calibrated), else none",
+        ),
+        (
+            (intrinsics is not None) != (method == "perspective"),
+            f"intrinsics are {'not ' if intrinsics is None else ''}given",
+            "those of the camera for perspective, none for orthographic methods",
+        ),
+        (
+            resolve is not None and resolve not in resolvers,
+            f"resolve is {resolve!r}",
+            ", ".join(resolvers) or "none",
+        ),
+        (
+            tuple(given.shape) != (count, *size) or not ((given >= 0) & given.isfinite()).all(),
+            f"weights are {tuple(given.shape)}, some perhaps negative or not finite",
+            f"{(count, *size)}, finite and not negative",
+        ),
+    ):
+        if wrong:
+            raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
 
 
 def _refuse_plane(lights: Float[Tensor, "view 3"]) -> None:
-    singular = torch.linalg.svdvals(lights)
-    if not bool(lights.isfinite().all()) or not singular[-1] > 1e-6 * singular[0]:
+    if not lights.isfinite().all() or int(torch.linalg.matrix_rank(lights, rtol=1e-6)) < 3:
         raise InputError(
             "calibrated: the lights lie in one plane through the object; needed: lights that span "
             "space, or normals are free across the plane. Add one from outside it."
