@@ -24,9 +24,15 @@ from one_viewpoint import NormalMap, read_normal_map
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.paper.integrate import differences
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem
-from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
+from pimper_torch.single_view.integration.steps import (
+    Steps,
+    joined,
+    orthographic_steps,
+    perspective_steps,
+)
 
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
 # Occluding contours divide it into parts; normals say nothing of their distances.
@@ -119,9 +125,10 @@ def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
     steps = perspective_steps(one.normals.double(), one.mask, one.intrinsics)
     unknown = torch.where(one.mask, one.depth.double(), 1).log()
     inside = one.mask[:, 1:] & one.mask[:, :-1], one.mask[1:] & one.mask[:-1]
+    residual = joined(*differences(unknown)) / steps.unit - steps.slope
     apart = [
-        torch.where(inside[0], unknown.diff(dim=1) / steps.unit_right - steps.right, 0),
-        torch.where(inside[1], unknown.diff(dim=0) / steps.unit_down - steps.down, 0),
+        torch.where(within, part, 0)
+        for within, part in zip(inside, steps.split(residual), strict=True)
     ]
     weights = [
         within * (1 + (residual / TRUE_SCALE_PX).square()).pow(-2).clamp_min(1e-6)
@@ -166,9 +173,8 @@ def rotated_by(one: NormalMap, found: IntegratedMap) -> Tensor:
         steps = orthographic_steps(one.normals.double(), one.mask)
     else:
         steps = perspective_steps(one.normals.double(), one.mask, K)
-    across = unknown.diff(dim=1) / steps.unit_right
-    along = unknown.diff(dim=0) / steps.unit_down
-    kept = [steps.reliable_right, steps.reliable_down]
+    across, along = steps.split(joined(*differences(unknown)) / steps.unit)
+    kept = list(steps.split(steps.reliable))
     if found.continuity is not None:
         kept[0] = kept[0] & (found.continuity.right > 0.25)
         kept[1] = kept[1] & (found.continuity.down > 0.25)

@@ -29,7 +29,7 @@ from pimper_torch.paper.integrate import differences, differences_transposed
 from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
-from pimper_torch.single_view.integration.steps import Steps
+from pimper_torch.single_view.integration.steps import Steps, joined
 
 # The final scale: residual at which a step keeps a quarter of its weight, in widths of a pixel at
 # the surface's depth, and the least in deviations of the residuals, so that noisy normals make no
@@ -64,45 +64,28 @@ class Continuity(Record):
 
 def find_discontinuities(
     steps: Steps,
-    weight_right: Float[Tensor, "height steps_right"],
-    weight_down: Float[Tensor, "steps_down width"],
+    weight: Float[Tensor, " step"],
     anchor: Float[Tensor, "height width"] | None,
     heights: Float[Tensor, "height width"] | None,
 ) -> Continuity:
     """Find the continuous steps; constant to autograd.
 
     Args:
-        weight_right: ``D``, zero outside, in units of the squared unknown's inverse.
+        weight: ``D``, zero outside, in units of the squared unknown's inverse.
         anchor: Of pixels whose unknown is given.
     """
     with torch.no_grad():
-        height, width = steps.inside.shape
-        many = height * (width - 1)
-
-        def joined(right: Tensor, down: Tensor) -> Tensor:
-            return torch.cat([right.flatten(), down.flatten()])
-
-        def parts(values: Float[Tensor, " step"]) -> tuple[Tensor, Tensor]:
-            return values[:many].view(height, width - 1), values[many:].view(height - 1, width)
-
-        weight, target = joined(weight_right, weight_down), joined(*steps.target)
         inside = weight > 0
-        tested = inside & joined(steps.reliable_right, steps.reliable_down)
-        tested &= joined(steps.kink_right, steps.kink_down) < _KINK
-        tested &= joined(steps.twist_right, steps.twist_down) < _TWIST
+        tested = inside & steps.reliable & (steps.kink < _KINK) & (steps.twist < _TWIST)
         fraction = torch.where(tested, 1.0, _TIE) * inside
         scale, cause = 3.0, StopCause.LIMIT  # pixels
         for taken in range(1, _MAX_ITERATIONS + 1):
             weights = weight * fraction
-            system = RasterSystem(*parts(weights), anchor, tolerance=1e-6)
-            source = differences_transposed(*parts(weights * target))
+            system = RasterSystem(*steps.split(weights), anchor, tolerance=1e-6)
+            source = differences_transposed(*steps.split(weights * (steps.slope * steps.unit)))
             if anchor is not None and heights is not None:
                 source = source + anchor * heights
-            solution = system.solve(source)
-            right, down = differences(solution)
-            residual = joined(
-                right / steps.unit_right - steps.right, down / steps.unit_down - steps.down
-            )
+            residual = joined(*differences(system.solve(source))) / steps.unit - steps.slope
             deviation = 1.4826 * float(residual[tested].abs().median()) if tested.any() else 0.0
             smallest = max(_SCALE_PX, _NOISE_SCALES * deviation)
             narrowed = scale <= smallest
@@ -117,7 +100,7 @@ def find_discontinuities(
                 break
             scale = max(scale / 3, smallest)
         square = (fraction * residual.square()).sum() / fraction.sum().clamp_min(1)
-        right, down = parts(fraction)
+        right, down = steps.split(fraction)
         return Continuity(
             right=right,
             down=down,

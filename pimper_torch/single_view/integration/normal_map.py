@@ -15,7 +15,13 @@ from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
 from pimper_torch.single_view.integration.raster_system import RasterSystem
-from pimper_torch.single_view.integration.steps import Steps, orthographic_steps, perspective_steps
+from pimper_torch.single_view.integration.steps import (
+    Steps,
+    at_both_ends,
+    joined,
+    orthographic_steps,
+    perspective_steps,
+)
 
 Raster = Tensor | np.ndarray
 Integration = Literal["discontinuities", "weighted"]
@@ -101,12 +107,12 @@ def integrate_normal_map(
     anchor, unknown = _known(known_depth, mask, steps, intrinsics)
     weights = _weights(steps, weight)
     if method == "discontinuities":
-        continuity = find_discontinuities(steps, *weights, anchor, unknown)
-        weights = weights[0] * continuity.right, weights[1] * continuity.down
+        continuity = find_discontinuities(steps, weights, anchor, unknown)
+        weights = weights * joined(continuity.right, continuity.down)
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
-    system = RasterSystem(*weights, anchor)
+    system = RasterSystem(*steps.split(weights), anchor)
     found = system.fit_steps(*steps.target, unknown)
     depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
     return IntegratedMap(
@@ -130,20 +136,11 @@ def _usable(
     return torch.where(usable[..., None], normals / safe, torch.nan)
 
 
-def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> tuple[Tensor, Tensor]:
+def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> Float[Tensor, " step"]:
     """Return the weights of squared differences of the unknown, zero outside the mask."""
-    inside = steps.inside
     reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
-    parts = []
-    for axis, known, unit in (
-        (1, steps.reliable_right, steps.unit_right),
-        (0, steps.reliable_down, steps.unit_down),
-    ):
-        last = reliability.shape[axis] - 1
-        both = inside.narrow(axis, 1, last) & inside.narrow(axis, 0, last)
-        least = torch.minimum(reliability.narrow(axis, 1, last), reliability.narrow(axis, 0, last))
-        parts.append(both * torch.where(known, least, _FILLED_WEIGHT) / unit**2)
-    return parts[0], parts[1]
+    least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
+    return at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
 
 
 def _known(
@@ -163,7 +160,7 @@ def _known(
         )
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
-    return given.double() / (steps.unit_right * steps.unit_down), unknown
+    return given.double() / (steps.units[0] * steps.units[1]), unknown
 
 
 def _refuse_convention(
@@ -199,18 +196,15 @@ def _refuse(
             f"normals are {str(normals.dtype).removeprefix('torch.')} of shape "
             f"{tuple(normals.shape)}; needed: floating point, height width 3."
         )
-    size = normals.shape[:2]
+    size = tuple(normals.shape[:2])
     for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
         if raster is not None and raster.shape != size:
             raise InputError(
-                f"{name} is {raster.shape[0]} x {raster.shape[1]} pixels, the normals "
-                f"{size[0]} x {size[1]}; both must be of one size."
+                f"{name} is {tuple(raster.shape)}, the normals {size}; needed: one size."
             )
-        if name == "weight" and raster is not None and not bool((raster >= 0).all()):
-            raise InputError(
-                f"{name} has {int((~(raster >= 0)).sum())} values that are negative or NaN; "
-                "each must be 0 or more."
-            )
+    if weight is not None and not bool((weight >= 0).all()):
+        count = int((~(weight >= 0)).sum())
+        raise InputError(f"weight has {count} values that are negative or NaN; needed: 0 or more.")
     if mask is not None and not bool(mask.any()):
         raise InputError("mask has no pixel; at least one must be inside.")
     if not all(0 < step < math.inf for step in spacing):

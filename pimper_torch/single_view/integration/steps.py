@@ -10,10 +10,11 @@ unit; times the distance of neighbouring pixels (``unit``: their spacing, or one
 length) they are steps of the unknown.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -32,39 +33,63 @@ _MAX_DIFFERENCE, _MAX_KINK = 0.5, 0.3
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Steps(Record):
-    """Target differences between neighbouring pixels, in units of ``unit_right, unit_down``.
+    """Slopes of the steps between neighbouring pixels: those to the right, then those down.
 
     Attributes:
         slopes: At every pixel, right and down; inpainted where not valid.
-        reliable_right: True where both pixels are inside and their normals are usable.
-        kink_right: Change of the slope along the step, less that of the steps before and after:
+        slope: Of every step; 0 outside.
+        units: Change of the unknown on a step of slope 1, to the right and down.
+        reliable: True where both pixels are inside and their normals are usable.
+        kink: Change of the slope along the step, less that of the steps before and after:
             0 on a smooth surface.
-        twist_right: Likewise of the slope across the step, at depth discontinuities: sides of
+        twist: Likewise of the slope across the step, at depth discontinuities: sides of
             different slope meet in one point at most.
-        unit_right: Change of the unknown on a step of slope 1.
         valid: Pixels with a usable normal.
     """
 
     slopes: Float[Tensor, "height width 2"]
-    right: Float[Tensor, "height steps_right"]
-    down: Float[Tensor, "steps_down width"]
-    reliable_right: Bool[Tensor, "height steps_right"]
-    reliable_down: Bool[Tensor, "steps_down width"]
-    kink_right: Float[Tensor, "height steps_right"]
-    kink_down: Float[Tensor, "steps_down width"]
-    twist_right: Float[Tensor, "height steps_right"]
-    twist_down: Float[Tensor, "steps_down width"]
-    unit_right: float
-    unit_down: float
+    slope: Float[Tensor, " step"]
+    units: tuple[float, float]
+    reliable: Bool[Tensor, " step"]
+    kink: Float[Tensor, " step"]
+    twist: Float[Tensor, " step"]
     inside: Bool[Tensor, "height width"]
     valid: Bool[Tensor, "height width"]
+
+    @property
+    def unit(self) -> Float[Tensor, " step"]:
+        """The unit of each step."""
+        right, down = self.split(torch.ones_like(self.slope))
+        return joined(self.units[0] * right, self.units[1] * down)
 
     @property
     def target(
         self,
     ) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
-        """The differences in units of the unknown."""
-        return self.right * self.unit_right, self.down * self.unit_down
+        """The differences in units of the unknown, to the right and down."""
+        return self.split(self.slope * self.unit)
+
+    def split(
+        self, values: Shaped[Tensor, " step"]
+    ) -> tuple[Shaped[Tensor, "height steps_right"], Shaped[Tensor, "steps_down width"]]:
+        """Return the values of steps to the right and of those down, as rasters."""
+        height, width = self.inside.shape
+        many = height * (width - 1)
+        return values[:many].view(height, width - 1), values[many:].view(height - 1, width)
+
+
+def joined(
+    right: Shaped[Tensor, "height steps_right"], down: Shaped[Tensor, "steps_down width"]
+) -> Shaped[Tensor, " step"]:
+    """Join the values of steps to the right and down; see :meth:`Steps.split`."""
+    return torch.cat([right.flatten(), down.flatten()])
+
+
+def at_both_ends(
+    combine: Callable[[Tensor, Tensor], Tensor], raster: Shaped[Tensor, "height width"]
+) -> Shaped[Tensor, " step"]:
+    """Combine the values of the pixels at both ends of every step."""
+    return joined(combine(raster[:, 1:], raster[:, :-1]), combine(raster[1:], raster[:-1]))
 
 
 def orthographic_steps(
@@ -151,27 +176,23 @@ def _steps(
     valid: Bool[Tensor, "height width"],
     unit: tuple[float, float],
 ) -> Steps:
-    known = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
-    inside = mask[:, 1:] & mask[:, :-1], mask[1:] & mask[:-1]
-    across, along = slopes.unbind(dim=-1)
-    right, kink_right = _curved(*_between_planes(across[:, :-1], across[:, 1:], bend[0]), known[0])
-    down, kink_down = _curved(
-        *_between_planes(along.mT[:, :-1], along.mT[:, 1:], bend[1]), known[1].mT
-    )
-    twist_right = _excess(along.diff(dim=1), known[0])
-    twist_down = _excess(across.diff(dim=0).mT, known[1].mT).mT
+    axes = []
+    for axis in (0, 1):
+        own, other, known = slopes[..., axis], slopes[..., 1 - axis], valid
+        if axis == 1:
+            own, other, known = own.mT, other.mT, known.mT
+        both = known[:, 1:] & known[:, :-1]
+        step, kink = _curved(*_between_planes(own[:, :-1], own[:, 1:], bend[axis]), both)
+        found = step, both, kink, _excess(other.diff(dim=1), both)
+        axes.append([part.mT for part in found] if axis == 1 else found)
+    step, reliable, kink, twist = (joined(right, down) for right, down in zip(*axes, strict=True))
     return Steps(
         slopes=slopes,
-        right=torch.where(inside[0], right, 0),
-        down=torch.where(inside[1], down.mT, 0),
-        reliable_right=known[0],
-        reliable_down=known[1],
-        kink_right=kink_right,
-        kink_down=kink_down.mT,
-        twist_right=twist_right,
-        twist_down=twist_down,
-        unit_right=unit[0],
-        unit_down=unit[1],
+        slope=torch.where(at_both_ends(torch.logical_and, mask), step, 0),
+        units=unit,
+        reliable=reliable,
+        kink=kink,
+        twist=twist,
         inside=mask,
         valid=valid,
     )
