@@ -88,7 +88,6 @@ def integrate_normal_map(
     _refuse(normals, mask, weight, known_depth, spacing)
     mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
-    _refuse_convention(normals, mask)
     rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
     box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
@@ -163,16 +162,35 @@ def _known(
     return given.double() / (steps.units[0] * steps.units[1]), unknown
 
 
-def _refuse_convention(
-    normals: Float[Tensor, "height width 3"], mask: Bool[Tensor, "height width"]
+def _refuse(
+    normals: Tensor,
+    mask: Tensor | None,
+    weight: Tensor | None,
+    known_depth: Tensor | None,
+    spacing: tuple[float, float],
 ) -> None:
-    """Refuse normals that are coded as colours or face away."""
-    some = normals.detach()[mask]
+    """Refuse unusable rasters, and normals that are coded as colours or face away."""
+    if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
+        raise InputError(
+            f"normals are {str(normals.dtype).removeprefix('torch.')} of shape "
+            f"{tuple(normals.shape)}; needed: floating point, height width 3."
+        )
+    size = tuple(normals.shape[:2])
+    for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
+        if raster is not None and raster.shape != size:
+            shape = tuple(raster.shape)
+            raise InputError(f"{name} is {shape}, the normals are {size}; needed: one size.")
+    if weight is not None and not bool((weight >= 0).all()):
+        count = int((~(weight >= 0)).sum())
+        raise InputError(f"weight has {count} values that are negative or NaN; needed: 0 or more.")
+    if mask is not None and not bool(mask.any()):
+        raise InputError("mask has no pixel; at least one must be inside.")
+    if not all(0 < step < math.inf for step in spacing):
+        raise InputError(f"spacing is {spacing}; both distances must be above 0.")
+    some = normals.detach().flatten(0, 1) if mask is None else normals.detach()[mask.bool()]
     some = some[some.isfinite().all(dim=-1) & (some != 0).any(dim=-1)]
-    if len(some) == 0:
-        return
     axes = "needed: x right, y down, z into the surface, n_z < 0 where it faces the viewer"
-    if bool((some >= 0).all() and (some <= 1).all()) and len(some) > 1:
+    if len(some) > 1 and bool(((some >= 0) & (some <= 1)).all()):
         raise InputError(
             f"normals lie in [0, 1], as colours do: decode them as 2 n - 1 first; {axes}."
         )
@@ -182,30 +200,3 @@ def _refuse_convention(
             f"normals: {away:.0%} of them have z towards the viewer, as OpenGL's do, whose y "
             f"points up, too: negate y and z; {axes}."
         )
-
-
-def _refuse(
-    normals: Tensor,
-    mask: Tensor | None,
-    weight: Tensor | None,
-    known_depth: Tensor | None,
-    spacing: tuple[float, float],
-) -> None:
-    if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
-        raise InputError(
-            f"normals are {str(normals.dtype).removeprefix('torch.')} of shape "
-            f"{tuple(normals.shape)}; needed: floating point, height width 3."
-        )
-    size = tuple(normals.shape[:2])
-    for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
-        if raster is not None and raster.shape != size:
-            raise InputError(
-                f"{name} is {tuple(raster.shape)}, the normals {size}; needed: one size."
-            )
-    if weight is not None and not bool((weight >= 0).all()):
-        count = int((~(weight >= 0)).sum())
-        raise InputError(f"weight has {count} values that are negative or NaN; needed: 0 or more.")
-    if mask is not None and not bool(mask.any()):
-        raise InputError("mask has no pixel; at least one must be inside.")
-    if not all(0 < step < math.inf for step in spacing):
-        raise InputError(f"spacing is {spacing}; both distances must be above 0.")

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
@@ -104,11 +104,8 @@ def orthographic_steps(
             and the steps not reliable.
         spacing: Distance of neighbouring pixels in a row and in a column.
     """
-    known = normals.isfinite().all(dim=-1)
-    valid = mask & known & (normals[..., 2] < -_GRAZING)
-    safe = torch.where(valid[..., None], normals, normals.new_tensor([0, 0, -1])).double()
-    slopes = _filled(-safe[..., :2] / safe[..., 2:], valid)
-    return _steps(slopes, (0.0, 0.0), mask, valid, spacing)
+    towards = normals.new_tensor([0, 0, 1]).double()
+    return _steps(normals, towards.expand(*mask.shape, 3), (0.0, 0.0), mask, spacing)
 
 
 def perspective_steps(
@@ -130,25 +127,11 @@ def perspective_steps(
     Source: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung, Discontinuity-aware normal
     integration for generic central camera models, 2025, for the planes that meet.
     """
-    height, width = mask.shape
     K = intrinsics.to(normals).double()
-    centers = pixel_centers(width, height, like=K)
-    rays = torch.stack(
-        [
-            (centers[..., 0] - K[0, 2]) / K[0, 0],
-            (centers[..., 1] - K[1, 2]) / K[1, 1],
-            torch.ones_like(centers[..., 0]),
-        ],
-        dim=-1,
-    )
-    known = normals.isfinite().all(dim=-1)
-    facing = -(torch.where(known[..., None], normals, 0).double() * rays).sum(dim=-1)
-    valid = mask & known & (facing > _GRAZING)
-    safe = torch.where(valid[..., None], normals.double(), -rays)
-    facing = -(safe * rays).sum(dim=-1)
-    slopes = _filled(safe[..., :2] / facing[..., None], valid)
+    centers = pixel_centers(mask.shape[1], mask.shape[0], like=K)
+    rays = homogeneous((centers - K[:2, 2]) / K.diagonal()[:2])
     unit = 1 / float(K[0, 0]), 1 / float(K[1, 1])
-    return _steps(slopes, unit, mask, valid, unit)
+    return _steps(normals, rays, unit, mask, unit)
 
 
 def _between_planes(
@@ -170,12 +153,18 @@ def _between_planes(
 
 
 def _steps(
-    slopes: Float[Tensor, "height width 2"],
+    normals: Float[Tensor, "height width 3"],
+    rays: Float[Tensor, "height width 3"],
     bend: tuple[float, float],
     mask: Bool[Tensor, "height width"],
-    valid: Bool[Tensor, "height width"],
     unit: tuple[float, float],
 ) -> Steps:
+    known = normals.isfinite().all(dim=-1)
+    facing = -(torch.where(known[..., None], normals, 0).double() * rays).sum(dim=-1)
+    valid = mask & known & (facing > _GRAZING)
+    safe = torch.where(valid[..., None], normals.double(), -rays)
+    across = (safe[..., :2] / -(safe * rays).sum(dim=-1)[..., None]).movedim(-1, 0)
+    slopes = fill_smoothly(across[None], valid.to(across)[None])[0].movedim(0, -1)
     axes = []
     for axis in (0, 1):
         own, other, known = slopes[..., axis], slopes[..., 1 - axis], valid
@@ -232,9 +221,3 @@ def _beside(
     """Return the changes on the steps before and after each; 0 where those are not reliable."""
     wide = pad(torch.where(known, change, 0), (1, 1))
     return wide[:, :-2], wide[:, 2:]
-
-
-def _filled(
-    slopes: Float[Tensor, "height width 2"], valid: Bool[Tensor, "height width"]
-) -> Float[Tensor, "height width 2"]:
-    return fill_smoothly(slopes.movedim(-1, 0)[None], valid.to(slopes)[None])[0].movedim(0, -1)
