@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
@@ -188,21 +189,20 @@ class Align(Stage):
     ) -> Pulls:
         """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
         seams, unit, vertices = problem.seams, problem.unit, problem.vertices
-        overlaps = meet_overlaps(
-            seams, problem.patches, depths.buckets, transforms * problem.in_scene
-        )
-        met = overlaps.met.flatten(1)
+        in_scene = transforms * problem.in_scene
+        found, feet, both = meet_overlaps(seams, problem.patches, depths.buckets, in_scene)
+        met = both.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
         prior[3] = torch.inf  # patches do not move along their normals
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
-        corners = _with_one(vertices.samples / unit)
+        corners = pad(vertices.samples / unit, (0, 1), value=1.0)
         pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
-            samples=_with_one(overlaps.samples.flatten(2, 3) / unit),
-            gap=(overlaps.feet[:, 0] - overlaps.feet[:, 1]).flatten(1, 2) / unit,
+            samples=pad(found.flatten(2, 3) / unit, (0, 1), value=1.0),
+            gap=(feet[:, 0] - feet[:, 1]).flatten(1, 2) / unit,
             weight=met.to(unit) / count[:, None],
-            curvature=curvature_along(overlaps.samples[..., 2], overlaps.met, seams.edge_lengths),
+            curvature=curvature_along(found[..., 2], both, seams.edge_lengths),
             corners=corners,
             corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
@@ -220,29 +220,20 @@ class Align(Stage):
         touching = pulls.facets[(pulls.weight > 0).any(dim=1)].flatten()
         moves = torch.zeros_like(transforms[:, 0]).index_fill(0, touching, 1)
         pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
+        prior = pulls.prior_weight.clone()
+        prior[2] = torch.inf
+        scales_held = pulls.replace(prior_weight=prior)
         for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
-            terms = _curvature_terms(pulls, transforms, distance)
+            apart = (pulls.weight * distance.square()).sum(dim=1)
+            terms = seam_stiffness(pulls.curvature, transforms[pulls.facets, 2], apart)
             # What tilts and shifts can repair says nothing about scales.
-            only_level = fresh and solve == 0
-            transforms = solve_transforms(
-                _with_scales_held(pulls) if only_level else pulls, transforms, *terms
-            )
+            free = scales_held if fresh and solve == 0 else pulls
+            transforms = solve_transforms(free, transforms, *terms)
             limited = _limit_scales(transforms, self.config.scale_limit)
             if not torch.equal(limited, transforms):
-                transforms = solve_transforms(_with_scales_held(pulls), limited, *terms)
+                transforms = solve_transforms(scales_held, limited, *terms)
         return transforms
-
-
-def _curvature_terms(
-    pulls: Pulls, transforms: Float[Tensor, "face 4"], distance: Float[Tensor, "seam ray"]
-) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
-    """Return k of every seam, and what its derivative adds to the right-hand sides."""
-    scales = transforms[pulls.facets, 2]
-    # The floor is C of an arc whose centre stands out by 0.7 % of its edge's length.
-    stiffness = seam_stiffness(pulls.curvature, scales, 3e-3)
-    apart = (pulls.weight * distance.square()).sum(dim=1)
-    return stiffness, (stiffness.square() * apart)[:, None] * pulls.curvature * scales
 
 
 def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
@@ -253,19 +244,9 @@ def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, "
     return distance[met].median().clamp_min(5e-3) / 2**0.5
 
 
-def _with_scales_held(pulls: Pulls) -> Pulls:
-    held = pulls.prior_weight.clone()
-    held[2] = torch.inf
-    return pulls.replace(prior_weight=held)
-
-
 def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Tensor, "face 4"]:
     hx, hy, hz, h0 = transforms.unbind(dim=-1)
     return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
-
-
-def _with_one(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
 
 
 def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, ""]:

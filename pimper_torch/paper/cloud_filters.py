@@ -10,14 +10,6 @@ from scipy.spatial import ConvexHull, Delaunay, cKDTree
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import barycentric_2d
-from pimper_torch.records import Cameras
-
-
-def views_near(cameras: Cameras, reference: int, max_angle_deg: float) -> Bool[Tensor, " view"]:
-    """Find the views whose optical axes are within an angle of the reference's."""
-    axes = cameras.cam_from_world[:, 2, :3]
-    cosine = (axes @ axes[reference]).clamp(-1, 1)
-    return cosine >= torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()
 
 
 def behind_others(

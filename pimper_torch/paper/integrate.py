@@ -15,8 +15,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import slopes_from_normals
-from pimper_torch.records import CoarseMesh, DepthPatches, Depths, PhotometricPatches
-from pimper_torch.records.patches import Templates
+from pimper_torch.records import DepthPatches, Depths, PhotometricPatches
 from pimper_torch.runtime.progress import track
 from pimper_torch.runtime.stage import Stage
 
@@ -47,8 +46,11 @@ def _blended(
     known = torch.where(weight > 0, weighted / torch.where(weight > 0, weight, 1), 0)
     if max(size) == 1:
         return known
-    coarse_weight = _halved(weight)
-    coarse_weighted = _halved(weighted)
+    window = [min(2, side) for side in size]
+    coarse_weight, coarse_weighted = (
+        avg_pool2d(raster, kernel_size=window, stride=window, ceil_mode=True)
+        for raster in (weight, weighted)
+    )
     # A parent of one known child knows as much as that child: without saturation, thin
     # evidence would fade on its way up, and the mean of the whole patch would win.
     full = (4 * coarse_weight).clamp_max(1)
@@ -56,13 +58,6 @@ def _blended(
     coarse = _blended(coarse_weighted * gain, full)
     around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
     return weight * known + (1 - weight) * around
-
-
-def _halved(
-    raster: Float[Tensor, "patch channel height width"],
-) -> Float[Tensor, "patch channel half_height half_width"]:
-    window = [min(2, side) for side in raster.shape[-2:]]
-    return avg_pool2d(raster, kernel_size=window, stride=window, ceil_mode=True)
 
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
@@ -98,7 +93,11 @@ def solve_poisson(
     Args:
         source: ``s``. No ``z`` can produce its mean, which is ignored; ``z`` has mean zero.
 
-    Differentiable in ``source``.
+    With ``s`` the transposed differences of given steps, these are the heights whose steps come
+    nearest to them. Differentiable in ``source``.
+
+    Source: Frankot & Chellappa, PAMI 10(4), 1988, in the cosine basis; Simchony, Chellappa &
+    Shao, PAMI 12(5), 1990, for the discrete operator.
     """
     height, width = source.shape[-2:]
     rows, cols = cosine_basis(height, source), cosine_basis(width, source)
@@ -106,18 +105,6 @@ def solve_poisson(
     # No height answers to the mean; dividing it by infinity removes it.
     stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
     return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols
-
-
-def integrate_steps(
-    right: Float[Tensor, "*batch height steps_right"],
-    down: Float[Tensor, "*batch steps_down width"],
-) -> Float[Tensor, "*batch height width"]:
-    """Find the heights, of mean zero, whose steps come nearest to those given.
-
-    Source: Frankot & Chellappa, PAMI 10(4), 1988, in the cosine basis; Simchony, Chellappa &
-    Shao, PAMI 12(5), 1990, for the discrete operator.
-    """
-    return solve_poisson(differences_transposed(right, down))
 
 
 def _stiffness(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"]:
@@ -141,13 +128,19 @@ class Integrate(Stage):
         # A normal beyond the warp's limit lies on the contour or is wrong, and one alone can bend
         # its whole patch.
         steepest = math.tan(math.radians(75))
+        mesh = photometric.patches.coarse.mesh
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
         buckets = []
         for templates, photometry in track(pairs):
             height_field = integrate_normals(
                 photometry.normals_patch, photometry.valid, templates.spacing, steepest
             )
-            depth = through_corners(height_field, templates, photometric.patches.coarse)
+            vertices = mesh.vertices_world[mesh.faces[templates.facet]]
+            across, up = transform(templates.patch_from_world, vertices).split([2, 1], dim=-1)
+            grid = templates.origin, templates.spacing
+            found = sample_raster(height_field[:, None], across, *grid)
+            offset = (found[:, 0] - up[..., 0]).mean(dim=1)
+            depth = height_field - offset[:, None, None]
             has_data = photometry.valid.flatten(1).any(dim=1)
             depths = Depths(
                 depth=depth,
@@ -178,17 +171,4 @@ def integrate_normals(
     # Half-way between samples the mean of the two is right to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
-    return integrate_steps(right, down).to(normals)
-
-
-def through_corners(
-    height_field: Float[Tensor, "patch height width"], templates: Templates, coarse: CoarseMesh
-) -> Float[Tensor, "patch height width"]:
-    """Shift height fields along z so that they pass, on average, through their facets' corners."""
-    vertices = coarse.mesh.vertices_world[coarse.mesh.faces[templates.facet]]
-    corners = transform(templates.patch_from_world, vertices)
-    found = sample_raster(
-        height_field[:, None], corners[..., :2], templates.origin, templates.spacing
-    )
-    offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
-    return height_field - offset[:, None, None]
+    return solve_poisson(differences_transposed(right, down)).to(normals)

@@ -59,14 +59,15 @@ class Triangulate(Stage):
         chosen = cloud_filters.spread_to_count(pixels, quality, self.config.num_points)
         source = reliable[chosen]
         facets = self._facets(scene.points_world[source], scene.views, scene.cameras, reference)
-        connected = largest_component(facets)
-        leave_out("triangulate.pieces", len(facets) - len(connected), total=len(facets))
-        if len(connected) == 0:
+        if len(facets) == 0:
             raise ReconstructionError(
                 f"coarse mesh: all facets between {len(source)} points were dropped, and at least "
                 "one is needed. Choose another `triangulate.reference`, or look at the masks."
             )
-        used, faces = torch.unique(connected, return_inverse=True)
+        label = face_components(facets)
+        connected = label == label.bincount().argmax()
+        leave_out("triangulate.pieces", ~connected)
+        used, faces = torch.unique(facets[connected], return_inverse=True)
         source = source[used]
         vertices = scene.points_world[source]
         between = reliable[~torch.isin(reliable, source)]
@@ -95,7 +96,8 @@ class Triangulate(Stage):
         """List the points that pass every filter, and how good each is."""
         cameras, observed = scene.cameras, scene.observed
         cam_from_world = cameras.cam_from_world[reference]
-        near = cloud_filters.views_near(cameras, reference, _MAX_VIEW_ANGLE_DEG)
+        axes = cameras.cam_from_world[:, 2, :3]
+        near = axes @ axes[reference] >= torch.deg2rad(axes.new_tensor(_MAX_VIEW_ANGLE_DEG)).cos()
         pixels, depth = project(scene.points_world, cam_from_world, cameras.intrinsics[reference])
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
         points_cam = transform(cam_from_world, scene.points_world)
@@ -175,14 +177,6 @@ def peel(
         if not drop.any():
             return faces
         faces, unwanted, sharp = faces[~drop], unwanted[~drop], sharp[~drop]
-
-
-def largest_component(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
-    """Keep the largest component of faces connected by edges."""
-    if len(faces) == 0:
-        return faces
-    label = face_components(faces)
-    return faces[label == label.bincount().argmax()]
 
 
 def _shown(

@@ -51,7 +51,7 @@ GUARDS: dict[str, tuple[What, str]] = {
     "coarse.components": ("faces", "small components"),
     "coarse.crowded": ("facets", "a third at an edge"),
     "coarse.pieces": ("facets", "small components"),
-    "triangulate.reliable": ("points", "uncertain, hidden, or unlike their neighbours"),
+    "triangulate.reliable": ("points", "far from the view, hidden, or unlike their neighbours"),
     "triangulate.pieces": ("facets", "small components"),
     "warp": ("pixels", "turned away, hidden, dark or saturated"),
     "photometry.shadows": ("pixels", "in shadow of the fitted light"),

@@ -105,22 +105,22 @@ def _improve(
     w: Float[Tensor, "*batch 1 sample"],
 ) -> Float[Tensor, "*batch 4 4"]:
     moved = matrix @ source
-    basis = _algebra(torch.eye(6, dtype=matrix.dtype, device=matrix.device))
-    eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
-    basis = torch.cat([basis, eye[None]])
-    steps = torch.einsum("gij,...jk->...gik", basis, moved)
+    eye = torch.eye(7).to(matrix)
+    basis = torch.cat([_algebra(eye[:6, :6]), eye[None, :4, :4]])
     root = w.sqrt()
+    steps = torch.einsum("gij,...jk->...gik", basis, moved)
     A = (steps * root[..., None, :, :]).flatten(-2)
     r = ((target - moved) * root).flatten(-2)
     normal = A @ A.mT
     damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + 1e-30
-    eye7 = torch.eye(7, dtype=matrix.dtype, device=matrix.device)
-    step = torch.linalg.solve(normal + damping[..., None, None] * eye7, (A @ r[..., None])[..., 0])
+    step = torch.linalg.solve(normal + damping[..., None, None] * eye, (A @ r[..., None])[..., 0])
     step = step * (1 / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
     better = step[..., 6, None, None].exp() * lorentz(step[..., :6]) @ matrix
-    before = (w * (target - moved) ** 2).sum(dim=(-2, -1))
-    after = (w * (target - better @ source) ** 2).sum(dim=(-2, -1))
-    return torch.where((after < before)[..., None, None], better, matrix)
+
+    def misfit(moving: Tensor) -> Tensor:
+        return (w * (target - moving @ source) ** 2).sum(dim=(-2, -1))
+
+    return torch.where((misfit(better) < misfit(matrix))[..., None, None], better, matrix)
 
 
 def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:

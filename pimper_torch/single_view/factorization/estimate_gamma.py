@@ -335,6 +335,13 @@ def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, Encode
 
 
 def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
+    r"""Find the minimum, with gamma's sandwich standard error.
+
+    With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
+    second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`, over samples, or
+    over views if that is larger; it needs no model of the noise. Infinite where the loss has next
+    to no curvature.
+    """
     fit = start
 
     def loss(logarithm: float) -> float:
@@ -346,7 +353,16 @@ def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     gamma = math.exp(found.x)
     fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
-    error = _standard_error(problem, gamma, fit)
+    step = 0.02 * gamma
+    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
+    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
+    centre = float(fit.loss.sum())
+    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * centre) / step**2
+    slope = (above.loss - below.loss) / (2 * step)
+    noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
+    # On data without noise everything but the curvature is rounding.
+    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
+    error = noise / curvature if curved else math.inf
     return _Minimum(problem=problem, gamma=gamma, fit=fit, error=error)
 
 
@@ -372,22 +388,3 @@ def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
     ):
         found = found[1:]
     return found[0]
-
-
-def _standard_error(problem: EncodedMatrix, gamma: float, fit: EncodedFit) -> float:
-    r"""Return gamma's sandwich standard error over samples, or over views if that is larger.
-
-    With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
-    second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`; it needs no model
-    of the noise. Infinite where the loss has next to no curvature.
-    """
-    step = 0.02 * gamma
-    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
-    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
-    centre = float(fit.loss.sum())
-    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * centre) / step**2
-    slope = (above.loss - below.loss) / (2 * step)
-    noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
-    # On data without noise everything but the curvature is rounding.
-    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
-    return noise / curvature if curved else math.inf

@@ -88,13 +88,12 @@ def low_rank_problem(
             f"{rows} x {columns}."
         )
     heavy = weight.double().contiguous()
-    if not bool(((heavy >= 0) & heavy.isfinite()).all()):
-        raise InputError("weights must be finite and not negative; found others.")
     seen = heavy > 0
-    if not bool(matrix[seen].isfinite().all()):
-        count = int((~matrix[seen].isfinite()).sum())
+    wrong = ~((heavy >= 0) & heavy.isfinite() & (matrix.isfinite() | ~seen))
+    if bool(wrong.any()):
         raise InputError(
-            f"{count} entries with weight are not finite; needed: numbers. Give them weight 0."
+            f"{int(wrong.sum())} entries have a weight that is negative or not finite, or one "
+            "above 0 but no finite value; needed: weight 0 where there is no number."
         )
     known = torch.where(seen, matrix.double(), 0).contiguous()
     left = start.double()

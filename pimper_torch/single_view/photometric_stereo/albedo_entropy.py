@@ -12,23 +12,27 @@ minimization, CVPR 2007.
 import itertools
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
 
-def chromaticities(
-    radiance: Float[Tensor, "view channel pixel"],
-) -> tuple[Float[Tensor, "channel pixel"], Bool[Tensor, " pixel"]]:
-    """Estimate the logarithm of each pixel's chromaticity, the lights' colours removed.
+def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Tensor, " pixel"]:
+    """Cluster pixels of similar chromaticity, the lights' colours removed.
 
-    Weighted least squares for ``e`` and ``a`` in turn, weights the square of brightness.
+    The logarithms ``e`` and ``a`` are estimated in turn by weighted least squares, weights the
+    square of brightness. The colour with the most neighbours becomes the first cluster, its
+    neighbours are removed, and so on; then every pixel is assigned to the nearest cluster within
+    the radius.
+
+    Args:
+        radiance: Linear, of two channels or more; all pixels of one channel are one cluster.
 
     Returns:
-        Colours whose sum over channels is zero, up to one colour that all pixels share; and
-        whether a pixel has one: bright enough in all channels of some view.
+        Labels of the pixels, the largest group's 0; -1 for pixels in no group, and for those that
+        are not bright enough in all channels of some view.
     """
     values = radiance.double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
@@ -41,29 +45,12 @@ def chromaticities(
     total_view = weight.sum(dim=2).clamp_min(1e-30)
     total_pixel = weight.sum(dim=0).clamp_min(1e-30)
     point_light = torch.zeros_like(log[:, :, 0])
-    pixel = torch.zeros_like(log[0])
     # Each at least halves the residual where point lights overlap.
     for _ in range(20):
         pixel = (weight * (log - point_light[..., None])).sum(dim=0) / total_pixel
         point_light = (weight * (log - pixel)).sum(dim=2) / total_view
-    return pixel.to(radiance), bright.any(dim=0)
-
-
-def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Tensor, " pixel"]:
-    """Cluster pixels of similar chromaticity.
-
-    The colour with the most neighbours becomes the first cluster, its neighbours are removed, and
-    so on; then every pixel is assigned to the nearest cluster within the radius.
-
-    Args:
-        radiance: Linear, of two channels or more; all pixels of one channel are one cluster.
-
-    Returns:
-        Labels of the pixels, the largest group's 0; -1 for pixels in no group.
-    """
-    colour, known = chromaticities(radiance)
-    labels = torch.full_like(known, -1, dtype=torch.int64)
-    colour = colour[:, known].mT.double().contiguous()
+    known = bright.any(dim=0)
+    colour = pixel[:, known].to(radiance).mT.double().contiguous()
     sample = colour[:: max(1, -(-len(colour) // 2000))]  # all are then assigned
     # In logarithm of colour: a few times its noise, less than half the distance of paints.
     radius = 0.05
@@ -77,6 +64,7 @@ def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Te
             break
         leaders.append(sample[neighbours[best] & remaining].mean(dim=0))
         remaining = remaining & ((sample - leaders[-1]).norm(dim=1) > 2 * radius)
+    labels = torch.full_like(known, -1, dtype=torch.int64)
     if leaders:
         distance, nearest = torch.cdist(colour, torch.stack(leaders)).min(dim=1)
         labels[known] = torch.where(distance < radius, nearest, -1)
@@ -152,13 +140,32 @@ def albedo_entropy(
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """
+    # A cubic B-spline is a Gaussian of width 1 / sqrt(3) bins, and its samples' entropy hardly
+    # depends on where in a bin they are taken.
+    bins_per_unit = 1 / (3**0.5 * width)
+    bins = int(2 * _REACH * bins_per_unit) + 4
+    x, y, z = shading
+    found = []
     # Products at a time fit a cache.
-    size = max(1, 250_000 // shading.shape[1])
-    parts = [
-        _entropy(shading, labels, candidates[first : first + size], width)
-        for first in range(0, len(candidates), size)
-    ]
-    return torch.cat(parts)
+    for some in candidates.split(max(1, 250_000 // shading.shape[1])):
+        mu, nu, log_lam = some.mT[..., None]
+        lam = log_lam.exp()
+        square = (lam * x - mu * z).square() + (lam * y - nu * z).square() + z * z
+        log = square.clamp_min(torch.finfo(shading.dtype).tiny).log() / 2
+        position = (log - log.mean(dim=1, keepdim=True)).clamp(-_REACH, _REACH) + _REACH
+        position = position * bins_per_unit
+        below = position.long()
+        t = position - below
+        index = labels * bins + below
+        histogram = shading.new_zeros(len(some), (int(labels.max()) + 1) * bins)
+        u, double = 1 - t, t * t
+        last = double * t / 6
+        first, second = u * u * u / 6, 2 / 3 - double + 3 * last
+        for shift, fraction in enumerate((first, second, 1 - first - second - last, last)):
+            histogram.scatter_add_(1, index + shift, fraction)
+        probability = histogram / shading.shape[1]
+        found.append(-torch.special.xlogy(probability, probability).sum(dim=1))
+    return torch.cat(found)
 
 
 def _minimized(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Float[Tensor, " 3"]:
@@ -207,33 +214,3 @@ def _local_search(
         if len(moving) == 0:
             break
     return best, least
-
-
-def _entropy(
-    b: Float[Tensor, "3 pixel"],
-    labels: Int[Tensor, " pixel"],
-    candidates: Float[Tensor, "candidate 3"],
-    width: float,
-) -> Float[Tensor, " candidate"]:
-    mu, nu, log_lam = candidates.mT[..., None]
-    x, y, z = b
-    lam = log_lam.exp()
-    square = (lam * x - mu * z).square() + (lam * y - nu * z).square() + z * z
-    log = square.clamp_min(torch.finfo(b.dtype).tiny).log() / 2
-    # A cubic B-spline is a Gaussian of width 1 / sqrt(3) bins, and its samples' entropy hardly
-    # depends on where in a bin they are taken.
-    bins_per_unit = 1 / (3**0.5 * width)
-    position = (log - log.mean(dim=1, keepdim=True)).clamp(-_REACH, _REACH) + _REACH
-    position = position * bins_per_unit
-    bins = int(2 * _REACH * bins_per_unit) + 4
-    below = position.long()
-    t = position - below
-    index = labels * bins + below
-    histogram = b.new_zeros(len(candidates), (int(labels.max()) + 1) * bins)
-    u, double = 1 - t, t * t
-    last = double * t / 6
-    first, second = u * u * u / 6, 2 / 3 - double + 3 * last
-    for shift, fraction in enumerate((first, second, 1 - first - second - last, last)):
-        histogram.scatter_add_(1, index + shift, fraction)
-    probability = histogram / b.shape[1]
-    return -torch.special.xlogy(probability, probability).sum(dim=1)

@@ -77,9 +77,10 @@ def factorize_in_perspective(
         right = torch.where(known, right, 0)
         inside = torch.zeros_like(mask)
         inside[mask] = known
-        matrix = _between(right, known, mask, inside, intrinsics.double(), radius)
-        rays = _rays(mask, intrinsics.double())[mask].mT
-        towards = ((matrix @ right) * rays).sum()
+        pixels = homogeneous(pixel_centers(mask.shape[1], mask.shape[0], weight))
+        rays = pixels @ torch.linalg.inv(intrinsics.double()).mT
+        matrix = _between(right, known, mask, inside, intrinsics.double(), rays, radius)
+        towards = ((matrix @ right) * rays[mask].mT).sum()
         matrix = torch.where(towards > 0, -matrix, matrix)
         lights = left @ torch.linalg.inv(matrix)
         scale = lights.square().sum(dim=1).mean().sqrt()
@@ -111,6 +112,7 @@ def _between(
     mask: Bool[Tensor, "height width"],
     inside: Bool[Tensor, "height width"],
     intrinsics: Float[Tensor, "3 3"],
+    rays: Float[Tensor, "height width 3"],
     radius: int,
 ) -> Float[Tensor, "3 3"]:
     """Find the matrix under which the vectors are normals times albedo, up to a factor."""
@@ -141,7 +143,7 @@ def _between(
             f"seen in three views; needed: {50}. Lower `radius`, or enlarge the mask."
         )
     b, bu, bv = value[:, whole], along_u[:, whole], along_v[:, whole]
-    rays = _rays(mask, intrinsics)[whole].mT
+    rays = rays[whole].mT
     (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
     rows = integrability_equations(b, fx * bu, skew * bu + fy * bv, rays)
     # Noise of the factors is white; after whitening it has a covariance, and normalization
@@ -153,26 +155,19 @@ def _between(
     x, y, one = rays
     by_u = torch.stack([fx * one, skew * one, -x * fx - y * skew], dim=1)
     by_v = torch.stack([0 * one, fy * one, -y * fy], dim=1)
-    weight = torch.ones_like(b[0])
-    for _ in range(4):
-        cofactors, ratio = _least(rows, weight, noise_covariance, by_u, by_v)
-        rotated_u, rotated_v = by_u @ cofactors, by_v @ cofactors
-        variance = torch.einsum("pi,pij,pj->p", rotated_u, noise_covariance, rotated_u)
-        variance = variance + torch.einsum("pi,pij,pj->p", rotated_v, noise_covariance, rotated_v)
-        weight = 1 / variance.clamp_min(1e-3 * variance.median())
-        weight = weight / weight.mean()
-    if ratio < _DISTINCT:
+    cofactors, ratio = _cofactors(rows, noise_covariance, by_u, by_v)
+    inverse, singular = torch.linalg.inv_ex(cofactors)
+    if ratio < _DISTINCT or bool(singular):
         raise InputError(
             f"a second surface explains the images as well (its misfit is {ratio:.2f} times the "
             "least); needed: a surface unlike a ball or any quadric, or less noise. Raise "
             "`radius`, or factorize without perspective and resolve the bas-relief ambiguity."
         )
-    return torch.linalg.inv(cofactors).mT @ white
+    return inverse.mT @ white
 
 
-def _least(
+def _cofactors(
     rows: Float[Tensor, "pixel 9"],
-    weight: Float[Tensor, " pixel"],
     noise_covariance: Float[Tensor, "pixel 3 3"],
     by_u: Float[Tensor, "pixel 3"],
     by_v: Float[Tensor, "pixel 3"],
@@ -182,13 +177,20 @@ def _least(
     Returns:
         The cofactors, and the second smallest ratio over the smallest.
     """
-    both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
-    both = both * weight[:, None, None]
-    noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
-    noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
-    moment = (weight[:, None] * rows).mT @ rows
-    ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
-    least = torch.from_numpy(vectors[:, 0].reshape(3, 3)).to(rows)
+    weight = torch.ones_like(rows[:, 0])
+    for _ in range(4):
+        both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
+        both = both * weight[:, None, None]
+        noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
+        noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
+        moment = (weight[:, None] * rows).mT @ rows
+        ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
+        least = torch.from_numpy(vectors[:, 0].reshape(3, 3)).to(rows)
+        variance = torch.zeros_like(weight)
+        for rotated in (by_u @ least, by_v @ least):
+            variance += torch.einsum("pi,pij,pj->p", rotated, noise_covariance, rotated)
+        weight = 1 / variance.clamp_min(1e-3 * variance.median())
+        weight = weight / weight.mean()
     return least, float(ratios[1] / max(ratios[0], 1e-300))
 
 
@@ -204,10 +206,3 @@ def _derivatives(
     kernels = fit[[powers.index(term) for term in ((0, 0), (1, 0), (0, 1))]]
     found = conv2d(raster[:, None], kernels.reshape(3, 1, *u.shape), padding=radius)
     return found[:, 0], found[:, 1], found[:, 2]
-
-
-def _rays(
-    mask: Bool[Tensor, "height width"], intrinsics: Float[Tensor, "3 3"]
-) -> Float[Tensor, "height width 3"]:
-    pixels = homogeneous(pixel_centers(mask.shape[1], mask.shape[0], intrinsics))
-    return pixels @ torch.linalg.inv(intrinsics).mT

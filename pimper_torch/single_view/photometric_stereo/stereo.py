@@ -118,7 +118,11 @@ def photometric_stereo(
         radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
         applied, free = None, "nothing"
         if lights is not None:
-            _refuse_plane(lights[used])
+            if int(torch.linalg.matrix_rank(lights[used], rtol=1e-6)) < 3:
+                raise InputError(
+                    "calibrated: the lights lie in one plane through the object; needed: lights "
+                    "that span space, or normals are free across the plane. Add one from outside."
+                )
             found = calibrated_stereo(radiance, heavy, lights[used].double(), robust=robust)
         elif intrinsics is not None:
             whole = torch.zeros_like(images[used], dtype=torch.float64)
@@ -232,6 +236,11 @@ def _refuse(
             "one for each if they are known (calibrated), else none",
         ),
         (
+            lights is not None and not lights.isfinite().all(),
+            "some lights are not finite",
+            "directions times irradiances",
+        ),
+        (
             (intrinsics is not None) != (method == "perspective"),
             f"intrinsics are {'not ' if intrinsics is None else ''}given",
             "those of the camera for perspective, none for orthographic methods",
@@ -249,11 +258,3 @@ def _refuse(
     ):
         if wrong:
             raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
-
-
-def _refuse_plane(lights: Float[Tensor, "view 3"]) -> None:
-    if not lights.isfinite().all() or int(torch.linalg.matrix_rank(lights, rtol=1e-6)) < 3:
-        raise InputError(
-            "calibrated: the lights lie in one plane through the object; needed: lights that span "
-            "space, or normals are free across the plane. Add one from outside it."
-        )
