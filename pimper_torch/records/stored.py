@@ -1,21 +1,18 @@
 """Records as files: tensors as safetensors, everything else as JSON in the file's header.
 
-The metadata in the header have one entry, ``pimper_torch``, with the text of the JSON object
-``{"format": 1, "record": ...}``. A record is ``{"record": class, "fields": {name: value}}``, a
-tensor ``{"tensor": name}``, a tuple a list; numbers, texts and ``null`` stand for themselves.
-Classes are found by the annotations of the fields: a file can name no other, and holds no code.
+The JSON is an entry of the metadata in the header, whose name has the version of the format. There
+a record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, a tuple a
+list, a mapping ``{"map": {key: value}}``; numbers, texts and ``null`` stand for themselves. Classes
+are found by the annotations of the fields: a file can name no other, and holds no code.
 """
 
 import dataclasses
 import json
-import math
 import secrets
 import types
 import typing
-from bisect import bisect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,20 +27,14 @@ from pimper_torch.runtime.errors import InputError, OutputError
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
-_FORMAT = 1
-_KEY = "pimper_torch"
+_KEY = "pimper_torch record 2"
 # A choice: the structure of a run's last step is below 1 MB, and a stranger's file can't make
 # the parser fill the memory.
 _MAX_STRUCTURE = 2**25
-_DTYPES = frozenset(
-    {torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
-    | {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64}
-)
-_UNLIKE = object()
 _AGAIN = "Save the record again with `save_record`."
 
 
-def save_record(record: Record, path: str | Path) -> None:
+def save_record(record: Record, path: str | Path, about: Mapping[str, str] | None = None) -> None:
     """Write a record, with all records inside it, to one file for :func:`load_record`.
 
     The file is safetensors, which other programs read too; a tensor is called by the fields that
@@ -53,24 +44,20 @@ def save_record(record: Record, path: str | Path) -> None:
 
     Args:
         path: A former file is replaced when the new one is complete. Folders are made.
+        about: More entries of the header's metadata.
 
     Raises:
-        InputError: A field holds something else than records, tensors, tuples, lists, mappings,
-            enums, paths, numbers, texts and ``None``.
+        InputError: A field holds something else than records, dense tensors, tuples, mappings by
+            texts, numbers, texts and ``None``.
+        OutputError: The disk refuses; then a former file is as it was.
     """
     path = Path(path)
-    writer = _Writer()
-    structure = {"format": _FORMAT, "record": writer.plain(record, "")}
-    text = json.dumps(structure, allow_nan=False)
-    if len(text) > _MAX_STRUCTURE:
-        raise InputError(
-            f"{type(record).__name__}: what is not tensors takes {len(text)} bytes; needed: "
-            f"{_MAX_STRUCTURE} at most. Save its parts one by one, or hold numbers as tensors."
-        )
+    tensors: dict[int, tuple[str, Tensor]] = {}
+    text = json.dumps(to_plain(record, tensors))
     trial = path.with_name(f".{path.name}.new-{secrets.token_hex(4)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(writer.tensors, trial, metadata={_KEY: text})
+        save_file(_apart(tensors.values()), trial, metadata={_KEY: text, **(about or {})})
         trial.replace(path)
     except (OSError, SafetensorError) as error:
         raise OutputError(
@@ -88,8 +75,7 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
     The file is mapped into memory: pages are read when they are used, and writing into a tensor
     does not change the file. Fields that shared a tensor share one again. All structure, names and
     shapes are checked before a tensor's memory is touched; values are checked by the stages that
-    take the record (:meth:`~pimper_torch.records.record.Record.check`). Paths in a record are
-    returned, never opened.
+    take the record (:meth:`~pimper_torch.records.record.Record.check`).
 
     Returns:
         The record, on the CPU.
@@ -98,232 +84,136 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
         InputError: There is no such file, it is damaged, of another format, or holds another record
             than ``cls``, as its fields are annotated.
     """
-    path = Path(path)
-    if not path.is_file():
+    return load_with_metadata(cls, path)[0]
+
+
+def load_with_metadata(
+    cls: type[AnyRecord], path: str | Path
+) -> tuple[AnyRecord, Mapping[str, str]]:
+    """Read a record as :func:`load_record`, and the metadata in the file's header."""
+    if not Path(path).is_file():
         raise InputError(f"{path}: is no file; needed: a file that `save_record` wrote.")
     try:
         with safe_open(path, framework="pt") as file:
-            structure, names = _structure(path, file.metadata()), file.keys()
-            reader = _Reader(path, {name: file.get_tensor(name) for name in names})
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or 'the system refuses'}). {_AGAIN}"
-        ) from error
-    except SafetensorError as error:
-        raise InputError(
-            f"{path}: cannot be read as safetensors, it seems cut short or damaged; needed: a "
-            f"whole file. {_AGAIN}"
-        ) from error
-    record: AnyRecord = reader.value(structure, cls, cls.__name__)
-    if reader.unused:
-        raise InputError(
-            f"{path}: has tensors that no field names, such as {min(reader.unused)!r}; needed: "
-            f"those of {cls.__name__} alone. {_AGAIN}"
-        )
-    return record
-
-
-class _Writer:
-    """Turns values into JSON, and collects tensors by the fields that lead to them."""
-
-    def __init__(self) -> None:
-        self.tensors: dict[str, Tensor] = {}
-        self._names: dict[object, str] = {}
-        self._taken: list[tuple[int, float]] = []  # memory: where each tensor begins and ends
-
-    def plain(self, value: object, where: str) -> object:
-        if isinstance(value, Record):
-            fields = {
-                field.name: self.plain(getattr(value, field.name), _inside(where, field.name))
-                for field in dataclasses.fields(value)
-            }
-            return {"record": type(value).__name__, "fields": fields}
-        if isinstance(value, Tensor):
-            return {"tensor": self._name(value, where)}
-        if isinstance(value, tuple):
-            return self._listed(value, where)
-        if isinstance(value, list):
-            return {"list": self._listed(value, where)}
-        if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-            return {"map": {key: self.plain(value[key], _inside(where, key)) for key in value}}
-        if isinstance(value, Enum):
-            return {"enum": value.name}
-        if isinstance(value, Path):
-            return {"path": str(value)}
-        if isinstance(value, float) and not math.isfinite(value):
-            return {"float": str(float(value))}
-        if value is None or isinstance(value, bool | int | float | str):
-            return value
-        raise InputError(
-            f"{where} is a {type(value).__name__}, which a file cannot hold; needed: records, "
-            "tensors, tuples, lists, mappings, enums, paths, numbers, texts or None."
-        )
-
-    def _listed(self, values: tuple[object, ...] | list[object], where: str) -> list[object]:
-        return [self.plain(item, _inside(where, index)) for index, item in enumerate(values)]
-
-    def _name(self, tensor: Tensor, where: str) -> str:
-        if tensor.dtype not in _DTYPES or tensor.layout != torch.strided or tensor.is_meta:
+            metadata: dict[str, str] = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        text = metadata.get(_KEY, "")
+        if not 0 < len(text) <= _MAX_STRUCTURE:
+            found = ", ".join(sorted(metadata))[:60] or "tensors alone"
             raise InputError(
-                f"{where} is a tensor of {tensor.dtype}, {tensor.layout}, on {tensor.device}; "
-                "needed: a dense one with values, of a type that safetensors has."
+                f"holds {found}; needed: {_KEY!r}, as this version of pimper_torch writes it, of "
+                f"{_MAX_STRUCTURE} bytes at most."
             )
-        memory = (tensor.device, tensor.data_ptr(), tensor.dtype, tensor.shape, tensor.stride())
-        lazy = (tensor.is_conj(), tensor.is_neg())
-        name = self._names.setdefault((*memory, *lazy), where)
-        if name == where:
-            self.tensors[name] = self._separate(tensor.detach().cpu().resolve_conj().resolve_neg())
-        return name
-
-    def _separate(self, tensor: Tensor) -> Tensor:
-        """Return contiguous memory that no tensor before has a part of, as safetensors needs.
-
-        What was taken before is disjoint and sorted, so that only its two neighbours can overlap.
-        """
-        tensor = tensor.contiguous()
-        first, end = tensor.data_ptr(), tensor.data_ptr() + tensor.nbytes
-        place = bisect(self._taken, (first, math.inf))
-        around = self._taken[max(0, place - 1) : place + 1]
-        if any(first < other_end and other < end for other, other_end in around):
-            return tensor.clone()
-        if tensor.nbytes:
-            self._taken.insert(place, (first, end))
-        return tensor
-
-
-class _Reader:
-    """Turns JSON into what the annotations ask for, or says where it is something else."""
-
-    def __init__(self, path: Path, tensors: Mapping[str, Tensor]) -> None:
-        self.path = path
-        self.tensors = tensors
-        self.unused = set(tensors)
-
-    def value(self, found: Any, hint: Any, where: str) -> Any:  # noqa: ANN401 - JSON
-        if typing.get_origin(hint) in (typing.Union, types.UnionType):
-            choices = typing.get_args(hint)
-        else:
-            choices = (hint,)
-        for choice in choices:
-            made = self._made(found, choice, where)
-            if made is not _UNLIKE:
-                return made
-        raise self._refused(where, f"is {_shortly(found)}", " or ".join(map(_named, choices)))
-
-    def _made(self, found: Any, hint: Any, where: str) -> Any:  # noqa: ANN401
-        """Return the value, or ``_UNLIKE`` where it is of another kind than the annotation."""
-        origin, hints = typing.get_origin(hint) or hint, typing.get_args(hint)
-        if origin is typing.Literal:
-            same = any(type(found) is type(one) and found == one for one in hints)
-            return found if same else _UNLIKE
-        if isinstance(found, list):
-            return self._tuple(found, hints, where) if origin in (object, tuple) else _UNLIKE
-        if not isinstance(found, dict):
-            kinds = (float, int) if origin is float else (origin,)
-            return found if origin is object or type(found) in kinds else _UNLIKE
-        match sorted(found.items()):
-            case [("fields", dict(fields)), ("record", name)] if _is_a(hint, Record):
-                return self._record(fields, hint, where) if name == hint.__name__ else _UNLIKE
-            case [("tensor", str(name))] if _is_a(hint, AbstractArray | Tensor):
-                return self._tensor(name, where)
-            case [("map", dict(content))] if origin is object or _is_a(origin, Mapping):
-                inner = (*hints, object, object)[1]
-                items = content.items()
-                return {key: self.value(item, inner, _inside(where, key)) for key, item in items}
-            case [("list", list(content))] if origin in (object, list):
-                inner = (*hints, object)[0]
-                pairs = enumerate(content)
-                return [self.value(item, inner, _inside(where, at)) for at, item in pairs]
-            case [("enum", str(name))] if _is_a(hint, Enum):
-                if name not in hint.__members__:
-                    known = f"one of {', '.join(hint.__members__)}"
-                    raise self._refused(where, f"is {name!r}", known)
-                return hint[name]
-            case [("path", str(text))] if _is_a(hint, Path):
-                if "\0" in text:
-                    raise self._refused(where, f"is {text!r}", "a path")
-                return Path(text)
-            case [("float", "nan" | "inf" | "-inf" as text)] if origin in (object, float):
-                return float(text)
-        return _UNLIKE
-
-    def _record(self, fields: Mapping[str, Any], cls: Any, where: str) -> Record:  # noqa: ANN401
-        hints, known = typing.get_type_hints(cls), {field.name for field in dataclasses.fields(cls)}
-        if fields.keys() != known:
-            lacking, foreign = sorted(known - fields.keys()), sorted(fields.keys() - known)
-            parts = [f"lacks {', '.join(lacking)}"] if lacking else []
-            parts += [f"has the unknown {', '.join(map(_shortly, foreign))}"] if foreign else []
-            raise self._refused(where, " and ".join(parts), f"the fields of {cls.__name__}")
-        made = {
-            name: self.value(fields[name], hints[name], _inside(where, name)) for name in fields
-        }
-        try:
-            record: Record = cls(**made)
-        except InputError as error:
-            raise InputError(f"{self.path}: {where}: {error} {_AGAIN}") from error
-        return record
-
-    def _tensor(self, name: str, where: str) -> Tensor:
-        if name not in self.tensors:
-            raise self._refused(where, f"names {_shortly(name)}", "a tensor of the file")
-        self.unused.discard(name)
-        return self.tensors[name]
-
-    def _tuple(self, found: list[Any], hints: tuple[Any, ...], where: str) -> tuple[Any, ...]:
-        if not hints or hints[-1] is Ellipsis:
-            hints = (*hints, object)[:1] * len(found)
-        if len(hints) != len(found):
-            raise self._refused(where, f"has {len(found)} entries", str(len(hints)))
-        pairs = enumerate(zip(found, hints, strict=True))
-        return tuple(self.value(item, hint, _inside(where, at)) for at, (item, hint) in pairs)
-
-    def _refused(self, where: str, found: str, needed: str) -> InputError:
-        return InputError(f"{self.path}: {where} {found}; needed: {needed}. {_AGAIN}")
-
-
-def _structure(path: Path, metadata: Mapping[str, str] | None) -> object:
-    """Parse the record's structure, and check the format."""
-    text = (metadata or {}).get(_KEY)
-    if text is None:
-        raise InputError(f"{path}: holds tensors but no record; needed: what `save_record` writes.")
-    if len(text) > _MAX_STRUCTURE:
-        needed = f"needed: {_MAX_STRUCTURE} bytes at most"
-        raise InputError(f"{path}: its structure takes {len(text)} bytes; {needed}. {_AGAIN}")
-    try:
-        structure = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        record: AnyRecord = from_plain(json.loads(text), cls, cls.__name__, tensors)
+    except InputError as error:
+        raise InputError(f"{path}: {error} {_AGAIN}") from error
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: its structure is no JSON ({error}); needed: what `save_record` writes. "
-            f"{_AGAIN}"
+            f"{path}: cannot be read ({error}), it seems cut short or damaged; needed: a whole "
+            f"file. {_AGAIN}"
         ) from error
-    version = structure.get("format") if isinstance(structure, dict) else None
-    if version != _FORMAT or structure.keys() != {"format", "record"}:
-        raise InputError(
-            f"{path}: is of format {_shortly(version)}; needed: format {_FORMAT}. Save the record "
-            "again with this version of pimper_torch, or load it with the version that wrote it."
-        )
-    return structure["record"]
+    return record, metadata
+
+
+def to_plain(value: object, tensors: dict[int, tuple[str, Tensor]], where: str = "") -> object:
+    """Turn a value into what JSON holds.
+
+    Args:
+        tensors: Collects the tensors by their identity, each with the fields that lead to it.
+        where: Fields that lead to the value.
+    """
+
+    def inner(part: object, name: object) -> object:
+        return to_plain(part, tensors, f"{where}.{name}" if where else str(name))
+
+    if isinstance(value, Record):
+        names = [field.name for field in dataclasses.fields(value)]
+        fields = {name: inner(getattr(value, name), name) for name in names}
+        return {"record": type(value).__name__, "fields": fields}
+    if isinstance(value, Tensor) and _is_writable(value):
+        return {"tensor": tensors.setdefault(id(value), (where, value))[0]}
+    if isinstance(value, tuple):
+        return [inner(item, index) for index, item in enumerate(value)]
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {"map": {key: inner(item, key) for key, item in value.items()}}
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    kind = f"{value.dtype} {value.layout} " if isinstance(value, Tensor) else ""
+    raise InputError(
+        f"{where} is a {kind}{type(value).__name__}, which a file cannot hold; needed: records, "
+        "dense tensors with values, tuples, mappings by texts, numbers, texts or None."
+    )
+
+
+def from_plain(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
+    """Turn what :func:`to_plain` gave into what an annotation asks for, or refuse it."""
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    choices = typing.get_args(hint) if union else (hint,)
+    kind = next((choice for choice in choices if _fits(found, choice, tensors)), None)
+    if kind is None:
+        needed = getattr(hint, "__name__", hint)
+        raise InputError(f"{where} is {json.dumps(found)[:60]}; needed: {needed}.")
+
+    def inner(part: object, hint: object, name: object) -> Any:  # noqa: ANN401
+        return from_plain(part, hint, f"{where}.{name}", tensors)
+
+    hints = typing.get_args(kind)
+    match found:
+        case {"record": _, "fields": fields}:
+            own, of = (
+                [field.name for field in dataclasses.fields(kind)],
+                typing.get_type_hints(kind),
+            )
+            if fields.keys() != set(own):
+                has = ", ".join(fields)[:200]
+                raise InputError(f"{where} has the fields {has}; needed: {', '.join(own)}.")
+            return kind(**{name: inner(fields[name], of[name], name) for name in own})
+        case {"tensor": name}:
+            return tensors[name]
+        case {"map": content}:
+            return {key: inner(item, hints[1], key) for key, item in content.items()}
+        case list():
+            each = hints[:1] * len(found) if hints[-1:] == (...,) else hints
+            return tuple(map(inner, found, each, range(len(found))))
+    return found
+
+
+def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa: ANN401
+    """Return whether JSON is of the kind of an annotation, whatever is inside."""
+    origin, hints = typing.get_origin(hint) or hint, typing.get_args(hint)
+    if origin is typing.Literal:
+        return any(type(found) is type(one) and found == one for one in hints)
+    match found:
+        case {"record": name, "fields": dict()}:
+            return _is_a(hint, Record) and name == hint.__name__
+        case {"tensor": str(name)}:
+            return _is_a(hint, AbstractArray | Tensor) and name in tensors
+        case {"map": dict()}:
+            return _is_a(origin, Mapping)
+        case list():
+            return origin is tuple and (hints[-1:] == (...,) or len(hints) == len(found))
+    return type(found) is origin or (type(found) is int and origin is float)
 
 
 def _is_a(hint: object, cls: type | types.UnionType) -> bool:
     return isinstance(hint, type) and issubclass(hint, cls)
 
 
-def _inside(where: str, name: object) -> str:
-    return f"{where}.{name}" if where else str(name)
+def _is_writable(tensor: Tensor) -> bool:
+    known = tensor.dtype != torch.complex128  # the one that safetensors lacks
+    return known and tensor.layout == torch.strided and not tensor.is_meta
 
 
-def _shortly(found: object) -> str:
-    """Show what a file says in a line, a record by its class."""
-    if isinstance(found, dict) and isinstance(found.get("record"), str):
-        return f"the record {found['record'][:60]}"
-    text = json.dumps(found)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _named(hint: Any) -> str:  # noqa: ANN401
-    """Name an annotation."""
-    if _is_a(hint, AbstractArray | Tensor):
-        return "a tensor"
-    plain = typing.get_origin(hint) is None and isinstance(hint, type)
-    return "None" if hint is types.NoneType else hint.__name__ if plain else str(hint)
+def _apart(tensors: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
+    """Return contiguous tensors on the CPU that share no memory, as safetensors needs them."""
+    found = {
+        name: tensor.detach().cpu().resolve_conj().resolve_neg().contiguous()
+        for name, tensor in tensors
+    }
+    end = 0
+    for name, tensor in sorted(found.items(), key=lambda item: item[1].data_ptr()):
+        if tensor.data_ptr() < end:
+            found[name] = tensor.clone()
+        else:
+            end = tensor.data_ptr() + tensor.nbytes
+    return found

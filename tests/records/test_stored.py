@@ -3,15 +3,13 @@
 import dataclasses
 import json
 import math
-import time
 import typing
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, safe_open, save_file
 from torch import Tensor
 
 import pimper_torch as pt
@@ -26,22 +24,15 @@ AXES = {"patch": 2, "view": 3, "height": 4, "width": 5, "channel": 1, "vertex": 
 BITS = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
-class Kind(IntEnum):
-    FIRST = 0
-    SECOND = 1
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Odds(Record):
     """What no record of the package has all of."""
 
     many: tuple[Tensor | None, ...]
     pair: tuple[int, float]
-    kind: Kind
-    place: Path | None
+    name: str | None
     numbers: tuple[float, ...]
     figures: dict[str, int | float]
-    anything: object
     flag: bool | None = None
 
 
@@ -113,12 +104,9 @@ def odds():
     return Odds(
         many=(whole, None, whole, whole.T, whole[1:], torch.zeros(0, 3), torch.tensor(7)),
         pair=(1, 2.0),
-        kind=Kind.SECOND,
-        place=Path("../éa b/c.png"),
+        name="../éa b/c.png",
         numbers=(-0.0, math.nan, -math.inf, 1e-320, 3.0),
         figures={"samples": 3, "fraction": math.nan},
-        anything={"list": [1, (2.5, "x")], "map": {}, "flag": False},
-        flag=None,
     )
 
 
@@ -136,7 +124,8 @@ def test_every_record_comes_back_bit_for_bit(cls, full, generator, tmp_path):
 
 
 def test_whatever_a_field_may_hold_comes_back_bit_for_bit(odds, path):
-    kinds = sorted(stored._DTYPES, key=str)
+    kinds = [torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64]
+    kinds += [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64]
     values = torch.tensor([0.0, 1.0, 2.0])
     odds = odds.replace(many=(*odds.many, *(values.to(kind) for kind in kinds)))
     odds = odds.replace(many=(*odds.many, torch.tensor([math.nan, -0.0, math.inf]).bfloat16()))
@@ -162,23 +151,6 @@ def test_tensors_that_overlap_in_memory_come_back_bit_for_bit(odds, path, genera
         assert_same(found, wanted)
 
 
-def test_saving_takes_time_linear_in_the_number_of_tensors(odds, path):
-    tensors = {f"many.{index}": torch.full((8,), float(index)) for index in range(5000)}
-    record = odds.replace(many=tuple(tensors.values()))
-
-    def least(save):
-        taken = []
-        for _ in range(3):
-            began = time.process_time()
-            save()
-            taken.append(time.process_time() - began)
-        return min(taken)
-
-    reference = least(lambda: save_file(tensors, path))  # which is linear
-    # 1.5 to 2; comparing each tensor with all before it takes 15.
-    assert least(lambda: save_record(record, path)) < 5 * reference
-
-
 def test_a_file_is_mapped_and_writing_into_a_tensor_leaves_it_alone(odds, path):
     save_record(odds, path)
     before = path.read_bytes()
@@ -200,16 +172,18 @@ def test_a_record_on_a_graph_is_saved_without_it(odds, path):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (lambda: 1, "anything.0 is a function, which a file cannot hold; needed: records, "),
-        (torch.zeros(2, dtype=torch.complex128), "anything.0 is a tensor of torch.complex128"),
-        (torch.eye(2).to_sparse(), "anything.0 is a tensor of torch.float32, torch.sparse_coo"),
-        (torch.zeros(2, device="meta"), "on meta; needed: a dense one with values"),
-        ({1: 2}, "anything.0 is a dict"),
+        (lambda: 1, "figures.it is a function, which a file cannot hold; needed: records, "),
+        (Path("a"), "figures.it is a PosixPath"),
+        ([1], "figures.it is a list"),
+        ({1: 2}, "figures.it is a dict"),
+        (torch.zeros(2, dtype=torch.complex128), "figures.it is a torch.complex128"),
+        (torch.eye(2).to_sparse(), "figures.it is a torch.float32 torch.sparse_coo Tensor"),
+        (torch.zeros(2, device="meta"), "needed: .* dense tensors with values"),
     ],
 )
 def test_what_a_file_cannot_hold_is_refused_by_its_field(odds, path, value, message):
     with pytest.raises(InputError, match=message):
-        save_record(odds.replace(anything=(value,)), path)
+        save_record(odds.replace(figures={"it": value}), path)
     assert not path.exists()
 
 
@@ -224,7 +198,7 @@ def test_a_save_that_fails_leaves_the_former_file_and_nothing_else(odds, path, m
     with monkeypatch.context() as patched:
         patched.setattr(stored, "save_file", full_disk)
         with pytest.raises(OutputError, match="No space left on device"):
-            save_record(odds.replace(kind=Kind.FIRST), path)
+            save_record(odds.replace(name=None), path)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
     mapped = load_record(Odds, path)
@@ -237,114 +211,79 @@ def test_a_save_that_fails_leaves_the_former_file_and_nothing_else(odds, path, m
 
 def test_files_that_are_no_whole_record_are_refused(odds, path, tmp_path):
     with pytest.raises(InputError, match="is no file; needed: a file that `save_record` wrote"):
-        load_record(Odds, path)
-    with pytest.raises(InputError, match="is no file"):
         load_record(Odds, tmp_path)
     save_record(odds, path)
     whole = path.read_bytes()
     claimed = (2**60).to_bytes(8, "little") + whole[8:]  # a header longer than any memory
-    for damaged in (b"", whole[:4], whole[:200], whole[:-1], whole + b"x", claimed):
+    shape = whole.replace(b'"shape":[3,4]', b'"shape":[9,4]')
+    for damaged in (b"", whole[:4], whole[:200], whole[:-1], whole + b"x", claimed, shape):
+        assert damaged != whole
         path.write_bytes(damaged)
         with pytest.raises(InputError, match="seems cut short or damaged"):
             load_record(Odds, path)
-    shape = whole.replace(b'"shape":[3,4]', b'"shape":[9,4]')
-    assert shape != whole
-    path.write_bytes(shape)
-    with pytest.raises(InputError, match="seems cut short or damaged"):
-        load_record(Odds, path)
     save_file({"a": torch.zeros(2)}, path)
-    with pytest.raises(InputError, match="holds tensors but no record"):
+    with pytest.raises(InputError, match=r"holds tensors alone; needed: 'pimper_torch record 2'"):
+        load_record(Odds, path)
+    save_file({"a": torch.zeros(2)}, path, {"pimper_torch": '{"format": 1}'})  # as 0.10 wrote it
+    with pytest.raises(InputError, match=r"holds pimper_torch; needed: 'pimper_torch record 2', "):
         load_record(Odds, path)
 
 
 def test_another_record_than_the_one_asked_for_is_refused(odds, path):
     save_record(odds, path)
-    with pytest.raises(InputError, match=r"Mesh is the record Odds; needed: Mesh\."):
+    with pytest.raises(InputError, match=r'Mesh is {"record": "Odds", .*; needed: Mesh\.'):
         load_record(pt.Mesh, path)
 
 
-def fields_of(structure):
-    return structure["record"]["fields"]
-
-
-FORGERIES = {
-    "is of format 2; needed: format 1": lambda one: one.update(format=2),
-    "is of format null": lambda one: one.pop("format"),
-    "Odds has the unknown .spare.; needed": lambda one: fields_of(one).update(spare=1),
-    "Odds lacks kind and has the unknown": lambda one: fields_of(one).update(
-        kin=fields_of(one).pop("kind")
-    ),
-    "Odds.kind is 'THIRD'; needed: one of FIRST, SECOND": lambda one: fields_of(one).update(
-        kind={"enum": "THIRD"}
-    ),
-    "Odds.kind is 1; needed: Kind": lambda one: fields_of(one).update(kind=1),
-    "Odds.pair has 3 entries; needed: 2": lambda one: fields_of(one)["pair"].append(1),
-    "Odds.pair.0 is true; needed: int": lambda one: fields_of(one).update(pair=[True, 1.0]),
-    "Odds.pair.1 is {.float.: .nine.}": lambda one: fields_of(one).update(
-        pair=[1, {"float": "nine"}]
-    ),
-    "Odds.many.1 names ./etc/passwd.; needed: a tensor of": lambda one: fields_of(one)[
-        "many"
-    ].__setitem__(1, {"tensor": "/etc/passwd"}),
-    "Odds.many.0 is the record Mesh; needed: a tensor or None": lambda one: fields_of(one)[
-        "many"
-    ].__setitem__(0, {"record": "Mesh", "fields": {}}),
-    "Odds.anything is the record Odds; needed: object": lambda one: fields_of(one).update(
-        anything=one["record"] | {"fields": {}}
-    ),
-    "Odds.place is .a.x00b.; needed: a path": lambda one: fields_of(one).update(
-        place={"path": "a\0b"}
-    ),
-    "tensors that no field names, such as 'many.6'": lambda one: fields_of(one)["many"].pop(),
-}
-
-
-@pytest.mark.parametrize("message", FORGERIES)
-def test_a_strangers_structure_is_refused_where_it_is_wrong(odds, path, message):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"spare": 1}, "Odds has the fields many, .*, spare; needed: many, .*flag"),
+        ({"pair": [1, 1.0, 1]}, "Odds.pair is .1, 1.0, 1.; needed: tuple"),
+        ({"pair": [True, 1.0]}, "Odds.pair.0 is true; needed: int"),
+        ({"pair": [1, "nine"]}, 'Odds.pair.1 is "nine"; needed: float'),
+        ({"many": [{"tensor": "/etc/passwd"}]}, "Odds.many.0 is .*passwd.*; needed: .*Tensor"),
+        ({"many": [{"tensor": []}]}, "Odds.many.0 is"),
+        ({"many": [{"record": "Mesh", "fields": {}}]}, "Odds.many.0 is .*Mesh.*; needed: .*Tensor"),
+        ({"name": {"record": []}}, "Odds.name is .*; needed: str . None"),
+        ({"figures": {"map": {"a": None}}}, "Odds.figures.a is null; needed: int . float"),
+    ],
+)
+def test_a_strangers_structure_is_refused_where_it_is_wrong(odds, path, changes, message):
     save_record(odds, path)
-    forge(path, lambda text: changed_by(FORGERIES[message], text))
+    forge(path, lambda structure: json.dumps(structure | {"fields": structure["fields"] | changes}))
     with pytest.raises(InputError, match=message):
         load_record(Odds, path)
 
 
-def changed_by(change, text):
-    structure = json.loads(text)
-    change(structure)
-    return json.dumps(structure)
-
-
-def forge(path, change):
-    """Change the text of a file's structure."""
-    with stored.safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    tensors = {name: one.clone() for name, one in load_file(path).items()}
-    save_file(tensors, path, {"pimper_torch": change(metadata["pimper_torch"])})
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("text", "message"),
     [
-        (lambda text: text[:-1], "its structure is no JSON"),
-        (lambda text: "[" * 10**5 + "]" * 10**5, "its structure is no JSON"),
-        (lambda text: text.replace("[1, 2.0]", f"[{'9' * 5000}, 2.0]"), "is no JSON"),
-        (lambda text: text + " " * 2**25, "needed: 33554432 bytes at most"),
+        ("{", "seems cut short or damaged"),
+        ("[" * 10**5 + "]" * 10**5, "seems cut short or damaged"),
+        ("9" * 5000, "seems cut short or damaged"),
+        ("1" + " " * 2**25, "33554432 bytes at most"),
     ],
 )
-def test_a_structure_that_is_no_plain_json_is_refused(odds, path, change, message):
+def test_a_structure_that_is_no_plain_json_is_refused(odds, path, text, message):
     save_record(odds, path)
-    forge(path, change)
+    forge(path, lambda structure: text)
     with pytest.raises(InputError, match=message):
         load_record(Odds, path)
 
 
 @pytest.mark.usefixtures("shapes_unchecked")
 def test_a_tensor_of_the_wrong_shape_is_refused_by_file_and_field(path, generator):
-    cameras = example(pt.Cameras, generator)
-    save_record(cameras, path)
-    with stored.safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    tensors = {name: one.clone() for name, one in load_file(path).items()}
-    save_file(tensors | {"cam_from_world": torch.zeros(3, 3, 4)}, path, metadata)
-    message = r"odds.safetensors: Cameras: Cameras.cam_from_world is float32\[3, 3, 4\]; needed: "
+    save_record(example(pt.Cameras, generator), path)
+    forge(path, json.dumps, cam_from_world=torch.zeros(3, 3, 4))
+    message = r"odds.safetensors: Cameras.cam_from_world is float32\[3, 3, 4\]; needed: "
     with pytest.raises(InputError, match=message):
         load_record(pt.Cameras, path)
+
+
+def forge(path, change, **others):
+    """Write a file anew with another structure, or other tensors."""
+    with safe_open(path, framework="pt") as file:
+        structure = json.loads(file.metadata()[stored._KEY])
+    tensors = {name: one.clone() for name, one in load_file(path).items()}
+    save_file(tensors | others, path, {stored._KEY: change(structure)})

@@ -3,12 +3,12 @@
 import dataclasses
 import hashlib
 import json
-import re
 import types
 from collections.abc import Mapping
+from contextlib import suppress
 from enum import Enum
 from functools import cache
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
@@ -20,10 +20,18 @@ from pimper_torch.runtime.mapped import LARGE, drop_pages
 _PACKAGE = Path(__file__).parents[2]
 
 
+# Packages that stages compute with.
+_COMPUTE = ("torch", "numpy", "scipy", "numba", "pycolmap", "kornia", "opencv-python-headless")
+_COMPUTE += ("scikit-image", "trimesh", "embreex", "fcpw", "cholespy")
+
+
 @cache
 def code() -> str:
-    """Hash all source files of the package, and the versions of what it depends on."""
-    hashed = hashlib.blake2b(_versions().encode(), digest_size=16)
+    """Hash all source files of the package, and the versions of what it computes with."""
+    hashed = hashlib.blake2b(digest_size=16)
+    for name in _COMPUTE:
+        with suppress(PackageNotFoundError):  # as where another program installed it
+            hashed.update(f"{name} {version(name)} ".encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         hashed.update(path.relative_to(_PACKAGE).as_posix().encode() + path.read_bytes())
     return hashed.hexdigest()
@@ -32,15 +40,6 @@ def code() -> str:
 def is_known(module: str) -> bool:
     """Return whether :func:`code` covers a module: one of this package, or of torch's layers."""
     return module.startswith((f"{_PACKAGE.name}.", "torch.nn."))
-
-
-def _versions() -> str:
-    try:
-        needed = requires(_PACKAGE.name) or []
-    except PackageNotFoundError:  # sources that were not installed
-        needed = ["torch", "numpy", "numba", "pycolmap"]
-    names = {re.split(r"[^\w.-]", one)[0] for one in needed if "extra ==" not in one}
-    return " ".join(f"{name} {version(name)}" for name in sorted(names))
 
 
 # Of tensors that were hashed, while they live: their version when they were, and the hash. Stages

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from pimper_torch.records import Failure, LeftOut, Record, StageReport
-from pimper_torch.records.stored import load_record, save_record
-from pimper_torch.runtime.errors import OutputError, PimperError, caution
+from pimper_torch.records.stored import from_plain, load_with_metadata, save_record, to_plain
+from pimper_torch.runtime.errors import InputError, OutputError, caution
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.journal import KEEP, aside, current, noted
 from pimper_torch.runtime.mapped import copied
@@ -24,16 +24,16 @@ from pimper_torch.runtime.store.digest import digest
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
-_RECORD, _ABOUT = ".safetensors", ".json"
+_Events = tuple[str | Failure | LeftOut | StageReport, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Store:
-    """A folder with two files a record, named by a key: the record, and a hash of its bits.
+    """A folder with a file a record, named by a key, in which is a hash of the record's bits.
 
-    A record is believed when its hash is right: what was damaged or cut short is as if it were not
-    there, so that runs can share the folder. Where it grows too large, the records are deleted that
-    were used longest ago.
+    A record is believed when its hash is right: what was damaged is as if it were not there, so
+    that runs can share the folder. Where it grows too large, the records are deleted that were used
+    longest ago.
 
     Attributes:
         folder: Made when the first record is kept.
@@ -47,20 +47,19 @@ class Store:
 
     def find(self, key: str, cls: type[AnyRecord]) -> tuple[AnyRecord, dict[str, Any]] | None:
         """Read a record; ``None`` where there is none, or a damaged one."""
-        if self.fresh:
+        path = self._path(key)
+        if self.fresh or not path.exists():
             return None
         try:
-            about = json.loads(self._path(key, _ABOUT).read_bytes())
-            record = load_record(cls, self._path(key, _RECORD))
-            if about["digest"] != digest(record):
+            record, metadata = load_with_metadata(cls, path)
+            about = metadata.get("about", "")
+            if metadata.get("digest") != digest(record, about):
                 return None
-            found = settled(record), dict(about["about"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, PimperError):
+        except InputError:
             return None
-        for kind in (_RECORD, _ABOUT):
-            with suppress(OSError):  # a folder that may only be read
-                os.utime(self._path(key, kind))
-        return found
+        with suppress(OSError):  # a folder that may only be read
+            os.utime(path)
+        return settled(record), json.loads(about)
 
     def keep(self, key: str, record: Record, about: Mapping[str, object] | None = None) -> bool:
         """Write a record in place of one of the same key.
@@ -72,27 +71,26 @@ class Store:
         Returns:
             Whether it is kept: it is not where it alone is larger than the folder may be.
         """
-        hashed = digest(record)
+        text = json.dumps(about or {})
+        hashed = digest(record, text)
         if hashed is None:
             return False
-        text = json.dumps({"digest": hashed, "about": dict(about or {})})
         try:
-            self._path(key, _ABOUT).unlink(missing_ok=True)
-            save_record(record, self._path(key, _RECORD))
-            self._path(key, _ABOUT).write_text(text, encoding="utf-8")
-        except (OSError, OutputError) as error:
-            self._forget(key)
+            save_record(record, self._path(key), {"digest": hashed, "about": text})
+        except InputError:  # a record that no file can hold
+            return False
+        except OutputError as error:
             raise OutputError(
                 f"{self.folder}: what was found cannot be kept there ({error}). Free space, or "
                 "give a folder that may be written."
             ) from error
         with suppress(OSError):  # another run deletes, too
             self._bound()
-        return self._path(key, _ABOUT).exists()
+        return self._path(key).exists()
 
     def sizes(self) -> dict[str, int]:
         """Return the bytes of every record by its key, in the order they were last used in."""
-        found = {path.stem: path.stat() for path in Path(self.folder).glob(f"*{_RECORD}")}
+        found = {path.stem: path.stat() for path in Path(self.folder).glob("*.safetensors")}
         used = sorted(found, key=lambda key: found[key].st_mtime_ns)
         return {key: found[key].st_size for key in used}
 
@@ -105,16 +103,11 @@ class Store:
         total = sum(sizes.values())
         for key, size in sizes.items():
             if total > self.max_bytes:
-                self._forget(key)
+                self._path(key).unlink(missing_ok=True)
                 total -= size
 
-    def _forget(self, key: str) -> None:
-        for kind in (_ABOUT, _RECORD):
-            with suppress(OSError):
-                self._path(key, kind).unlink(missing_ok=True)
-
-    def _path(self, key: str, kind: str) -> Path:
-        return Path(self.folder) / f"{key}{kind}"
+    def _path(self, key: str) -> Path:
+        return Path(self.folder) / f"{key}.safetensors"
 
 
 def opened(cache: Store | Path | str | None) -> Store | None:
@@ -142,9 +135,6 @@ def settled(record: AnyRecord) -> AnyRecord:
     return found
 
 
-_EVENTS = {cls.__name__: cls for cls in (Failure, LeftOut, StageReport)}
-
-
 def kept(
     store: Store | None, key: str | None, cls: type[AnyRecord], make: Callable[[], AnyRecord]
 ) -> tuple[AnyRecord, float]:
@@ -163,7 +153,7 @@ def kept(
         found = store.find(key, cls) if store and key else None
     if found is not None:
         record, about = found
-        for event in about["events"]:
+        for event in from_plain(about["events"], _Events, "events", {}):
             _tell(event)
         return record, about["seconds"]
     began = time.perf_counter()
@@ -173,30 +163,19 @@ def kept(
     if store and key:
         try:
             with aside(KEEP):
-                store.keep(key, record, {"seconds": seconds, "events": list(map(_plain, events))})
+                about = {"seconds": seconds, "events": to_plain(tuple(events), {})}
+                store.keep(key, record, about)
         except OutputError as error:
             caution(str(error))
     return record, seconds
 
 
-def _plain(event: object) -> object:
-    """Turn an event into what JSON holds."""
-    if not isinstance(event, Failure | LeftOut | StageReport):
-        return event
-    return {"kind": type(event).__name__, **asdict(event)}
-
-
-def _tell(plain: str | dict[str, Any]) -> None:
+def _tell(event: str | Failure | LeftOut | StageReport) -> None:
     """Repeat an event of an earlier run."""
-    if isinstance(plain, str):
-        caution(plain)
-        return
-    fields: dict[str, Any] = dict(plain)
-    if "names" in fields:
-        fields["names"] = tuple(fields["names"])
-    kind: Any = _EVENTS[fields.pop("kind")]
-    event, journal = kind(**fields), current()
-    if isinstance(event, Failure):
+    journal = current()
+    if isinstance(event, str):
+        caution(event)
+    elif isinstance(event, Failure):
         skipped(event)
     elif isinstance(event, LeftOut) and journal.collects:
         journal.tell(event)
