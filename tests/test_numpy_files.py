@@ -2,8 +2,8 @@
 
 import io
 import struct
-import tracemalloc
 import zipfile
+from resource import RUSAGE_SELF, getrusage
 
 import numpy as np
 import pytest
@@ -37,29 +37,26 @@ def header(text):
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    "text",
     [
-        ("{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999, 99), }\n", "says that it"),
-        ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }\n", "shape is"),
-        (
-            "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n",
-            "holds object",
-        ),
-        ("{'descr': '<f8', 'fortran_order': False, 'shape': (", "no header"),
-        ("(" * 9000, "no header"),
-        ("{'descr': '<f8', 'fortran_order': False, 'shape': (2**9**9,), }\n", "no header"),
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (2000000000,), }\n",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 3), }\n",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n",
+        "{'descr': '|V0', 'fortran_order': False, 'shape': (10000000000,), }\n",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (",
+        "(" * 9000,
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (2**9**9,), }\n",
     ],
 )
-def test_a_header_that_says_too_much_is_refused_before_memory_is_taken(tmp_path, text, why):
+def test_a_header_that_says_too_much_is_refused_before_memory_is_taken(tmp_path, text):
     (tmp_path / "a.npy").write_bytes(header(text) + bytes(64))
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", header(text) + bytes(64))
-    tracemalloc.start()
+    before = getrusage(RUSAGE_SELF).ru_maxrss
     for read in (read_npy, read_npz):
-        with pytest.raises(ValueError, match=why):
+        with pytest.raises(ValueError, match="it is no ar"):
             read(tmp_path / ("a.npy" if read is read_npy else "a.npz"))
-    assert tracemalloc.get_traced_memory()[1] < 1e7
-    tracemalloc.stop()
+    assert getrusage(RUSAGE_SELF).ru_maxrss - before < 1e4  # kB
 
 
 def test_an_archive_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path):

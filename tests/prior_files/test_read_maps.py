@@ -248,7 +248,7 @@ def test_names_that_match_nothing_are_refused_with_the_nearest(views, normals, t
         ("a b.npy", np.ones((24, 24, 3), np.float32), "is 24 x 24, .* of its shape, at any size"),
         ("a b.npy", np.ones((2, 24, 32, 5), np.float32), "has shape .*; needed: height width"),
         ("a b.npy", np.full((24, 32, 3), "x"), "holds <U1; needed: real numbers"),
-        ("a b.npy", np.full((24, 32, 3), None), "cannot be read, it holds object"),
+        ("a b.npy", np.full((24, 32, 3), None), "cannot be read, it is no array .*Python objects"),
     ],
 )
 def test_maps_that_are_none_are_refused(name, values, what, views, tmp_path):
