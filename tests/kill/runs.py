@@ -208,7 +208,7 @@ def forked(line: list[str], disturbed: Disturbance = ((lambda: None), None)) -> 
 
 def copied(source: Path, target: Path) -> None:
     """Copy a result without what is kept for the next run."""
-    subprocess.run(["cp", "-r", str(source), str(target)], check=True)
+    subprocess.run(["cp", "-a", str(source), str(target)], check=True)
     subprocess.run(["rm", "-rf", str(target / ".stages")], check=True)
 
 

@@ -7,10 +7,13 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from pimper_torch.cli.main import main
 from pimper_torch.doors.outputs.folders import (
     clean_output,
     held_output,
@@ -18,7 +21,7 @@ from pimper_torch.doors.outputs.folders import (
     require_apart,
     written_whole,
 )
-from pimper_torch.doors.outputs.marker import MARKER, STAGES, foreign, read_marker, remove_written
+from pimper_torch.doors.outputs.marker import MARKER, STAGES, read_marker
 from pimper_torch.runtime.errors import InputError, OutputError
 
 
@@ -75,9 +78,7 @@ def out(tmp_path: Path) -> Path:
 def test_the_marker_lists_what_was_written(out):
     marker = read_marker(out)
     assert marker.kind == "result"
-    assert set(marker.files) == {"mesh.ply", "sparse/cameras.bin", "masks/a.png"}
-    assert marker.files["mesh.ply"].size == len("first mesh.ply")
-    assert foreign(out, marker) == []
+    assert marker.files == {"mesh.ply", "sparse/cameras.bin", "masks/a.png"}
     assert held(out) == [MARKER, "masks", "mesh.ply", "sparse"]
 
 
@@ -113,9 +114,17 @@ def test_a_file_of_ours_that_a_person_has_changed_stays(out):
 
 
 def test_a_copy_of_a_result_is_a_result(out, tmp_path):
-    shutil.copytree(out, tmp_path / "copy", copy_function=shutil.copyfile)  # with other times
+    shutil.copytree(out, tmp_path / "copy")
     write(tmp_path / "copy", result("second"), overwrite=True)
     assert contents(tmp_path / "copy") == result("second")
+
+
+def test_a_list_of_a_former_version_is_read(out):
+    content = json.loads((out / MARKER).read_text())
+    files = {name: [9, 0, "hash"] for name in content["files"]}
+    (out / MARKER).write_text(json.dumps(content | {"format_version": 1, "files": files}))
+    write(out, result("second"), overwrite=True)
+    assert contents(out) == result("second")
 
 
 def test_a_link_in_the_place_of_a_file_of_ours_is_not_followed(out, tmp_path):
@@ -133,7 +142,7 @@ def test_a_link_in_the_place_of_a_file_of_ours_is_not_followed(out, tmp_path):
     assert (tmp_path / "sparse" / "cameras.bin").exists()
 
 
-def test_names_alone_make_no_result(tmp_path):
+def test_a_folder_without_a_list_is_no_result(tmp_path):
     fill(tmp_path / "proj", result("a person's"))
     with pytest.raises(OutputError, match=r"no list of what a former run wrote"):
         write(tmp_path / "proj", result("second"), overwrite=True)
@@ -145,29 +154,22 @@ def test_a_folder_of_another_kind_is_not_replaced(out):
         prepare_output(out, "scene", overwrite=True)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda content: [],
-        lambda content: content | {"format": "another"},
-        lambda content: content | {"format_version": 2},
-        lambda content: content | {"kind": "letters"},
-        lambda content: content | {"files": ["mesh.ply"]},
-        lambda content: content | {"files": {"mesh.ply": [1]}},
-    ],
-)
+WRONG = [
+    lambda content: [],
+    lambda content: content | {"format": "another"},
+    lambda content: content | {"format_version": 3},
+    lambda content: content | {"kind": "letters"},
+    lambda content: content | {"files": 3},
+]
+
+
+@pytest.mark.parametrize("change", [*WRONG, "", "{", "[" * 100_000, "\udcff"])
 def test_a_marker_that_is_wrong_is_not_believed(out, change):
-    content = json.loads((out / MARKER).read_text())
-    (out / MARKER).write_text(json.dumps(change(content)))
-    assert read_marker(out) is None
+    if not isinstance(change, str):
+        change = json.dumps(change(json.loads((out / MARKER).read_text())))
+    (out / MARKER).write_bytes(change.encode("utf-8", "surrogateescape"))
     with pytest.raises(OutputError, match="no list of what a former run wrote"):
         write(out, result("second"), overwrite=True)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\udcff", "null"])
-def test_a_marker_that_is_no_json_is_not_believed(out, text):
-    (out / MARKER).write_bytes(text.encode("utf-8", "surrogateescape"))
-    assert read_marker(out) is None
 
 
 @pytest.mark.parametrize(
@@ -176,20 +178,11 @@ def test_a_marker_that_is_no_json_is_not_believed(out, text):
 def test_a_list_that_leads_elsewhere_removes_nothing_there(out, name):
     mine, content = out.parent / "mine.txt", json.loads((out / MARKER).read_text())
     mine.write_text("years of work")
-    about = mine.stat()
-    listed = content["files"] | {name.format(out.parent): (about.st_size, about.st_mtime_ns, "")}
+    listed = [*content["files"], name.format(out.parent)]
     (out / MARKER).write_text(json.dumps(content | {"files": listed}))
     write(out, result("second"), overwrite=True)
     assert contents(out) == result("second")
     assert mine.read_text() == "years of work"
-
-
-def test_only_what_the_list_names_is_removed(out):
-    marker = read_marker(out)
-    (out / "sparse" / "mine.txt").write_text("mine")
-    (out / "mesh.ply").write_text("changed!")
-    remove_written(out, marker)
-    assert contents(out) == {"mesh.ply": "changed!", "sparse/mine.txt": "mine"}
 
 
 def test_kept_stages_survive_a_replacement_without_a_copy(out):
@@ -320,42 +313,66 @@ HOLDS = """
 import sys, time
 from pathlib import Path
 from pimper_torch.doors.outputs.folders import held_output, written_whole
-folder, mode = Path(sys.argv[1]), sys.argv[2]
+folder = Path(sys.argv[1])
 with held_output(folder, "result", overwrite=True):
-    (folder / ".stages" / "mesh.pt").write_text("kept")
+    (folder / ".stages" / "mesh.pt").write_bytes(b"kept")
     with written_whole(folder, "result", overwrite=True) as filled:
-        (filled / "mesh.ply").write_text("half")
+        (filled / "mesh.ply").write_bytes(b"half")
         print("ready", flush=True)
         time.sleep(60)
 """
 
 
-def run_that_holds(folder: Path) -> "subprocess.Popen[str]":
-    """Start a run that has written half of its result."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, str(folder), "sleep"], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
+@contextmanager
+def run_that_holds(folder: Path) -> Iterator[int]:
+    """Start a run that has written half of its result, and kill it at the end of the block."""
+    line = [sys.executable, "-c", HOLDS, str(folder)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "ready\n"
+            yield process.pid
+        finally:
+            process.kill()
 
 
 def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(out, tmp_path):
     for folder in (out, tmp_path / "fresh"):
-        with run_that_holds(folder) as process:
-            try:
-                with pytest.raises(OutputError, match="another run writes there") as refused:
-                    write(folder, result("second"), overwrite=True)
-                told = str(refused.value)
-                assert f"process {process.pid} on {os.uname().nodename} since 20" in told
-                assert "sleep" in told  # its command
-            finally:
-                process.kill()
+        with (
+            run_that_holds(folder) as number,
+            pytest.raises(
+                OutputError, match=rf"another run writes there: process {number} on .*-c"
+            ),
+        ):
+            write(folder, result("second"), overwrite=True)
         assert (folder / STAGES / "new" / "mesh.ply").read_text() == "half"
         write(folder, result("second"), overwrite=True)
         assert contents(folder) == result("second")
         assert (folder / STAGES / "mesh.pt").read_text() == "kept"
         assert held(folder / STAGES) == ["lock", "mesh.pt"]
+
+
+@pytest.mark.parametrize("former", [True, False])
+def test_what_a_killed_run_kept_and_left_is_cleaned(out, tmp_path, capsys, former):
+    folder = out if former else tmp_path / "fresh"
+    with run_that_holds(folder), pytest.raises(OutputError, match="another run writes there"):
+        clean_output(folder)
+    assert (folder / STAGES / "mesh.pt").exists()
+    assert main(["clean", str(folder), "--json"]) == 0
+    assert '"freed_bytes": 8' in capsys.readouterr().out
+    assert contents(folder) == (result("first", "masks/a.png") if former else {})
+    assert STAGES not in held(folder)
+    if former:
+        assert clean_output(folder) == 0  # again: there is nothing to remove
+
+
+@pytest.mark.parametrize("name", ["mine", "nowhere", "file", "mine/.stages", "empty"])
+def test_cleaning_refuses_a_folder_that_is_not_ours(tmp_path, name):
+    (tmp_path / "empty" / STAGES).mkdir(parents=True)
+    fill(tmp_path, {f"mine/{STAGES}/act_one.txt": "a play", "file": ""})
+    with pytest.raises(OutputError, match="needed: the folder"):
+        clean_output(tmp_path / name)
+    assert (tmp_path / "mine" / STAGES / "act_one.txt").exists()
+    assert (tmp_path / "empty" / STAGES).exists()
 
 
 def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):

@@ -19,10 +19,9 @@ from pimper_torch.doors.outputs.marker import (
     STAGES,
     FileList,
     Kind,
-    foreign,
     read_marker,
-    remove_written,
     seal,
+    sort_out,
 )
 from pimper_torch.doors.outputs.stages import NEW, is_ours, kept, locked, resumption
 from pimper_torch.runtime.errors import InputError, OutputError, some
@@ -36,28 +35,40 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
 
     Args:
         folder: New, or empty but for what a former run kept.
-        overwrite: Replace a former result of that kind, if nothing but its own files is there, as
-            they were written.
+        overwrite: Replace a former result of that kind, if nothing but its own files is there, none
+            of them changed since.
     """
     folder = Path(folder)
     require_name(folder.resolve(), OutputError)
-    if folder.is_symlink() and not folder.exists():
-        raise OutputError(f"{folder}: is a link to nothing. Remove it, or write elsewhere.")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; needed: a folder that is new or empty.")
     if os.path.lexists(folder / STAGES) and not is_ours(folder / STAGES):
         raise OutputError(f"{folder}: holds {STAGES}, which pimper did not make. Write elsewhere.")
+    place = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise OutputError(f"{folder}: cannot be written, as {place} refuses. Write elsewhere.")
     there = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     present = [name for name in there if name != STAGES]
-    if present and not overwrite:
+    if not present:
+        return
+    if not overwrite:
         names = [name for name in present if name != MARKER] or present
         raise OutputError(
             f"{folder}: already holds {some(names)}; needed: a new or empty folder. Write "
             "elsewhere, or replace a former result by `--overwrite` (`overwrite=True`)."
         )
-    if present:
-        _require_replaceable(folder, kind, present)
-    _require_writable(folder)
+    lists = _lists(folder)
+    if not lists:
+        raise OutputError(
+            f"{folder}: holds {some(present)}, but no list of what a former run wrote ({MARKER}), "
+            "so it is not overwritten. Write elsewhere, or remove it yourself."
+        )
+    if others := {one.kind for one in lists} - {kind}:
+        raise OutputError(
+            f"{folder}: holds a {others.pop()}, and is not overwritten by a {kind}. Write "
+            "elsewhere."
+        )
+    _require_ours(folder, lists)
 
 
 @contextmanager
@@ -152,12 +163,13 @@ def put_in_place(target: Path) -> None:
     stages = target / STAGES
     new = stages / NEW
     if read_marker(new) is not None:
-        _require_ours(target, _markers(target))
+        _require_ours(target, _lists(target))
         if (target / MARKER).exists():
             (target / MARKER).replace(stages / MARKER)
         former = read_marker(stages)
-        if former is not None:
-            remove_written(target, former)
+        for path in sort_out(target, former)[0] if former else ():
+            with suppress(OSError):  # a folder in which is something else
+                path.rmdir() if path.is_dir() else path.unlink()
         (stages / MARKER).unlink(missing_ok=True)
         for path in sorted(new.iterdir()):
             if path.name != MARKER:
@@ -193,40 +205,20 @@ def _refused_by_the_disk(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _markers(folder: Path) -> list[FileList]:
-    """Read the lists of a result, of one that is being removed, and of a new one."""
-    places = (folder, folder / STAGES, folder / STAGES / NEW)
-    return [marker for place in places if (marker := read_marker(place)) is not None]
+def _lists(folder: Path) -> list[FileList]:
+    """Read the list of a result, or those of one that a new one is replacing, and of the new."""
+    whole = read_marker(folder)
+    places = (folder / STAGES, folder / STAGES / NEW) if whole is None else ()
+    return [one for one in (whole, *map(read_marker, places)) if one is not None]
 
 
-def _require_replaceable(folder: Path, kind: Kind, present: list[str]) -> None:
-    markers = _markers(folder)
-    if not markers:
-        raise OutputError(
-            f"{folder}: holds {some(present)}, but no list of what a former run wrote ({MARKER}), "
-            "so it is not overwritten. Write elsewhere, or remove it yourself."
-        )
-    others = [marker.kind for marker in markers if marker.kind != kind]
-    if others:
-        raise OutputError(
-            f"{folder}: holds a {others[0]}, and is not overwritten by a {kind}. Write elsewhere."
-        )
-    _require_ours(folder, markers)
-
-
-def _require_ours(folder: Path, markers: list[FileList]) -> None:
-    strangers = foreign(folder, *markers)
+def _require_ours(folder: Path, lists: list[FileList]) -> None:
+    _, strangers = sort_out(folder, *lists)
     if strangers:
         raise OutputError(
             f"{folder}: holds {some(strangers)}, which is no part of a result, so it is not "
             "overwritten. Write elsewhere, or move it away."
         )
-
-
-def _require_writable(folder: Path) -> None:
-    place = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
-    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise OutputError(f"{folder}: cannot be written, as {place} refuses. Write elsewhere.")
 
 
 def require_cleanable(folder: Path | str) -> None:

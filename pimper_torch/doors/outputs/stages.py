@@ -1,17 +1,15 @@
 """The folder of kept stages inside a folder of results, and the lock in it."""
 
-import errno
 import os
 import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from platform import node
 
 from pimper_torch.doors.outputs.marker import MARKER, STAGES
-from pimper_torch.runtime.errors import OutputError, caution
+from pimper_torch.runtime.errors import OutputError
 
 LOCK, NEW, HOLDER = "lock", "new", "holder.txt"
 """Names in the folder of kept stages: its lock, a result that is being written, who holds it."""
@@ -19,8 +17,6 @@ PREVIEW = "preview.png"
 """In the folder of kept stages, while a run is under way: its coarse surface."""
 
 _PASSING = (HOLDER, PREVIEW, f"{PREVIEW}.new")
-_UNLOCKED = "{}: its disk knows no locks; see that no other run writes there."
-_LOCKLESS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP)
 
 
 def is_ours(stages: Path) -> bool:
@@ -57,40 +53,33 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     stages = target / STAGES
+    holder = stages / HOLDER
     lock = FileLock(stages / LOCK, timeout=0, thread_local=False)
     try:
         stages.mkdir(parents=True, exist_ok=True)
         lock.acquire()
-    except NotImplementedError:
-        caution(_UNLOCKED.format(shown))
+    except NotImplementedError as error:
+        raise OutputError(f"{shown}: its disk knows no locks. Write elsewhere.") from error
     except (Timeout, RuntimeError) as error:  # a RuntimeError where this thread holds it
-        holder = "of which nothing is known"
-        with suppress(OSError, ValueError):
-            holder = (stages / HOLDER).read_text(encoding="utf-8")
+        known = "of which nothing is known"
+        with suppress(OSError):
+            known = holder.read_text(encoding="utf-8")
         raise OutputError(
-            f"{shown}: another run writes there: {holder}. Wait until it has ended, or write "
+            f"{shown}: another run writes there: {known}. Wait until it has ended, or write "
             "elsewhere."
         ) from error
     except OSError as error:
-        if error.errno not in _LOCKLESS:
-            raise OutputError(f"{shown}: cannot be locked ({error}). Write elsewhere.") from error
-        caution(_UNLOCKED.format(shown))
+        raise OutputError(f"{shown}: cannot be locked ({error}). Write elsewhere.") from error
     try:
         with suppress(OSError):  # the disk is full
-            (stages / HOLDER).write_text(_myself(), encoding="utf-8")
+            command = shlex.join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
+            holder.write_text(f"process {os.getpid()} on {node()}, `{command}`", encoding="utf-8")
         yield
     finally:
         with suppress(OSError):
             for name in _PASSING:
                 (stages / name).unlink(missing_ok=True)
-            if {path.name for path in stages.iterdir()} <= {LOCK, MARKER}:  # nothing is kept
-                (stages / MARKER).unlink(missing_ok=True)
+            if [path.name for path in stages.iterdir()] == [LOCK]:  # nothing is kept
                 (stages / LOCK).unlink()
                 stages.rmdir()
         lock.release()
-
-
-def _myself() -> str:
-    now = datetime.now(UTC).astimezone().isoformat(" ", "seconds")
-    command = shlex.join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
-    return f"process {os.getpid()} on {node()} since {now}, `{command}`"
