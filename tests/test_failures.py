@@ -4,7 +4,6 @@ import warnings
 from contextlib import contextmanager
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from probes import small_scene
@@ -24,13 +23,11 @@ from pimper_torch.method.sfm.sparse_scene import sound
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.method.sweep.sweep import Sweep
-from pimper_torch.records import Failure, Heights, PatchStatus, Silhouettes
-from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.records import Failure, PatchStatus, Silhouettes
+from pimper_torch.runtime.errors import OutOfMemoryError, PimperWarning, ReconstructionError
 from pimper_torch.runtime.failures import (
     by_data,
     distinct,
-    out_of_memory,
-    over_patches,
     skipped,
     solved_or,
     warn_of,
@@ -40,6 +37,7 @@ from pimper_torch.runtime.stage import Given
 
 # As torch words it on the CPU.
 NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."
+FAILURE = Failure(stage="fuse", what="solver", name="it", reason="NaN", done="Kept")
 
 
 @contextmanager
@@ -49,72 +47,6 @@ def collecting(*arguments):
     with collecting_entries(*arguments) as entries:
         yield failures
     failures += [entry for entry in entries if isinstance(entry, Failure)]
-
-
-def heights(some):
-    count = len(range(some.start, some.stop))
-    offset = torch.arange(some.start, some.stop, dtype=torch.float32)[:, None, None]
-    return Heights(
-        offset=offset, information=torch.ones_like(offset), num_views=torch.ones(count).long()
-    )
-
-
-def nothing(some):
-    return heights(some).replace(offset=torch.full((1, 1, 1), -1.0))
-
-
-def divided(fails, count=8, lost=nothing):
-    """Work on patches of which a range fails with what ``fails`` gives for it."""
-
-    def work(some):
-        if error := fails(some):
-            raise error
-        return heights(some)
-
-    return over_patches(work, list(range(100, 100 + count)), "sweep", lost, "Kept")
-
-
-def holds(some, *bad):
-    return any(some.start <= one < some.stop for one in bad)
-
-
-@pytest.mark.parametrize(
-    "error",
-    [RuntimeError("numbers"), np.linalg.LinAlgError("singular"), InputError("none")],
-    ids=lambda error: type(error).__name__,
-)
-def test_only_the_bad_patches_of_a_batch_are_lost(error):
-    with collecting() as failures:
-        found = divided(lambda some: error if holds(some, 2, 5) else None)
-    assert found.offset[:, 0, 0].tolist() == [0, 1, -1, 3, 4, -1, 6, 7]
-    assert [(each.what, each.name) for each in failures] == [("patch", "102"), ("patch", "105")]
-
-
-def test_a_failure_may_end_the_run_by_name():
-    with (
-        pytest.raises(ReconstructionError, match="sweep: patch 102 failed: RuntimeError: numbers"),
-        collecting("fail"),
-    ):
-        divided(lambda some: RuntimeError("numbers") if holds(some, 2) else None)
-
-
-@pytest.mark.parametrize("kind", [TypeError, KeyError, AssertionError, NotImplementedError])
-def test_mistakes_in_a_program_are_not_hidden(kind):
-    with pytest.raises(kind), collecting():
-        divided(lambda some: kind("wrong") if holds(some, 2) else None)
-
-
-def test_what_all_patches_fail_with_is_raised():
-    with pytest.raises(RuntimeError, match="size of tensor"), collecting():
-        divided(lambda _: RuntimeError("size of tensor a must match"))
-
-
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError(NO_MEMORY)], ids=["python", "torch"])
-def test_memory_that_does_not_suffice_ends_the_run_and_says_what_was_needed(error):
-    assert out_of_memory(error)
-    refused = pytest.raises(ReconstructionError, match=r"Memory did not suffice.*--max-size-px")
-    with refused, collecting():
-        divided(lambda some: error if holds(some, 3) else None)
 
 
 def test_a_kind_of_failure_is_warned_of_once_with_its_count():
@@ -131,17 +63,32 @@ def test_a_kind_of_failure_is_warned_of_once_with_its_count():
 
 def test_outside_of_a_chain_a_failure_is_warned_of_at_once():
     with pytest.warns(PimperWarning, match="fuse: 1 failed"):
-        skipped(Failure(stage="fuse", what="solver", name="it", reason="NaN", done="Kept"))
+        skipped(FAILURE)
 
 
 def test_an_error_that_ends_a_run_comes_after_what_had_failed_before():
-    def broken():
+    def broken(error):
         with collecting():
-            divided(lambda some: RuntimeError("numbers") if holds(some, 2) else None)
-            raise KeyError("wrong")
+            skipped(FAILURE)
+            raise error
 
-    with pytest.warns(PimperWarning, match="sweep: 1 failed"), pytest.raises(KeyError):
-        broken()
+    with pytest.warns(PimperWarning, match="fuse: 1 failed"), pytest.raises(KeyError):
+        broken(KeyError("wrong"))
+    for error in (MemoryError(), RuntimeError(NO_MEMORY)):
+        with (
+            pytest.warns(PimperWarning, match="fuse: 1 failed"),
+            pytest.raises(OutOfMemoryError, match=r"Memory did not suffice.*--max-size-px"),
+        ):
+            broken(error)
+
+
+@pytest.mark.parametrize("kind", [TypeError, KeyError, AssertionError, NotImplementedError])
+def test_mistakes_in_a_program_are_not_hidden(kind):
+    def wrong():
+        raise kind("wrong")
+
+    with pytest.raises(kind), collecting():
+        solved_or(wrong, lambda: 3, stage="fuse", name="the fusion", done="Kept")
 
 
 def test_something_stands_in_for_equations_without_a_solution():
@@ -287,15 +234,6 @@ def by_bucket(swept):
         )
 
 
-def determined_patch(swept):
-    """Give the bucket and the place of a patch that light determines, among several."""
-    for index, bucket in enumerate(swept.photometric.buckets):
-        rows = bucket.determined.nonzero()[:, 0]
-        if len(bucket.status) > 1 and len(rows):
-            return index, int(rows[-1])
-    raise AssertionError("no patch is determined")
-
-
 def status_of(swept, facet):
     for templates, bucket in zip(swept.patches.buckets, swept.photometric.buckets, strict=True):
         for one, status in zip(templates.facet.tolist(), bucket.status.tolist(), strict=True):
@@ -310,50 +248,6 @@ def solver(monkeypatch, change):
     solve = factorization.SOLVERS[name]
     changed = {**factorization.SOLVERS, name: lambda *given: change(solve, *given)}
     monkeypatch.setattr(factorization, "SOLVERS", changed)
-
-
-def broken_for(shading, error):
-    """A solver that fails on batches with the patch of that initial shading."""
-
-    def change(solve, problem, *limits):
-        if any(torch.equal(one, shading) for one in problem.shading):
-            raise error
-        return solve(problem, *limits)
-
-    return change
-
-
-@pytest.mark.parametrize(
-    "error", [torch.linalg.LinAlgError("singular"), RuntimeError("numbers")], ids=["linalg", "any"]
-)
-def test_a_patch_that_cannot_be_factorized_keeps_its_coarse_normals(
-    given, expected, monkeypatch, error
-):
-    bucket, row = determined_patch(expected)
-    facet = int(given[2].buckets[bucket].facet[row])
-    shadings = {}
-
-    def noting(solve, problem, *limits):
-        if len(problem.shading) == len(given[2].buckets[bucket].facet):
-            shadings.setdefault(problem.shading.shape, problem.shading)
-        return solve(problem, *limits)
-
-    # Which of the calls is of that bucket is known by its facets.
-    with monkeypatch.context() as noted:
-        part = given[2].replace(buckets=(given[2].buckets[bucket],))
-        solver(noted, noting)
-        seen = Warp()(given[0], given[1], part)
-        light = FitLight()(Warp()(*given))
-        Factorize()(seen, light)
-    ((_, shading),) = shadings.items()
-    solver(monkeypatch, broken_for(shading[row], error))
-    with collecting() as failures:
-        found = Factorize()(seen, light)
-    assert [(each.stage, each.name) for each in failures] == [("factorize", str(facet))]
-    assert found.buckets[0].status[row] == int(PatchStatus.FAILED)
-    assert not found.buckets[0].valid[row].any()
-    with pytest.raises(ReconstructionError, match=f"patch {facet} "), collecting("fail"):
-        Factorize()(seen, light)
 
 
 def test_a_solution_that_is_not_finite_changes_no_other_patch(given, expected, monkeypatch):

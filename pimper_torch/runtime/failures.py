@@ -173,49 +173,6 @@ def reason_of(error: BaseException) -> str:
     return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
 
 
-def over_patches(
-    work: Callable[[slice], AnyRecord],
-    facets: Sequence[int] | torch.Tensor,
-    stage: str,
-    lost: Callable[[slice], AnyRecord],
-    done: str,
-) -> AnyRecord:
-    """Work on a batch of patches; where it fails as a whole, on each of them by itself.
-
-    So a patch that cannot be worked on is found and left out. Patches must be independent; those of
-    a batch that failed are as in a whole one, up to rounding.
-
-    Args:
-        work: Called with a range of patches; gives their record.
-        lost: Gives the record of a patch that failed.
-        done: What that means, for the warning.
-
-    Raises:
-        BaseException: What no data can cause, or all of several patches failed with.
-    """
-    try:
-        return work(slice(0, len(facets)))
-    except Exception as error:
-        if not by_data(error) or len(facets) == 0:
-            raise
-        first = error
-    parts, failures = [], []
-    for index in range(len(facets)):
-        alone = slice(index, index + 1)
-        try:
-            parts.append(work(alone))
-        except Exception as error:
-            if not by_data(error):
-                raise
-            parts.append(lost(alone))
-            name, reason = str(int(facets[index])), reason_of(error)
-            failures.append(Failure(stage=stage, what="patch", name=name, reason=reason, done=done))
-    if len(failures) == len(facets) > 1:
-        raise first
-    skipped(*failures, error=first)
-    return type(parts[0]).cat(parts)
-
-
 def _kind(failure: Failure) -> tuple[str, str, str]:
     return failure.stage, failure.what, failure.done
 

@@ -30,7 +30,6 @@ from pimper_torch.records import (
     Record,
     Templates,
 )
-from pimper_torch.runtime.failures import over_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
@@ -136,26 +135,7 @@ def blend_patches(
     )
 
     def of_bucket(bucket: tuple[Templates, Depths, Photometry, Heights | None]) -> _Estimates:
-        def of_some(some: slice) -> _Estimates:
-            templates, height_field, photometry, offsets = bucket
-            return recomputed(
-                _estimates,
-                coarse,
-                templates.take(some),
-                height_field.take(some),
-                photometry.take(some),
-                None if offsets is None else offsets.take(some),
-                subdivision,
-                directions,
-                around,
-                vertices,
-            )
-
-        def lost(some: slice) -> _Estimates:
-            return of_some(slice(some.start, some.start))
-
-        facets = bucket[0].facet
-        return over_patches(of_some, facets, "fuse", lost, "These patches are left out")
+        return recomputed(_estimates, coarse, *bucket, subdivision, directions, around, vertices)
 
     estimates = list(side_by_side(of_bucket, list(buckets)))
     return _blend(_Estimates.cat(estimates), len(subdivision.points), outlier_samples)
@@ -330,9 +310,12 @@ def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:
-    """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates."""
+    """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates.
+
+    Of a facet without area it is not finite, so that no ray counts as near.
+    """
     ones = torch.ones_like(corners[..., :1])
-    return torch.linalg.inv(torch.cat([corners, ones], dim=-1).mT)
+    return torch.linalg.inv_ex(torch.cat([corners, ones], dim=-1).mT).inverse
 
 
 def _taper(

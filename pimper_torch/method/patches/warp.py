@@ -44,7 +44,6 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
-from pimper_torch.runtime.failures import over_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.stage import Stage
@@ -206,32 +205,12 @@ class Warp(Stage):
         caster: RayCaster,
         templates: Templates,
     ) -> Observations:
-        """Register a bucket; patches that cannot be have no valid sample."""
+        """Register a bucket."""
         rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
         if sources.lights is not None:
             sources = sources.replace(lights=templates.own(sources.lights))
 
-        def lost(some: slice) -> Observations:
-            raster = templates.take(some).depth
-            shape = len(raster), cameras.num_views, channels, *raster.shape[1:]
-            radiance = raster.new_zeros(shape, dtype=sources.images.finest.dtype)
-            valid = radiance[:, :, 0] > 0
-            unseen = [
-                (maps, Observations(radiance=radiance[:, maps.view], valid=valid[:, maps.view]))
-                for maps, _ in _maps_of(sources, rows)
-            ]
-            priors: PatchPriors | None = None
-            if unseen or sources.lights is not None:
-                priors = merged(unseen, valid, cameras, templates.take(some), sources.lights)
-            return Observations(radiance=radiance, valid=valid, priors=priors)
-
-        found = over_patches(
-            lambda some: self._register(cameras, sources, caster, rows, templates.take(some)),
-            templates.facet,
-            "warp",
-            lost,
-            "These patches have no samples, as if no view showed them",
-        )
+        found = self._register(cameras, sources, caster, rows, templates)
         total = int(templates.inside.sum()) * cameras.num_views
         leave_out("warp", total - int(found.valid.count_nonzero()), total=total)
         centers = cameras.centers_world.to(templates.patch_from_world)

@@ -48,18 +48,16 @@ from pimper_torch.method.photometry.status import light_varies, patch_status
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import (
     CoarseMesh,
-    Convergence,
     Observations,
     PatchStatus,
     PatchViews,
     PhotometricPatches,
     Photometry,
     Record,
-    StopCause,
     Templates,
 )
 from pimper_torch.runtime.config import require
-from pimper_torch.runtime.failures import over_patches, skipped_patches
+from pimper_torch.runtime.failures import skipped_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
@@ -167,15 +165,8 @@ class Factorize(Stage):
             normals=transferred_normals(coarse, templates),
         )
 
-        def work(patches: slice) -> Photometry:
-            taken = bucket.take(patches)
-            return self._photometry(
-                taken, *self._prepare(taken, *_illuminated(taken, light.field, caster), light)
-            )
-
-        solved = over_patches(
-            work, templates.facet, "factorize", partial(_lost, bucket), _COARSE_NORMALS
-        )
+        illuminated = _illuminated(bucket, light.field, caster)
+        solved = self._photometry(bucket, *self._prepare(bucket, *illuminated, light))
         exposure = light.field.exposure
         if exposure is None:
             return solved
@@ -433,27 +424,6 @@ def _with_albedo(
         lights=torch.cat([problem.lights, light], dim=1),
         anchor=torch.cat([problem.anchor, light], dim=1),
         regularization=torch.cat([problem.regularization, fixed], dim=1),
-    )
-
-
-def _lost(bucket: _Bucket, some: slice) -> Photometry:
-    """Return a patch that cannot be factorized: coarse normals, and nothing else."""
-    registered, normals = bucket.registered.take(some), bucket.normals[some]
-    _, views, channels, _, _ = registered.radiance.shape
-    blank = torch.zeros_like(normals[..., 0])
-    each = torch.zeros_like(blank[:, 0, 0])
-    return Photometry(
-        normals_patch=normals,
-        albedo=blank[..., None].expand(-1, -1, -1, channels),
-        lights_patch=blank.new_zeros(len(blank), views, 4),
-        valid=blank > 0,
-        information=blank,
-        status=torch.full_like(each, int(PatchStatus.FAILED), dtype=torch.long),
-        convergence=Convergence(
-            iterations=torch.zeros_like(each, dtype=torch.long),
-            residual=each,
-            cause=torch.full_like(each, int(StopCause.EMPTY), dtype=torch.long),
-        ),
     )
 
 

@@ -253,7 +253,7 @@ def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
     ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)
     damped = normal + torch.diag_embed(ridge.expand_as(diagonals))
     rhs = state.slope.double().flatten(1)[..., None]
-    return torch.linalg.solve(damped, rhs).reshape(state.slope.shape).to(state.slope)
+    return torch.linalg.solve_ex(damped, rhs).result.reshape(state.slope.shape).to(state.slope)
 
 
 def _is_free(problem: Bilinear) -> bool:

@@ -24,7 +24,7 @@ from pimper_torch.records import (
     Templates,
     Views,
 )
-from pimper_torch.runtime.failures import over_patches, skipped_patches
+from pimper_torch.runtime.failures import skipped_patches
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.stage import Stage
@@ -95,25 +95,8 @@ class Sweep(Stage):
         poses: Int[Tensor, " view"] | None,
         bucket: tuple[Templates, Observations, Photometry],
     ) -> Heights:
-        """Sweep a bucket; patches that cannot be have no heights."""
-        templates = bucket[0]
-
-        def lost(some: slice) -> Heights:
-            zero = torch.zeros_like(templates.depth[some])
-            none, priors = templates.facet.new_zeros(len(zero)), bucket[1].priors
-            return Heights(
-                offset=zero,
-                information=zero,
-                num_views=none,
-                priors=None if priors is None else priors.take(some),
-            )
-
-        def work(some: slice) -> Heights:
-            templates, registered, photometry = bucket
-            part = templates.take(some), registered.take(some), photometry.take(some)
-            return self._sweep(cameras, sources, coarse, poses, part)
-
-        found = over_patches(work, templates.facet, "sweep", lost, _NO_HEIGHTS)
+        """Sweep a bucket; heights that are not finite are none."""
+        found = self._sweep(cameras, sources, coarse, poses, bucket)
         usable = bucket[1].valid.sum(dim=1)
         most = (usable - self.config.num_views).clamp_min(0)
         leave_out("sweep.selection", int(most.sum()), total=int(usable.sum()))
@@ -123,8 +106,8 @@ class Sweep(Stage):
         finite = found.offset.isfinite() & found.information.isfinite()
         if bool(finite.all()):
             return found
-        lost_facets = templates.facet[~finite.flatten(1).all(dim=1)]
-        skipped_patches("sweep", lost_facets, "heights are not finite", _NO_HEIGHTS)
+        lost = bucket[0].facet[~finite.flatten(1).all(dim=1)]
+        skipped_patches("sweep", lost, "heights are not finite", _NO_HEIGHTS)
         return found.replace(
             offset=torch.where(finite, found.offset, 0),
             information=torch.where(finite, found.information, 0),
