@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -213,22 +214,10 @@ def test_what_fails_leaves_the_former_result_and_nothing_else(out, tmp_path, err
         with pytest.raises((OutputError, KeyboardInterrupt)) as raised:
             write_half(folder, error, overwrite=overwrite)
         if isinstance(error, OSError):
-            assert "No space left" in str(raised.value)
-            assert "writing failed" in str(raised.value)
+            assert re.search("writing failed .*No space left", str(raised.value))
     assert contents(out) == result("first", "masks/a.png")
     assert held(out.parent) == ["out"]
     assert held(tmp_path) == ["all"]
-
-
-def test_a_disk_that_is_full_while_the_list_is_written_changes_nothing(out, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("pimper_torch.doors.outputs.folders.seal", full)
-    with pytest.raises(OutputError, match="No space left"):
-        write(out, result("second"), overwrite=True)
-    assert contents(out) == result("first", "masks/a.png")
-    assert held(out.parent) == ["out"]
 
 
 KILLED_AT_EVERY_STEP = """
@@ -444,30 +433,6 @@ def test_inputs_in_the_folder_of_the_result_are_refused(out, tmp_path):
 def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
     with pytest.raises(OutputError, match=r"\\udcff: the name is not UTF-8"):
         prepare_output(tmp_path / "out\udcff", "result")
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounts need root")
-def test_a_full_disk_and_a_mount_point(tmp_path):
-    """A disk of 1 MB: what fits is there, what does not leaves the former result."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True
-    )
-    if mounted.returncode != 0:
-        pytest.skip("no disk can be mounted here")
-    try:
-        write(disk, result("first"))  # the mount point itself
-        write(disk, result("second"), overwrite=True)
-        assert contents(disk) == result("second")
-        write(disk / "out", result("first"))
-        with pytest.raises(OutputError, match="No space left"):
-            write(disk / "out", {"mesh.ply": "x" * (1 << 21)}, overwrite=True)
-        assert contents(disk / "out") == result("first")
-        assert held(disk / "out") == [MARKER, "mesh.ply", "sparse"]
-        assert not [path for path in disk.iterdir() if path.name.startswith(".pimper-")]
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
 
 
 def test_what_a_run_left_that_was_killed_in_its_first_moment_is_ours(tmp_path):

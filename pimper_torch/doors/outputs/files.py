@@ -2,7 +2,6 @@
 
 import os
 import secrets
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import fspath
@@ -18,11 +17,9 @@ def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
         sign: Text that every file of this kind holds.
     """
     require_name(path.resolve(), OutputError)
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; needed: the name of a file.")
     if not path.resolve().parent.is_dir():
         raise OutputError(f"{path}: its folder is not there. Make it, or write elsewhere.")
-    if not os.path.lexists(path.resolve()):
+    if not path.exists():
         return
     if not path.is_file():
         raise OutputError(f"{path}: is no ordinary file. Write elsewhere.")
@@ -60,14 +57,6 @@ def require_name(name: Path | str, error: type[PimperError]) -> None:
     Args:
         error: What is raised where it is not UTF-8.
     """
-    text = fspath(name)
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError as cause:
-        shown = text.encode("utf-8", "backslashreplace").decode()
-        encoding = sys.getfilesystemencoding()
-        reason = f" This system takes names for {encoding}: set LC_ALL=C.UTF-8."
-        raise error(
-            f"{shown}: the name is not UTF-8; needed: one that is. Rename it."
-            f"{'' if encoding.lower() == 'utf-8' else reason}"
-        ) from cause
+    shown = fspath(name).encode("utf-8", "backslashreplace").decode()
+    if shown != fspath(name):
+        raise error(f"{shown}: the name is not UTF-8; needed: one that is. Rename it.")

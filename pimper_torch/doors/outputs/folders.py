@@ -141,9 +141,6 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
             raise
         try:
             put_in_place(target)
-        except KeyboardInterrupt:
-            put_in_place(target)  # goes on
-            raise
         except OutputError as error:  # somebody wrote there meanwhile
             raise OutputError(f"{error} The new result is in {new}.") from error
 

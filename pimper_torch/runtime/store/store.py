@@ -88,23 +88,17 @@ class Store:
             self._bound()
         return self._path(key).exists()
 
-    def sizes(self) -> dict[str, int]:
-        """Return the bytes of every record by its key, in the order they were last used in."""
-        found = {path.stem: path.stat() for path in Path(self.folder).glob("*.safetensors")}
-        used = sorted(found, key=lambda key: found[key].st_mtime_ns)
-        return {key: found[key].st_size for key in used}
-
     def _bound(self) -> None:
         """Delete what was used longest ago until the rest is small enough."""
         for path in Path(self.folder).glob(".*.new-*"):
             if time.time() - path.stat().st_mtime > 86_400:  # a day: its run is no more
                 path.unlink()
-        sizes = self.sizes()
-        total = sum(sizes.values())
-        for key, size in sizes.items():
+        about = {path: path.stat() for path in Path(self.folder).glob("*.safetensors")}
+        total = sum(each.st_size for each in about.values())
+        for path in sorted(about, key=lambda path: about[path].st_mtime_ns):
             if total > self.max_bytes:
-                self._path(key).unlink(missing_ok=True)
-                total -= size
+                path.unlink(missing_ok=True)
+                total -= about[path].st_size
 
     def _path(self, key: str) -> Path:
         return Path(self.folder) / f"{key}.safetensors"

@@ -218,7 +218,7 @@ def test_views_of_a_set_are_paired_by_position_whatever_their_light():
     [
         (["--alignment", "cameras"], "needed: two at least"),
         (["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
-        (["-o", "."], "is a folder"),
+        (["-o", "."], "is no ordinary file"),
         (["-o", "nowhere/report.json"], "its folder is not there"),
     ],
 )
