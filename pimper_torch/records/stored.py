@@ -1,9 +1,9 @@
 """Records as files: tensors as safetensors, everything else as JSON in the file's header.
 
 The JSON is an entry of the metadata in the header, whose name has the version of the format. There
-a record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, a tuple a
-list, a mapping ``{"map": {key: value}}``; numbers, texts and ``null`` stand for themselves. Classes
-are found by the annotations of the fields: a file can name no other, and holds no code.
+a record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, and a
+tuple a list; the rest stands for itself. Classes are found by the annotations of the fields: a file
+can name no other, and holds no code.
 """
 
 import dataclasses
@@ -21,6 +21,7 @@ from jaxtyping import AbstractArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from pimper_torch.records.record import Record
 from pimper_torch.runtime.errors import InputError, OutputError
@@ -53,7 +54,10 @@ def save_record(record: Record, path: str | Path, about: Mapping[str, str] | Non
     """
     path = Path(path)
     tensors: dict[int, tuple[str, Tensor]] = {}
-    text = json.dumps(to_plain(record, tensors))
+    for keys, leaf in pytree.tree_flatten_with_path(record)[0]:
+        if isinstance(leaf, Tensor):
+            tensors.setdefault(id(leaf), (pytree.keystr(keys).removeprefix("."), leaf))
+    text = as_json(record, {key: name for key, (name, _) in tensors.items()})
     trial = path.with_name(f".{path.name}.new-{secrets.token_hex(4)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +108,7 @@ def load_with_metadata(
                 f"holds {found}; needed: {_KEY!r}, as this version of pimper_torch writes it, of "
                 f"{_MAX_STRUCTURE} bytes at most."
             )
-        record: AnyRecord = from_plain(json.loads(text), cls, cls.__name__, tensors)
+        record: AnyRecord = of_json(json.loads(text), cls, cls.__name__, tensors)
     except InputError as error:
         raise InputError(f"{path}: {error} {_AGAIN}") from error
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
@@ -115,38 +119,30 @@ def load_with_metadata(
     return record, metadata
 
 
-def to_plain(value: object, tensors: dict[int, tuple[str, Tensor]], where: str = "") -> object:
-    """Turn a value into what JSON holds.
+def as_json(value: object, names: Mapping[int, str] | None = None) -> str:
+    """Write a value as JSON for :func:`of_json`.
 
     Args:
-        tensors: Collects the tensors by their identity, each with the fields that lead to it.
-        where: Fields that lead to the value.
+        names: Of tensors, by their identity.
     """
 
-    def inner(part: object, name: object) -> object:
-        return to_plain(part, tensors, f"{where}.{name}" if where else str(name))
+    def plain(value: object) -> object:
+        if isinstance(value, Record):
+            fields = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+            return {"record": type(value).__name__, "fields": fields}
+        if isinstance(value, Tensor) and names and id(value) in names and _is_writable(value):
+            return {"tensor": names[id(value)]}
+        kind = f"{value.dtype} {value.layout} " if isinstance(value, Tensor) else ""
+        raise InputError(
+            f"A file cannot hold a {kind}{type(value).__name__}; needed: records, dense tensors "
+            "with values, tuples, mappings by texts, numbers, texts or None."
+        )
 
-    if isinstance(value, Record):
-        names = [field.name for field in dataclasses.fields(value)]
-        fields = {name: inner(getattr(value, name), name) for name in names}
-        return {"record": type(value).__name__, "fields": fields}
-    if isinstance(value, Tensor) and _is_writable(value):
-        return {"tensor": tensors.setdefault(id(value), (where, value))[0]}
-    if isinstance(value, tuple):
-        return [inner(item, index) for index, item in enumerate(value)]
-    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {"map": {key: inner(item, key) for key, item in value.items()}}
-    if value is None or type(value) in (bool, int, float, str):
-        return value
-    kind = f"{value.dtype} {value.layout} " if isinstance(value, Tensor) else ""
-    raise InputError(
-        f"{where} is a {kind}{type(value).__name__}, which a file cannot hold; needed: records, "
-        "dense tensors with values, tuples, mappings by texts, numbers, texts or None."
-    )
+    return json.dumps(value, default=plain)
 
 
-def from_plain(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
-    """Turn what :func:`to_plain` gave into what an annotation asks for, or refuse it."""
+def of_json(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
+    """Turn parsed JSON of :func:`as_json` into what an annotation asks for, or refuse it."""
     union = typing.get_origin(hint) in (typing.Union, types.UnionType)
     choices = typing.get_args(hint) if union else (hint,)
     kind = next((choice for choice in choices if _fits(found, choice, tensors)), None)
@@ -155,26 +151,23 @@ def from_plain(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor])
         raise InputError(f"{where} is {json.dumps(found)[:60]}; needed: {needed}.")
 
     def inner(part: object, hint: object, name: object) -> Any:  # noqa: ANN401
-        return from_plain(part, hint, f"{where}.{name}", tensors)
+        return of_json(part, hint, f"{where}.{name}", tensors)
 
     hints = typing.get_args(kind)
-    match found:
-        case {"record": _, "fields": fields}:
-            own, of = (
-                [field.name for field in dataclasses.fields(kind)],
-                typing.get_type_hints(kind),
-            )
-            if fields.keys() != set(own):
-                has = ", ".join(fields)[:200]
-                raise InputError(f"{where} has the fields {has}; needed: {', '.join(own)}.")
-            return kind(**{name: inner(fields[name], of[name], name) for name in own})
-        case {"tensor": name}:
-            return tensors[name]
-        case {"map": content}:
-            return {key: inner(item, hints[1], key) for key, item in content.items()}
-        case list():
-            each = hints[:1] * len(found) if hints[-1:] == (...,) else hints
-            return tuple(map(inner, found, each, range(len(found))))
+    if _is_a(kind, Record):
+        own, of = [field.name for field in dataclasses.fields(kind)], typing.get_type_hints(kind)
+        fields = found["fields"]
+        if fields.keys() != set(own):
+            has = ", ".join(fields)[:200]
+            raise InputError(f"{where} has the fields {has}; needed: {', '.join(own)}.")
+        return kind(**{name: inner(fields[name], of[name], name) for name in own})
+    if isinstance(found, list):
+        each = hints[:1] * len(found) if hints[-1:] == (...,) else hints
+        return tuple(map(inner, found, each, range(len(found))))
+    if _is_a(kind, AbstractArray | Tensor):
+        return tensors[found["tensor"]]
+    if isinstance(found, dict):
+        return {key: inner(item, hints[1], key) for key, item in found.items()}
     return found
 
 
@@ -184,11 +177,11 @@ def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa
     if origin is typing.Literal:
         return any(type(found) is type(one) and found == one for one in hints)
     match found:
-        case {"record": name, "fields": dict()}:
-            return _is_a(hint, Record) and name == hint.__name__
-        case {"tensor": str(name)}:
-            return _is_a(hint, AbstractArray | Tensor) and name in tensors
-        case {"map": dict()}:
+        case {"record": name, "fields": dict()} if _is_a(hint, Record):
+            return bool(name == hint.__name__)
+        case {"tensor": str(name)} if _is_a(hint, AbstractArray | Tensor):
+            return name in tensors
+        case dict():
             return _is_a(origin, Mapping)
         case list():
             return origin is tuple and (hints[-1:] == (...,) or len(hints) == len(found))

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Int
 
 from pimper_torch.records.failure import Failure, LeftOut
-from pimper_torch.records.record import Record
 from pimper_torch.runtime.errors import (
     InputError,
     NumericalError,
@@ -28,7 +27,6 @@ from pimper_torch.runtime.errors import (
 from pimper_torch.runtime.journal import current, writing
 
 Result = TypeVar("Result")
-AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 # What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from pimper_torch.records import Failure, LeftOut, Record, StageReport
-from pimper_torch.records.stored import from_plain, load_with_metadata, save_record, to_plain
+from pimper_torch.records.stored import as_json, load_with_metadata, of_json, save_record
 from pimper_torch.runtime.errors import InputError, OutputError, caution
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.journal import KEEP, aside, current, noted
@@ -66,12 +66,12 @@ class Store:
 
         Args:
             record: Of any class that :func:`~pimper_torch.records.stored.save_record` takes.
-            about: What else is to be known of it; what JSON holds.
+            about: What else is to be known of it: what JSON holds, and records without tensors.
 
         Returns:
             Whether it is kept: it is not where it alone is larger than the folder may be.
         """
-        text = json.dumps(about or {})
+        text = as_json(about or {})
         hashed = digest(record, text)
         if hashed is None:
             return False
@@ -147,7 +147,7 @@ def kept(
         found = store.find(key, cls) if store and key else None
     if found is not None:
         record, about = found
-        for event in from_plain(about["events"], _Events, "events", {}):
+        for event in of_json(about["events"], _Events, "events", {}):
             _tell(event)
         return record, about["seconds"]
     began = time.perf_counter()
@@ -157,8 +157,7 @@ def kept(
     if store and key:
         try:
             with aside(KEEP):
-                about = {"seconds": seconds, "events": to_plain(tuple(events), {})}
-                store.keep(key, record, about)
+                store.keep(key, record, {"seconds": seconds, "events": tuple(events)})
         except OutputError as error:
             caution(str(error))
     return record, seconds
