@@ -21,8 +21,10 @@ _PACKAGE = Path(__file__).parents[2]
 
 
 # Packages that stages compute with.
-_COMPUTE = ("torch", "numpy", "scipy", "numba", "pycolmap", "kornia", "opencv-python-headless")
-_COMPUTE += ("scikit-image", "trimesh", "embreex", "fcpw", "cholespy")
+_COMPUTE = (
+    *("torch", "numpy", "scipy", "numba", "pycolmap", "kornia", "opencv-python-headless"),
+    *("scikit-image", "trimesh", "embreex", "fcpw", "cholespy"),
+)
 
 
 @cache
