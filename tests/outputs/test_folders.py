@@ -48,24 +48,14 @@ def write(folder: Path, files: dict[str, str], *, overwrite: bool = False) -> No
         fill(filled, files)
 
 
-def write_half(folder: Path, error: BaseException, *, overwrite: bool = False) -> None:
-    with written_whole(folder, "result", overwrite=overwrite) as filled:
-        fill(filled, {"mesh.ply": "half"})
-        raise error
-
-
-def keep(folder: Path, error: BaseException) -> None:
-    """A run that fails after it has kept something."""
-    with held_output(folder, "result"):
-        (folder / STAGES / "mesh.pt").write_text("kept")
-        raise error
-
-
-def fill(folder: Path, files: dict[str, str]) -> None:
+def fill(folder: Path, files: dict[str, str], error: BaseException | None = None) -> None:
+    """Write files, and fail then."""
     for name, text in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+    if error is not None:
+        raise error
 
 
 @pytest.fixture
@@ -91,27 +81,38 @@ def test_a_result_is_replaced_on_demand_alone(out):
     assert held(out.parent) == ["out"]
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "sparse/mine.txt", "masks/old/b.png", "new/"])
-def test_a_persons_own_file_anywhere_in_a_result_is_named_and_stays(out, name):
-    path = out / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if name.endswith("/"):
-        path.mkdir()
-    else:
-        path.write_text("years of work")
-    before = contents(out)
-    with pytest.raises(OutputError, match=name.strip("/").split("/")[-1].replace(".", r"\.")):
-        write(out, result("second"), overwrite=True)
-    assert contents(out) == before
-    assert path.exists()
+def change(path: Path) -> None:
+    """Write a file of the same size a second after the result was written."""
+    later = (path.parents[1] / MARKER).stat().st_mtime_ns + 10**9
+    path.write_bytes(path.read_bytes()[::-1])
+    os.utime(path, ns=(later, later))
 
 
-def test_a_file_of_ours_that_a_person_has_changed_stays(out):
-    mask = out / "masks" / "a.png"
-    mask.write_text("first masks/A.png")  # of the same size
-    with pytest.raises(OutputError, match=r"masks/a\.png \(changed since it was written\)"):
+def link(path: Path) -> None:
+    """Put a link in the place of a file or a folder."""
+    path.rename(path.parents[2] / path.name)
+    path.symlink_to(path.parents[2] / path.name)
+
+
+SPOILED = {
+    r"notes\.txt": lambda out: fill(out, {"notes.txt": "years of work"}),
+    r"sparse/mine\.txt": lambda out: fill(out, {"sparse/mine.txt": "years of work"}),
+    r"masks/old/b\.png": lambda out: fill(out, {"masks/old/b.png": "years of work"}),
+    "holds new, ": lambda out: (out / "new").mkdir(),
+    r"masks/a\.png \(changed since it was written\)": lambda out: change(out / "masks" / "a.png"),
+    r"mesh\.ply": lambda out: link(out / "mesh.ply"),
+    "sparse, ": lambda out: link(out / "sparse"),
+    "no list of what a former run wrote": lambda out: (out / MARKER).unlink(),
+}
+
+
+@pytest.mark.parametrize("message", SPOILED)
+def test_what_is_no_part_of_a_result_is_named_and_stays(out, message):
+    SPOILED[message](out)
+    before = contents(out), held(out)
+    with pytest.raises(OutputError, match=message):
         write(out, result("second"), overwrite=True)
-    assert mask.read_text() == "first masks/A.png"
+    assert (contents(out), held(out)) == before
 
 
 def test_a_copy_of_a_result_is_a_result(out, tmp_path):
@@ -126,28 +127,6 @@ def test_a_list_of_a_former_version_is_read(out):
     (out / MARKER).write_text(json.dumps(content | {"format_version": 1, "files": files}))
     write(out, result("second"), overwrite=True)
     assert contents(out) == result("second")
-
-
-def test_a_link_in_the_place_of_a_file_of_ours_is_not_followed(out, tmp_path):
-    (tmp_path / "mine.ply").write_text("first mesh.ply")
-    (out / "mesh.ply").unlink()
-    (out / "mesh.ply").symlink_to(tmp_path / "mine.ply")
-    with pytest.raises(OutputError, match=r"holds mesh\.ply"):
-        write(out, result("second"), overwrite=True)
-    shutil.rmtree(out / "sparse")
-    (tmp_path / "sparse").mkdir()
-    (tmp_path / "sparse" / "cameras.bin").write_text("first sparse/cameras.bin")
-    (out / "sparse").symlink_to(tmp_path / "sparse")
-    with pytest.raises(OutputError, match="sparse"):
-        write(out, result("second"), overwrite=True)
-    assert (tmp_path / "sparse" / "cameras.bin").exists()
-
-
-def test_a_folder_without_a_list_is_no_result(tmp_path):
-    fill(tmp_path / "proj", result("a person's"))
-    with pytest.raises(OutputError, match=r"no list of what a former run wrote"):
-        write(tmp_path / "proj", result("second"), overwrite=True)
-    assert contents(tmp_path / "proj") == result("a person's")
 
 
 def test_a_folder_of_another_kind_is_not_replaced(out):
@@ -211,8 +190,11 @@ def test_a_folder_of_stages_that_is_not_ours_is_refused(tmp_path):
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
 def test_what_fails_leaves_the_former_result_and_nothing_else(out, tmp_path, error):
     for folder, overwrite in ((out, True), (tmp_path / "new" / "deep", False)):
-        with pytest.raises((OutputError, KeyboardInterrupt)) as raised:
-            write_half(folder, error, overwrite=overwrite)
+        with (
+            pytest.raises((OutputError, KeyboardInterrupt)) as raised,
+            written_whole(folder, "result", overwrite=overwrite) as filled,
+        ):
+            fill(filled, {"mesh.ply": "half"}, error)
         if isinstance(error, OSError):
             assert re.search("writing failed .*No space left", str(raised.value))
     assert contents(out) == result("first", "masks/a.png")
@@ -409,8 +391,8 @@ def test_a_folder_that_was_made_for_a_run_that_wrote_nothing_is_removed(tmp_path
 
 
 def test_a_run_that_kept_something_says_where_it_goes_on(tmp_path):
-    with pytest.raises(KeyboardInterrupt) as raised:
-        keep(tmp_path / "out", KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt) as raised, held_output(tmp_path / "out", "result"):
+        fill(tmp_path / "out" / STAGES, {"mesh.pt": "kept"}, KeyboardInterrupt())
     assert f"What was finished is kept in {tmp_path}/out/{STAGES}" in raised.value.__notes__[0]
     assert held(tmp_path / "out") == [STAGES]
     write(tmp_path / "out", result("first"))  # no --overwrite: there is no result yet
