@@ -6,8 +6,11 @@ import pytest
 import torch
 from probes import small_scene
 from torch import nn
+from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 import pimper_torch as pt
+from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.runtime.stage import Given
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
@@ -90,3 +93,15 @@ def test_a_module_behind_a_stage_of_the_finish_is_handed_its_record(behind):
     assert [report.name for report in result.report][-5:] == [
         *("simplify", "relight", "texture", "judge_textures", "between stages")
     ]
+
+
+def test_written_normals_are_vertex_normals_of_the_fused_surface():
+    plain, views = chain_on_a_sphere("default")
+    fused = Mine()
+    chain, _ = chain_on_a_sphere("default", fuse=pt.Then(plain.fuse, fused))
+    written, surface = chain(views).mesh, fused.handed[-1]
+    own = normalize(vertex_normals(surface.vertices_world, surface.faces), dim=1)
+    assert_close(surface.normals_world, own, rtol=0, atol=1e-6)
+    # `repair` and `extract` keep these vertices here, in another order.
+    nearest = torch.cdist(written.vertices_world, surface.vertices_world).argmin(dim=1)
+    assert_close(written.normals_world, own[nearest], rtol=0, atol=1e-6)

@@ -646,8 +646,8 @@ class Surface(Record):
         faces: Counter-clockwise from outside.
         facet: A facet each vertex lies in; a shared vertex names one of its facets.
         barycentric: Where in that facet.
-        normals_world: Unit, outward: those of the surface itself; of ``paper``, photometric
-            where there are any.
+        normals_world: Unit, outward: vertex normals of this mesh, which the result keeps; those
+            of factorization only shaped it. ``paper`` keeps photometric normals where there are.
         albedo: Linear, up to one scale; continued from round about where no light tells it.
         information: Inverse variance of the photometric normals, one over squared radians; 0
             where light does not determine them.
