@@ -24,11 +24,16 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_torch.cli.batches import task
+from pimper_torch.cli.options import InputOptions
+from pimper_torch.doors.camera_files import read_cameras
 from pimper_torch.method.chains import presets
 from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.method.chains.presets import load_config
+from pimper_torch.method.photometry import factorize
 from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.records import Silhouettes, SparseScene, Views
+from pimper_torch.runtime.errors import InputError
 from tests.relighting import ball
 
 PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
@@ -196,6 +201,16 @@ def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
     return {}
 
 
+def losses(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    monkeypatch.setattr(factorize, "LOSSES", dict(factorize.LOSSES))
+    return {}
+
+
+def camera_formats(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    monkeypatch.setattr(read_cameras, "FORMATS", list(read_cameras.FORMATS))
+    return {}
+
+
 def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = ball.photographed((0.0, 0.3, 1.0), views=3)
     chain = pimper_torch.load_chain("default")
@@ -258,7 +273,9 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/extending.md", 0): a_scene_and_a_mesh,
     ("docs/extending.md", 1): a_scene_and_a_mesh,
     ("docs/extending.md", 2): a_scene_and_a_mesh,
-    ("docs/extending.md", 3): a_data_set_of_ones_own,
+    ("docs/extending.md", 3): losses,
+    ("docs/extending.md", 4): camera_formats,
+    ("docs/extending.md", 5): a_data_set_of_ones_own,
 }
 
 
@@ -278,13 +295,31 @@ def test_the_python_of_the_pages_runs(page, number, tmp_path, monkeypatch):
 
 def test_the_reader_of_the_pages_reads_the_cameras(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = run_block("docs/extending.md", 3, monkeypatch)
+    names = run_block("docs/extending.md", 5, monkeypatch)
     _, found = photographed()
     read = names["scene"].cameras
     torch.testing.assert_close(
         read.cam_from_world, found.cameras.cam_from_world.to(read.intrinsics)
     )
     torch.testing.assert_close(read.intrinsics, found.cameras.intrinsics.to(read.intrinsics))
+
+
+def test_the_camera_format_of_the_pages_is_read_and_offered(tmp_path, monkeypatch):
+    run_block("docs/extending.md", 4, monkeypatch)
+    path = tmp_path / "mine.csv"
+    path.write_text("a.png,64,48,90,1,0,0,0.5,0,1,0,0,0,0,1,2\n")
+    (camera,) = read_cameras.read_cameras(path, ["a.png"], lambda names: [None for _ in names])
+    assert (camera.name, camera.lens.params) == ("a.png", (90, 32, 24))
+    assert camera.cam_from_world[:3, 3].tolist() == [0.5, 0, 2]
+    with pytest.raises(InputError, match=r"needed: .*cameras\.npz \(arrays\), cameras\.csv"):
+        read_cameras.read_cameras(tmp_path / "a.txt", [], lambda names: [])
+
+
+def test_every_format_of_cameras_is_in_the_table_and_in_the_help():
+    rows = PAGES["docs/index.md"].split("### Known cameras")[1].split("## ")[0]
+    for each in read_cameras.FORMATS:
+        assert re.search(rf"\n\| `{each.name}`.*\| .*\|", rows)
+        assert all(suffix in str(InputOptions.__doc__) for suffix in each.suffixes)
 
 
 def test_every_block_of_python_in_the_pages_is_run():

@@ -3,7 +3,7 @@ import json
 import torch
 from torch.testing import assert_close
 
-from pimper_bench.datasets import read_meshroom
+from pimper_bench.datasets import read_camera_file
 from pimper_torch.doors.camera_files.meshroom_sfm import read_meshroom_cameras
 from pimper_torch.doors.exchange.alicevision import write_alicevision, write_sfm
 from pimper_torch.ground.geometry.lens_models import pinhole_of
@@ -16,7 +16,7 @@ def parsed(path):
 
 def test_what_is_written_is_read_back(result, tmp_path, same_cameras):
     write_alicevision(result, tmp_path)
-    found = read_meshroom(tmp_path / "cameras.sfm", masks=tmp_path / "masks")
+    found = read_camera_file(tmp_path / "cameras.sfm", masks=tmp_path / "masks")
     same_cameras(found.cameras, result.cameras)
     assert found.views.names == result.scene.views.names
     assert torch.equal(found.views.masks, result.silhouettes.masks)

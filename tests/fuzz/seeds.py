@@ -21,12 +21,11 @@ from dng import write_dng
 from heic_files import UPRIGHT
 
 from pimper_bench.datasets import (
+    read_camera_file,
     read_colmap,
     read_diligent,
     read_idr,
     read_llff,
-    read_meshroom,
-    read_metashape,
     read_rendered,
     read_transforms,
     write_colmap,
@@ -356,8 +355,8 @@ def _datasets(root: Path) -> list[Seed]:
         "transforms": (read_transforms, ("transforms.json",)),
         "idr": (read_idr, ("cameras.npz",)),
         "llff": (read_llff, ("poses_bounds.npy",)),
-        "meshroom": (read_meshroom, ("cameras.sfm",)),
-        "metashape": (read_metashape, ("cameras.xml",)),
+        "meshroom": (read_camera_file, ("cameras.sfm",)),
+        "metashape": (read_camera_file, ("cameras.xml",)),
         "colmap": (
             read_colmap,
             tuple(f"sparse/0/{part}.bin" for part in ("cameras", "images", "points3D")),

@@ -30,8 +30,7 @@ Source = Literal[
     "llff",
     "idr",
     "transforms",
-    "meshroom",
-    "metashape",
+    "camera-file",
     "dtu-points",
     "dtu-mvs",
     "diligent-mv",
@@ -88,7 +87,8 @@ class ConvertJob:
     Attributes:
         data: The data set's folder; for some layouts its file of cameras.
         out: Folder for the result; new or empty.
-        source: Layout of DATA.
+        source: Layout of DATA; camera-file is a file of any format that `--sparse` takes, as of
+            Metashape or Meshroom, beside its photographs.
         target: Layout to write.
         overwrite: Replace a former result in OUT.
         options: Of the reader.
@@ -141,8 +141,7 @@ def readers() -> Mapping[Source, Callable[..., Capture]]:
         "llff": datasets.read_llff,
         "idr": datasets.read_idr,
         "transforms": datasets.read_transforms,
-        "meshroom": datasets.read_meshroom,
-        "metashape": datasets.read_metashape,
+        "camera-file": datasets.read_camera_file,
         "dtu-points": datasets.read_dtu_points,
         "dtu-mvs": datasets.read_dtu_mvs,
         "diligent-mv": datasets.read_diligent_mv,

@@ -7,11 +7,10 @@ Where a folder is laid out otherwise, or a file is missing or damaged, a reader 
 from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
 from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_points, read_dtu_protocol
 from pimper_bench.datasets.formats import (
+    read_camera_file,
     read_colmap,
     read_idr,
     read_llff,
-    read_meshroom,
-    read_metashape,
     read_transforms,
 )
 from pimper_bench.datasets.idr import write_idr
@@ -22,6 +21,7 @@ from pimper_torch.doors.exchange.nerfstudio import write_transforms
 
 __all__ = [
     "one_light_per_position",
+    "read_camera_file",
     "read_colmap",
     "read_diligent",
     "read_diligent_mv",
@@ -30,8 +30,6 @@ __all__ = [
     "read_dtu_protocol",
     "read_idr",
     "read_llff",
-    "read_meshroom",
-    "read_metashape",
     "read_rendered",
     "read_transforms",
     "write_colmap",

@@ -18,10 +18,11 @@ from pimper_bench.datasets.posed import (
     mask_finder,
 )
 from pimper_bench.truth import Capture
-from pimper_torch.doors.camera_files import meshroom_sfm, metashape_xml, transforms_json
+from pimper_torch.doors.camera_files import transforms_json
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.doors.camera_files.read_cameras import FORMATS, read_cameras
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.ground.geometry.rigid import invert_rigid
@@ -36,7 +37,6 @@ _LLFF = "an LLFF set"
 _LLFF_MASKS = ("masks", "mask", "images_mask")
 _IDR = "an IDR or NeuS set"
 _IDR_CAMERAS = ("cameras.npz", "cameras_sphere.npz", "cameras_large.npz")
-_MESHROOM = ("cameras.sfm", "sfm.json", "sfm.sfm", "cameras.json")
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 
@@ -181,7 +181,9 @@ def read_idr(
     needed = f"{len(files)} masks, one for each image"
     drawn.expect(len(masks) == len(files), needed, f"{len(masks)}")
     names = [path.name for path in files]
-    cameras = read_camera_arrays(file.path, names, lambda names: _sizes(pictures, names))
+    cameras = read_camera_arrays(
+        file.path, names, lambda names: _sizes([pictures.inside(name) for name in names])
+    )
     photographs = [
         PosedPhotograph.of(camera, path, mask)
         for camera, path, mask in zip(cameras, files, masks, strict=True)
@@ -189,61 +191,33 @@ def read_idr(
     return assemble(photographs, root, **options)
 
 
-def _sizes(folder: DataSetPath, names: Sequence[str]) -> list[tuple[int, int]]:
-    headers = [read_header(_with_suffix(folder.inside(name))) for name in names]
+def _sizes(images: Sequence[Path]) -> list[tuple[int, int]]:
+    headers = [read_header(image) for image in images]
     return [(header.width, header.height) for header in headers]
 
 
-def read_meshroom(
+def read_camera_file(
     folder: Path | str,
     *,
     images: Path | str | None = None,
     masks: Path | str | None = None,
     **options: Unpack[PosedOptions],
 ) -> Capture:
-    """Read the cameras of Meshroom's ``cameras.sfm`` and the photographs it names.
-
-    Their meaning is that of
-    :func:`~pimper_torch.doors.camera_files.meshroom_sfm.read_meshroom_cameras`.
+    """Read a file of cameras that ``--sparse`` takes, as of Metashape or Meshroom.
 
     Args:
-        folder: With ``cameras.sfm`` or ``sfm.json``; or the file itself.
-        images: Folder of the photographs, which are looked up by file name: the paths in the
-            file are those of the machine that wrote it. By default ``images`` beside the file,
-            or the file's own folder.
+        folder: The file, or the folder with one by its usual name, see
+            :data:`~pimper_torch.doors.camera_files.read_cameras.FORMATS`.
+        images: Folder of the photographs. They are looked up by the name in the file, without its
+            folders, and if need be without suffixes. By default ``images`` beside the file, or the
+            file's own folder.
     """
-    file = file_in(folder, _MESHROOM, meshroom_sfm.KIND)
+    file = file_in(folder, [each.name for each in FORMATS], "a file of cameras")
     pictures = _pictures(file, images)
+    files = image_files(pictures)
 
-    def find(camera: PosedCamera) -> Path:
-        return pictures.inside(PureWindowsPath(camera.name).name)
-
-    cameras = meshroom_sfm.read_meshroom_cameras(file.path)
-    return assemble(_beside(cameras, find, masks, file), file, **options)
-
-
-def read_metashape(
-    folder: Path | str,
-    *,
-    images: Path | str | None = None,
-    masks: Path | str | None = None,
-    **options: Unpack[PosedOptions],
-) -> Capture:
-    """Read the cameras that Metashape exported as XML, and their photographs.
-
-    Their meaning is that of
-    :func:`~pimper_torch.doors.camera_files.metashape_xml.read_metashape_cameras`.
-
-    Args:
-        folder: With one ``.xml`` file; or the file itself.
-        images: Folder of the photographs, which are called as the cameras are labelled, with
-            or without suffix; by default as of :func:`read_meshroom`.
-    """
-    file = file_in(folder, ("*.xml",), metashape_xml.KIND)
-    pictures = _pictures(file, images)
-
-    def find(camera: PosedCamera) -> Path:
-        files, name = image_files(pictures), PureWindowsPath(camera.name).name
+    def find(camera: str) -> Path:
+        name = PureWindowsPath(camera).name  # takes both kinds of slash
         found = [path for path in files if path.name == name]
         found = found or [path for path in files if path.stem == name]
         found = found or [path for path in files if path.stem == PureWindowsPath(name).stem]
@@ -251,8 +225,12 @@ def read_metashape(
         pictures.expect(len(found) == 1, f"one photograph called {name}", there)
         return found[0]
 
-    cameras = metashape_xml.read_metashape_cameras(file.path)
-    return assemble(_beside(cameras, find, masks, file), file, **options)
+    def sizes_of(names: Sequence[str]) -> list[tuple[int, int]]:
+        return _sizes([find(name) for name in names])
+
+    cameras = read_cameras(file.path, [path.name for path in files], sizes_of)
+    photographs = _beside(cameras, lambda camera: find(camera.name), masks, file)
+    return assemble(photographs, file, **options)
 
 
 def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capture:
@@ -269,10 +247,14 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     file = file_in(folder, _TRANSFORMS, transforms_json.KIND)
     around = file._replace(path=file.path.parent)
     frames = transforms_json.read_frames(file.path)
+
+    def image_of(name: str) -> Path:
+        return _with_suffix(around.inside(name))
+
     cameras = transforms_json.read_transforms_cameras(
-        file.path, lambda names: _sizes(around, names)
+        file.path, lambda names: _sizes([image_of(name) for name in names])
     )
-    images = [_with_suffix(around.inside(camera.name)) for camera in cameras]
+    images = [image_of(camera.name) for camera in cameras]
     names = [image.name for image in images]
     if len(set(names)) < len(names):
         names = [PurePosixPath(image.relative_to(around.path)).as_posix() for image in images]

@@ -134,21 +134,17 @@ def first_of(candidates: Sequence[Path]) -> Path | None:
 
 
 def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
-    """Return a file, or the one of these names, or of one pattern, in a folder.
+    """Return a file, or the first one of these names that is in a folder.
 
     Raises:
-        InputError: There is none, or several fit the pattern.
+        InputError: There is none.
     """
     given = Path(given)
     if given.is_file():
         return DataSetPath(given, kind)
-    folder, found = DataSetPath(given, kind), [given / name for name in names]
-    if names[0].startswith("*"):
-        found = sorted(given.glob(names[0])) if given.is_dir() else []
-        folder.expect(len(found) == 1, f"one file named {names[0]}")
-    path = first_of(found)
+    path = first_of([given / name for name in names])
     if path is None:
-        folder.refuse(f"a file {' or '.join(names)}")
+        DataSetPath(given, kind).refuse(f"a file {' or '.join(names)}")
     return DataSetPath(path, kind)
 
 

@@ -24,6 +24,11 @@ FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 _POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
+def has_frames(path: Path) -> bool:
+    """Return whether a JSON file has frames, by which this format is known."""
+    return "frames" in DataSetPath(path, "a file of cameras").read_json()
+
+
 def read_frames(path: Path) -> list[dict[str, object]]:
     """Return the frames, each with what the whole file says."""
     file = DataSetPath(path, KIND)
