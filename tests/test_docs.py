@@ -28,7 +28,6 @@ from pimper_torch.cli.options import InputOptions
 from pimper_torch.doors.camera_files import read_cameras
 from pimper_torch.method.chains import presets
 from pimper_torch.method.chains.chain_config import load_config
-from pimper_torch.method.chains.presets import load_config
 from pimper_torch.method.photometry import factorize
 from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.method.sfm.reconstruct import Reconstruct

@@ -40,7 +40,7 @@ from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.result.viewer.show import COARSE, RESULT, add_found
-from pimper_torch.result.viewer.viewer import Viewer, opened
+from pimper_torch.result.viewer.viewer import Viewer
 from pimper_torch.result.viz.overview import draw_preview, headline
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution, cautioned
@@ -52,7 +52,7 @@ from pimper_torch.runtime.store import Store
 def run(job: Job, output: Output) -> None:
     """Carry out ``reconstruct`` or ``demo``."""
     _check_device(job.common.device)
-    with opened() if job.common.view else nullcontext() as viewer:
+    with Viewer() if job.common.view else nullcontext() as viewer:
         if viewer is not None:
             tell_place(viewer, output)
         _carry_out(job, output, viewer)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Turn and light a result in a browser, until Ctrl-C.
+    """Turn a result in a browser, until Ctrl-C.
 
     Attributes:
         out: Folder that `pimper reconstruct` wrote, or a mesh file; needs pip install
@@ -42,10 +42,10 @@ class _Job:
 def run(job: _Job, output: Output) -> None:
     """Carry out ``view``."""
     from pimper_torch.result.viewer.show import add_folder
-    from pimper_torch.result.viewer.viewer import opened
+    from pimper_torch.result.viewer.viewer import Viewer
 
     # Ctrl-C ends the page and no work.
-    with opened(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
+    with Viewer(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
         tell_place(viewer, output, job.port)
         add_folder(viewer, job.out, job.photos)
         viewer.wait()

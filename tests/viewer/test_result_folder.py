@@ -33,7 +33,7 @@ def test_without_its_photographs_the_rest_is_shown_and_said(viewer, folder):
     with pytest.warns(PimperWarning, match="shows no photographs"):
         add_folder(viewer, folder)
     scene = viewer.server.scene
-    assert scene.get_handle_by_name("/surface") is not None
+    assert scene.get_handle_by_name("/surfaces/0: result") is not None
     assert scene.get_handle_by_name("/cameras/00002").image is None
 
 

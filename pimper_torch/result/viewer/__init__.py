@@ -1,1 +1,1 @@
-"""A surface with its cameras and photographs, to turn and to light in a browser."""
+"""A surface with its cameras and photographs, to turn in a browser."""

@@ -49,18 +49,6 @@ def open_server(host: str = HOST, port: int = PORT) -> "ViserServer":
     return server
 
 
-def close_server(server: "ViserServer") -> None:
-    """Close a server with all its connections."""
-    with redirect_stdout(StringIO()):
-        server.stop()
-
-
-def address(server: "ViserServer") -> str:
-    """Return the address that a browser opens."""
-    host = server.get_host()
-    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
-
-
 def _require_own(host: str) -> None:
     """Refuse an address that is not this machine's; viser would try it for ever."""
     try:

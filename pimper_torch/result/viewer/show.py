@@ -7,7 +7,7 @@ from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.method.chains.chain import Step
 from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.records import Mesh, Reconstruction, SparseScene
-from pimper_torch.result.viewer.server import HOST, PORT, open_server
+from pimper_torch.result.viewer.server import HOST, PORT
 from pimper_torch.result.viewer.viewer import Viewer
 from pimper_torch.runtime.errors import InputError, caution
 
@@ -39,24 +39,27 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
             viewer.add_cameras(names, estimate.cameras, points, place)
         viewer.add_pass(RESULT, estimate.mesh)
     else:
-        add_result(viewer, result)
+        add_found(viewer, result)
 
 
-def add_result(viewer: Viewer, result: Result) -> None:
-    """Show a result that was read."""
-    scene, names = result.scene, result.scene.views.names
-    reference = names.index(result.reference)
-    viewer.add_cameras(names, scene.cameras, scene.points_world, reference, scene.views)
-    viewer.add_pass(RESULT, result.mesh)
-
-
-def add_found(viewer: Viewer, found: SparseScene | Step, reference: int = 0) -> None:
-    """Show cameras, photographs and points, or the surface of a pass, as soon as it is there."""
-    if isinstance(found, Step):
-        viewer.add_pass(f"pass at {found.scale:g} of the photographs", found.surface.mesh)
-    else:
+def add_found(
+    viewer: Viewer, found: SparseScene | Step | Mesh | Result | Reconstruction, reference: int = 0
+) -> None:
+    """Show cameras, photographs and points, a surface, or a whole result."""
+    if isinstance(found, SparseScene):
         names = found.views.names
         viewer.add_cameras(names, found.cameras, found.points_world, reference, found.views)
+    elif isinstance(found, Step):
+        viewer.add_pass(f"pass at {found.scale:g} of the photographs", found.surface.mesh)
+    elif isinstance(found, Mesh):
+        viewer.add_pass("surface", found)
+    elif isinstance(found, Reconstruction):
+        add_found(viewer, found.scene, found.coarse.reference)
+        viewer.add_pass(COARSE, found.coarse.mesh)
+        viewer.add_pass(RESULT, found.mesh)
+    else:
+        add_found(viewer, found.scene, found.scene.views.names.index(found.reference))
+        viewer.add_pass(RESULT, found.mesh)
 
 
 def show(
@@ -75,24 +78,15 @@ def show(
         host: Address of this machine that the page is served at.
         port: The next free one is taken where another program has it; 0 takes any.
 
-    Returns:
-        With the server itself as ``server``.
-
     Raises:
         PimperError: viser is missing, no such host or port, or the folder holds no surface.
     """
-    viewer = Viewer(open_server(host, port))
+    viewer = Viewer(host, port)
     try:
-        if isinstance(result, Reconstruction):
-            add_found(viewer, result.scene, result.coarse.reference)
-            viewer.add_pass(COARSE, result.coarse.mesh)
-            viewer.add_pass(RESULT, result.mesh)
-        elif isinstance(result, Result):
-            add_result(viewer, result)
-        elif isinstance(result, Mesh):
-            viewer.add_pass("surface", result)
-        else:
+        if isinstance(result, Path | str):
             add_folder(viewer, result)
+        else:
+            add_found(viewer, result)
     except BaseException:
         viewer.stop()
         raise

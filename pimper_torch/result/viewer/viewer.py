@@ -1,35 +1,38 @@
 """The page: what is in the scene, and the controls beside it."""
 
 import math
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.report.predictions import shrunk
-from pimper_torch.result.viewer.frame import Frame, Stand, frame_of_cameras, frame_of_mesh, stand_of
-from pimper_torch.result.viewer.layers import LAYERS, painted
-from pimper_torch.result.viewer.server import HOST, PORT, address, close_server, open_server
+from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
+from pimper_torch.result.viewer.server import HOST, PORT, open_server
+from pimper_torch.result.viz.maps import base_color
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import each
-
-if TYPE_CHECKING:
-    from viser import ClientHandle, ViserServer
 
 NO_PHOTOGRAPH = "none"
 # Of frusta: photographs are a third of a unit wide where cameras are three away, and two dozen of
 # them on a ring stand 0.8 apart.
 _SCALE = 0.15
 _POINT_COLOR = (110, 140, 190)
-# Raking light from up on the left, and how much of it is round about; degrees.
-_AZIMUTH, _ELEVATION, _AMBIENT = -45.0, 40.0, 0.15
+# Towards a raking light up on the left of the reference camera, and the share of light that comes
+# from everywhere.
+_TO_LIGHT = (0.54, -0.54, 0.64)
+_AMBIENT = 0.15
 # Of light that falls straight on: three.js divides by pi what a matte surface reflects.
 _BRIGHTNESS = math.pi
 
@@ -41,30 +44,42 @@ class Viewer:
         server: viser's own, for whatever else is to be shown.
     """
 
-    def __init__(self, server: "ViserServer") -> None:
-        self.server = server
-        self._lock = threading.RLock()
-        self._frame: Frame | None = None
-        self._passes: list[tuple[str, Mesh]] = []
-        self._stands: dict[str, Stand] = {}
-        scene = server.scene
+    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+        self.server = open_server(host, port)
+        self._viewer_from_world: Float[Tensor, "4 4"] | None = None
+        self._surfaces: list[str] = []
+        self._cameras: dict[str, tuple[Float[Tensor, "4 4"], float]] = {}
+        scene, gui = self.server.scene, self.server.gui
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
-        server.gui.main_panel.dock_right()
-        self._sun = scene.add_light_directional("/light", intensity=_BRIGHTNESS)
-        self._sky = scene.add_light_ambient("/ambient", intensity=_BRIGHTNESS * _AMBIENT)
-        self._add_controls()
-        self._light()
+        direct = _BRIGHTNESS * (1 - _AMBIENT)
+        scene.add_light_directional("/light", intensity=direct, position=_TO_LIGHT)
+        scene.add_light_ambient("/ambient", intensity=_BRIGHTNESS * _AMBIENT)
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        self._about = gui.add_markdown("No surface yet.")
+        self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
+        # Without a client it is `choose` itself that sets it.
+        self._chosen.on_update(
+            lambda event: self.choose(self._chosen.value) if event.client else None
+        )
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     @property
     def address(self) -> str:
         """Address for a browser."""
-        return address(self.server)
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def stop(self) -> None:
-        """Close the server; the page stays as it was."""
-        close_server(self.server)
+        """Close the server with all its connections; the page stays as it was."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
 
     def wait(self) -> None:
         """Go on until Ctrl-C, which raises ``KeyboardInterrupt``."""
@@ -87,42 +102,38 @@ class Viewer:
         Args:
             names: Of the photographs, in the order of the cameras.
         """
-        frame = self._frame = frame_of_cameras(cameras, reference, points_world)
-        scene = self.server.scene
-        points = frame.points(points_world).float().numpy()
-        scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
-        self._points.disabled = False
-        scene.add_frame("/cameras", show_axes=False)
-        pictures = None if views is None else small_pictures(views)
-        for view, name in enumerate(names):
-            self._add_camera(view, name, cameras, None if pictures is None else pictures[view])
-        self._chosen.options = (NO_PHOTOGRAPH, *names)
-        _stand_at(self.server.initial_camera, self._stands[names[reference]])
-        self.choose(names[reference])
-
-    def _add_camera(
-        self, view: int, name: str, cameras: Cameras, picture: np.ndarray | None
-    ) -> None:
         from viser.transforms import SO3
 
-        assert self._frame is not None
-        stand = self._stands[name] = stand_of(cameras, view, self._frame)
-        width, height = cameras.sizes_px[view].tolist()
-        frustum = self.server.scene.add_camera_frustum(
-            f"/cameras/{view:05d}",
-            stand.fov,
-            width / height,
-            scale=_SCALE,
-            thickness=1.5,
-            thickness_units="screen",
-            image=picture,
-            wxyz=SO3.from_matrix(stand.rotation.numpy()).wxyz,
-            position=stand.position.numpy(),
-        )
-        frustum.on_click(lambda event: self.choose(name, event.client))
+        scene = self.server.scene
+        frame = self._viewer_from_world = frame_of_cameras(cameras, reference)
+        points = transform(frame, points_world.detach().cpu().double()).float().numpy()
+        scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
+        scene.add_frame("/cameras", show_axes=False)
+        pictures = [None] * len(names) if views is None else small_pictures(views)
+        poses = frame @ invert_rigid(cameras.cam_from_world.detach().cpu().double())
+        for view, (name, pose) in enumerate(zip(names, poses, strict=True)):
+            width, height = cameras.sizes_px[view].tolist()
+            fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1, 1]))
+            pose[:3, :3] = normalize(pose[:3, :3], dim=0)
+            self._cameras[name] = pose, fov
+            frustum = scene.add_camera_frustum(
+                f"/cameras/{view:05d}",
+                fov,
+                width / height,
+                scale=_SCALE,
+                thickness=1.5,
+                thickness_units="screen",
+                image=pictures[view],
+                wxyz=SO3.from_matrix(pose[:3, :3].numpy()).wxyz,
+                position=pose[:3, 3].numpy(),
+            )
+            frustum.on_click(lambda _, name=name: self.choose(name))
+        self._chosen.options = (NO_PHOTOGRAPH, *names)
+        _put(self.server.initial_camera, *self._cameras[names[reference]])
+        self.choose(names[reference])
 
     def add_pass(self, name: str, mesh: Mesh) -> None:
-        """Show a surface; the slider goes back to those before.
+        """Show a surface in place of those before, which the page's list of the scene brings back.
 
         Args:
             mesh: In the world of the cameras.
@@ -132,118 +143,52 @@ class Viewer:
                 f"the {name} has {len(mesh.vertices_world)} vertices and no faces; needed: a "
                 "surface, as a viewer of point clouds shows clouds."
             )
-        with self._lock:
-            if self._frame is None:
-                self._frame = frame_of_mesh(mesh)
-            if not self._passes:
-                self._points.value = False  # they lie on the surface
-            self._passes.append((name, mesh.detach().to("cpu")))
-            last = len(self._passes) - 1
-            self._pass.max, self._pass.visible = max(1, last), last > 0
-            if self._pass.value == last:
-                self._paint()
-            else:
-                self._pass.value = last  # paints
+        mesh, scene = mesh.detach().to("cpu"), self.server.scene
+        if self._viewer_from_world is None:
+            self._viewer_from_world = frame_of_mesh(mesh)
+        normals = mesh.normals_world
+        if normals is None:
+            normals = vertex_normals(mesh.vertices_world, mesh.faces)
+        attributes = {
+            "POSITION": transform(self._viewer_from_world, mesh.vertices_world.double()),
+            "NORMAL": normalize(rotate(self._viewer_from_world, normals.double()), dim=1),
+            "COLOR_0": base_color(mesh).expand(-1, 3).float(),
+        }
+        arrays = {key: values.numpy() for key, values in attributes.items()}
+        for before in ("/points", *self._surfaces):  # points lie on the surface
+            if node := scene.get_handle_by_name(before):
+                node.visible = False
+        self._surfaces.append(f"/surfaces/{len(self._surfaces)}: {name}")
+        scene.add_glb(self._surfaces[-1], gltf_of(arrays, mesh.faces.numpy(), MATTE))
+        self._about.content = f"**{name}**, {len(mesh.faces):,} faces."
 
-    def choose(self, name: str, client: "ClientHandle | None" = None) -> None:
-        """Stand where a photograph was taken.
+    def choose(self, name: str) -> None:
+        """Stand, on every open page, where a photograph was taken.
 
         Its own frustum is hidden meanwhile, as it is before the object.
 
         Args:
-            name: Of the photograph; :data:`NO_PHOTOGRAPH` stays where one is.
-            client: Page that stands there; all of them unless given.
+            name: Of the photograph; :data:`NO_PHOTOGRAPH` shows all frusta and moves no page.
         """
         self._chosen.value = name
-        for view, other in enumerate(self._stands):
+        for view, other in enumerate(self._cameras):
             self.server.scene.get_handle_by_name(f"/cameras/{view:05d}").visible = other != name
-        if name not in self._stands:
-            return
-        for one in self.server.get_clients().values() if client is None else (client,):
-            with one.atomic():
-                _stand_at(one.camera, self._stands[name])
-
-    def _add_controls(self) -> None:
-        gui, scene = self.server.gui, self.server.scene
-        self._layer = gui.add_dropdown("layer", tuple(LAYERS))
-        self._pass = gui.add_slider("pass", 0, 1, 1, 0, visible=False)
-        self._about = gui.add_markdown("No surface yet.")
-        self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
-        with gui.add_folder("light"):
-            self._azimuth = gui.add_slider("azimuth", -180.0, 180.0, 1.0, _AZIMUTH)
-            self._elevation = gui.add_slider("elevation", -90.0, 90.0, 1.0, _ELEVATION)
-            self._ambient = gui.add_slider("ambient", 0.0, 1.0, 0.01, _AMBIENT)
-        with gui.add_folder("show"):
-            self._surface = gui.add_checkbox("surface", True)
-            self._cameras = gui.add_checkbox("cameras", True)
-            self._points = gui.add_checkbox("points", True, disabled=True)
-        for control in (self._layer, self._pass):
-            control.on_update(lambda _: self._paint())
-        for slider in (self._azimuth, self._elevation, self._ambient):
-            slider.on_update(lambda _: self._light())
-        # Without a client it is `choose` itself that sets it.
-        self._chosen.on_update(
-            lambda event: self.choose(self._chosen.value, event.client) if event.client else None
-        )
-        for name in ("surface", "cameras", "points"):
-            box = getattr(self, f"_{name}")
-
-            def show(_: object, name: str = name, box: Any = box) -> None:  # noqa: ANN401 - viser's
-                node = scene.get_handle_by_name(f"/{name}")
-                if node is not None:
-                    node.visible = box.value
-
-            box.on_update(show)
-
-    def _paint(self) -> None:
-        """Colour the chosen surface by the chosen layer."""
-        with self._lock:
-            if not self._passes or self._frame is None:
-                return
-            name, mesh = self._passes[round(self._pass.value)]
-            wanted = self._layer.value
-            bare = mesh.albedo is None and wanted in ("lit", "albedo")
-            layer = painted(mesh, "shape" if bare else wanted, self._frame)
-            attributes = {
-                "POSITION": self._frame.points(mesh.vertices_world),
-                "NORMAL": self._frame.directions(layer.normals_world),
-                "COLOR_0": layer.colors,
-            }
-            data = gltf_of(
-                {key: values.numpy() for key, values in attributes.items()},
-                mesh.faces.numpy(),
-                MATTE if layer.lit else MATTE | {"extensions": {"KHR_materials_unlit": {}}},
-            )
-            self.server.scene.add_glb("/surface", data, visible=self._surface.value)
-            legend = "It has no albedo: grey clay." if bare else LAYERS[wanted]
-            self._about.content = f"**{name}**, {len(mesh.faces):,} faces. {legend}"
-
-    def _light(self) -> None:
-        """Move the light where the sliders are."""
-        azimuth, elevation = math.radians(self._azimuth.value), math.radians(self._elevation.value)
-        flat = math.cos(elevation)
-        direction = (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
-        self._sun.position = tuple(10 * one for one in direction)  # it shines on the origin
-        self._sun.intensity = _BRIGHTNESS * (1 - self._ambient.value)
-        self._sky.intensity = _BRIGHTNESS * self._ambient.value
+        for client in self.server.get_clients().values() if name in self._cameras else ():
+            with client.atomic():
+                _put(client.camera, *self._cameras[name])
 
 
-def _stand_at(camera: Any, stand: Stand) -> None:  # noqa: ANN401 - a page's, or of new pages
-    """Put the camera of a page where a photograph was taken."""
-    up = "up_direction" if hasattr(camera, "up_direction") else "up"
-    camera.fov, camera.position = stand.fov, stand.position.numpy()
-    camera.look_at = stand.ahead.numpy()
-    setattr(camera, up, stand.up.numpy())
+def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: ANN401 - viser's
+    """Put the camera of a page, or of new pages, where a photograph was taken.
 
-
-@contextmanager
-def opened(host: str = HOST, port: int = PORT) -> Iterator[Viewer]:
-    """Have an empty page in the ``with`` block, see :func:`open_server`."""
-    viewer = Viewer(open_server(host, port))
-    try:
-        yield viewer
-    finally:
-        viewer.stop()
+    It turns about a point as far away as the middle of the scene. Up stays that of the viewer, but
+    for the roll of the picture.
+    """
+    right, position = pose[:3, 0], pose[:3, 3]
+    up = torch.tensor([0.0, 0.0, 1.0]).to(right) - right[2] * right
+    camera.fov, camera.position = fov, position.numpy()
+    camera.look_at = (position + position.norm() * pose[:3, 2]).numpy()
+    setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", up.numpy())
 
 
 def small_pictures(views: Views) -> list[np.ndarray]:
