@@ -1,35 +1,32 @@
 import pytest
 import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 
 
-@pytest.mark.parametrize("factor", [1.0, -1.0, 3e-4, -250.0])
-def test_cameras_are_found_from_their_projections_whatever_the_factor(factor):
-    cameras = arc_cameras(3, width=64, height=48, focal_px=90.0, distance=700.0)
-    K = cameras.intrinsics.clone()
-    K[:, 0, 1], K[:, 1, 1] = 0.3, 91.0  # skew and unlike focal lengths survive
-    projections = factor * K @ cameras.cam_from_world[:, :3]
-    found, pose = decompose_projections(projections)
-    assert_close(found, K)
-    assert_close(pose, cameras.cam_from_world)
-
-
-def test_a_rotation_that_is_none_goes_into_the_intrinsics_and_projects_the_same():
-    cameras = arc_cameras(2, width=64, height=48, focal_px=90.0, distance=7.0)
-    stretch = torch.diag(torch.tensor([1.0035, 1.0, 1.0], dtype=torch.float64))
-    projections = cameras.intrinsics @ stretch @ cameras.cam_from_world[:, :3]
-    K, pose = decompose_projections(projections)
+@settings(deadline=None)
+@given(st.integers(0, 2**31))
+def test_a_projection_is_split_into_a_camera_that_projects_the_same(seed):
+    """Which is unique: so it is the camera that a projection was made of, whatever the factor."""
+    generator = torch.Generator().manual_seed(seed)
+    P = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
+    P = P * torch.tensor([1.0, -250.0, 3e-4]).double()[:, None, None]
+    assume(torch.linalg.cond(P[:, :, :3]).max() < 1e3)
+    K, pose = decompose_projections(P)
+    assert torch.equal(K, K.triu())
+    assert (K.diagonal(dim1=1, dim2=2) > 0).all()
+    assert (K[:, 2, 2] == 1).all()
     rotation = pose[:, :3, :3]
-    assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
-    assert_close(torch.linalg.det(rotation), torch.ones(2, dtype=torch.float64))
+    assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(3, 3, 3))
+    assert_close(torch.linalg.det(rotation), torch.ones(3).double())
     again = K @ pose[:, :3]
-    assert_close(again / again[:, 2:, 3:], projections / projections[:, 2:, 3:])
+    assert_close(again / again[:, 2:, 3:], P / P[:, 2:, 3:], rtol=1e-8, atol=1e-8)
 
 
 def test_a_projection_of_no_camera_is_an_error():
-    flat = torch.ones(1, 3, 4, dtype=torch.float64)
-    with pytest.raises(ValueError, match="no inverse"):
-        decompose_projections(flat)
+    P = torch.stack([torch.eye(3, 4), torch.ones(3, 4)]).double()
+    with pytest.raises(ValueError, match="number 1 has no inverse"):
+        decompose_projections(P)

@@ -2,16 +2,18 @@
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.method.sfm import colmap
 from pimper_torch.method.sfm.existing import existing_ways
 from pimper_torch.method.sfm.model import SparseModel
@@ -19,7 +21,7 @@ from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
-WIDTH, HEIGHT, FOCAL = 64, 48, 90.0
+WIDTH, HEIGHT = 64, 48
 NAMES = ("10.png", "2.png", "a b.png")
 
 
@@ -27,12 +29,23 @@ def existing_model(views: Views, path: Path) -> SparseModel:
     return existing_ways(views, path).plain[0]
 
 
+def rig_of(seed: int) -> Cameras:
+    """Three cameras with one lens, anywhere and looking anywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, 3, generator=generator).double())
+    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
+    fx, fy, cx, cy = (0.5 + torch.rand(4, generator=generator).double()).tolist()
+    K = torch.tensor([[90 * fx, 0, 32 * cx], [0, 90 * fy, 24 * cy], [0, 0, 1]])
+    return Cameras(
+        intrinsics=K.double().expand(3, 3, 3),
+        cam_from_world=rigid(rotation, 5 * torch.randn(3, 3, generator=generator).double()),
+        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * 3),
+    )
+
+
 @pytest.fixture
 def rig() -> Cameras:
-    cameras = arc_cameras(3, width=WIDTH, height=HEIGHT, focal_px=FOCAL, distance=5.0)
-    intrinsics = cameras.intrinsics.clone()
-    intrinsics[:, :2, 2] += torch.tensor([1.5, -2.25], dtype=torch.float64)
-    return cameras.replace(intrinsics=intrinsics)
+    return rig_of(7)
 
 
 def views_of(scale: float = 1.0, folder: Path | None = None) -> Views:
@@ -93,10 +106,11 @@ def of_metashape(rig: Cameras, folder: Path) -> Path:
         )
     )
     path = folder / "cameras.xml"
+    f, b1 = float(K[1, 1]), float(K[0, 0] - K[1, 1])
     path.write_text(
         '<document version="2.0.0"><chunk label="1"><sensors><sensor id="0" type="frame">'
         f'<resolution width="{WIDTH}" height="{HEIGHT}"/><calibration class="adjusted">'
-        f"<f>{float(K[0, 0])}</f><cx>{float(K[0, 2]) - WIDTH / 2}</cx>"
+        f"<f>{f}</f><b1>{b1}</b1><cx>{float(K[0, 2]) - WIDTH / 2}</cx>"
         f"<cy>{float(K[1, 2]) - HEIGHT / 2}</cy></calibration></sensor></sensors>"
         f"<cameras>{cameras}</cameras></chunk></document>"
     )
@@ -112,7 +126,7 @@ def of_meshroom(rig: Cameras, folder: Path) -> Path:
         "height": str(HEIGHT),
         "sensorWidth": "36",
         "focalLength": str(float(K[0, 0]) * 36 / WIDTH),
-        "pixelRatio": "1",
+        "pixelRatio": str(float(K[1, 1] / K[0, 0])),
         "type": "pinhole",
         "principalPoint": center,
         "distortionParams": "",
@@ -154,8 +168,7 @@ def of_idr(rig: Cameras, folder: Path) -> Path:
 
 
 def of_matrices(rig: Cameras, folder: Path) -> Path:
-    pose = rig.cam_from_world
-    return saved(folder, K=rig.intrinsics[0], R=pose[:, :3, :3], t=pose[:, :3, 3])
+    return saved(folder, K=rig.intrinsics[0], cam_from_world=rig.cam_from_world[:, :3])
 
 
 def of_named_poses(rig: Cameras, folder: Path) -> Path:
@@ -186,9 +199,13 @@ WAYS = [
 ]
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**31))
 @pytest.mark.parametrize("write", WAYS)
-def test_every_file_gives_the_same_cameras(rig, write, tmp_path):
-    found = existing_model(views_of(), write(rig, tmp_path))
+def test_every_file_gives_the_cameras_that_were_written(write, seed):
+    rig = rig_of(seed)
+    with TemporaryDirectory() as folder:
+        found = existing_model(views_of(), write(rig, Path(folder)))
     assert found.names == NAMES
     order = torch.tensor(np.argsort(NAMES) if write in (of_matrices, of_projections) else range(3))
     # Arrays without names go by the order of the names: those of the rig were written in another.
@@ -208,15 +225,11 @@ def test_of_several_models_in_a_folder_the_largest_is_read(rig, text, tmp_path):
         found = existing_model(views_of(), tmp_path)
     assert found.names == NAMES
     assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
-    assert existing_model(views_of(), tmp_path / "1").names == NAMES  # it alone: no warning
-
-
-def test_a_folder_of_one_model_is_read_without_a_word(rig, tmp_path):
-    of_colmap(rig, tmp_path / "sparse")
-    assert existing_model(views_of(), tmp_path / "sparse").names == NAMES
-    of_colmap(rig.take(torch.tensor([0])), tmp_path, names=("2.png",)).rename(tmp_path / "old")
-    (tmp_path / "old").rename(tmp_path / "sparse" / "model" / "old")  # beside the model itself
-    assert existing_model(views_of(), tmp_path / "sparse" / "model").names == NAMES
+    # One alone is read without a word: in its folder, beside others in it, and around it.
+    (tmp_path / "0").rename(tmp_path / "1" / "old")
+    assert existing_model(views_of(), tmp_path / "1").names == NAMES
+    (tmp_path / "10").rename(tmp_path / "1" / "older")
+    assert existing_model(views_of(), tmp_path).names == NAMES
 
 
 @pytest.mark.parametrize("write", [of_colmap, of_metashape, of_meshroom, of_transforms])
@@ -272,10 +285,10 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
         ({}, "no arrays"),
         ({"P": np.zeros((3, 3, 4))}, "no inverse"),
         ({"P": np.zeros((3, 4, 3))}, "3x4 numbers a camera as P"),
-        ({"K": np.eye(3), "R": np.zeros((3, 3, 3)), "t": np.zeros((3, 3))}, "a rotation in"),
-        ({"K": -np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((3, 3))}, "as K 0"),
-        ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((2, 3))}, "as many R as t"),
-        ({"K": np.eye(3), "R": [np.eye(3)] * 2, "t": np.zeros((2, 3))}, "3 photographs.*2 cameras"),
+        ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((3, 3))}, "side by side.*K, R, t"),
+        ({"K": np.eye(3), "cam_from_world": np.zeros((3, 3, 4))}, "a rotation in"),
+        ({"K": -np.eye(3), "cam_from_world": [np.eye(4)] * 3}, "as K 0"),
+        ({"K": np.eye(3), "cam_from_world": [np.eye(4)] * 2}, "3 photographs.*2 cameras"),
         ({"K": np.eye(3), "cam_from_world": np.full((3, 3, 4), np.nan)}, "finite numbers"),
         ({"world_mat_0": np.eye(4), "world_mat_1": np.eye(4)}, "3 photographs.*2 cameras"),
     ],

@@ -377,7 +377,7 @@ def _camera_files(root: Path) -> list[Seed]:
     _, views = _model()
     cameras = arc_cameras(len(views.names), width=24, height=18, focal_px=30.0, distance=5.0)
     K, poses = cameras.intrinsics.numpy(), cameras.cam_from_world.numpy()
-    np.savez(root / "turned.npz", K=K, R=poses[:, :3, :3], t=poses[:, :3, 3])
+    np.savez(root / "turned.npz", K=K, cam_from_world=poses)
     np.savez_compressed(root / "projections.npz", P=K @ poses[:, :3])
     return [
         Seed(

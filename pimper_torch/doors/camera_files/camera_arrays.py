@@ -38,8 +38,8 @@ def read_camera_arrays(
     our conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x
     right, y down, z forward):
 
-    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world`` (3x4 or 4x4 each) or
-      with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
+    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world``, ``[R | t]`` (3x4 or
+      4x4 each);
     - or ``projections`` or ``P``, 3x4 each, ``K [R | t]`` up to a factor.
 
     They belong to ``names``, if that array is there, or else to the photographs in plain order of
@@ -77,7 +77,7 @@ def _world_mats(arrays: Arrays, count: int, file: DataSetPath) -> Rig:
     names = [f"world_mat_{index}" for index in range(count)]
     file.expect(set(names) <= set(arrays), f"world_mat_0 to {names[-1]}", "other numbers")
     matrices = [file.numbers(arrays[name], 16, name).reshape(4, 4)[:3] for name in names]
-    intrinsics, poses = _decomposed(matrices, "world_mat_", file)
+    intrinsics, poses = _decomposed(torch.stack(matrices), file)
     intrinsics[:, :2, 2] = pixels_from_indices(intrinsics[:, :2, 2])
     return intrinsics, poses
 
@@ -85,18 +85,13 @@ def _world_mats(arrays: Arrays, count: int, file: DataSetPath) -> Rig:
 def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
     projections = _array(arrays, ("projections", "P"), ((3, 4),), file)
     if projections is not None:
-        return _decomposed(list(projections), "projection ", file)
+        return _decomposed(projections, file)
     intrinsics = _array(arrays, ("intrinsics", "K"), ((3, 3),), file)
     matrices = _array(arrays, ("cam_from_world",), ((3, 4), (4, 4)), file)
-    rotations = _array(arrays, ("R",), ((3, 3),), file)
-    shifts = _array(arrays, ("t",), ((3,), (3, 1)), file)
-    if matrices is None and rotations is not None and shifts is not None:
-        file.expect(len(rotations) == len(shifts), "as many R as t", f"{len(shifts)} t")
-        matrices = torch.cat([rotations, shifts.reshape(-1, 3, 1)], dim=2)
     if intrinsics is None or matrices is None or not len(matrices):
         file.refuse(
-            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, or with R and t; or "
-            "projections (P)",
+            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, R and t side by side "
+            "(3x4); or projections (P)",
             some(sorted(arrays)) or "no arrays",
         )
     several = len(intrinsics) in (1, len(matrices))
@@ -128,10 +123,8 @@ def _array(
     return torch.from_numpy(found.astype(np.float64))
 
 
-def _decomposed(matrices: Sequence[Float[Tensor, "3 4"]], what: str, file: DataSetPath) -> Rig:
-    for index, matrix in enumerate(matrices):
-        try:
-            decompose_projections(matrix[None])
-        except ValueError as error:
-            file.refuse(f"K [R t] in {what}{index}", str(error))
-    return decompose_projections(torch.stack(list(matrices)))
+def _decomposed(projections: Float[Tensor, "view 3 4"], file: DataSetPath) -> Rig:
+    try:
+        return decompose_projections(projections)
+    except ValueError as error:
+        file.refuse("K [R t] as each projection", str(error))

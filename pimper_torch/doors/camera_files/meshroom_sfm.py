@@ -8,7 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.doors.camera_files.posed_camera import (
+    PosedCamera,
+    polynomial_lens,
+    rigid_or_refuse,
+)
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
@@ -128,7 +132,7 @@ def _distortion(entry: Mapping[str, object], file: DataSetPath) -> tuple[str, tu
     )
     if name == "fisheye4":
         return "OPENCV_FISHEYE", tuple(values)
-    k1, k2, k3, t1, t2 = (*values, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    if name in _NONE or not any(values):
+    if name in _NONE:
         return "PINHOLE", ()
-    return "FULL_OPENCV", (k1, k2, t1, t2, k3, 0.0, 0.0, 0.0)
+    k1, k2, k3, t1, t2 = (*values, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    return polynomial_lens(k1, k2, t1, t2, k3)

@@ -9,7 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.doors.camera_files.posed_camera import (
+    PosedCamera,
+    polynomial_lens,
+    rigid_or_refuse,
+)
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import InputError, caution, some
@@ -168,15 +172,11 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
     pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
     kind = calibration.get("type") or sensor.get("type") or "frame"
-    model, params = "PINHOLE", tuple[float, ...]()
+    model, params = polynomial_lens(k1, k2, p2, p1, k3)
+    readable = kind == "frame" and not any((k4, p3, p4)) and not (b2 and params)
     if kind == "fisheye":
         model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
         readable = not any((p1, p2, p3, p4, b2))
-    else:
-        distorted = any((k1, k2, k3, p1, p2))
-        readable = kind == "frame" and not any((k4, p3, p4)) and not (b2 and distorted)
-        if distorted:
-            model, params = "FULL_OPENCV", (k1, k2, p2, p1, k3, 0.0, 0.0, 0.0)
     file.expect(
         readable,
         f"a frame camera with k1, k2, k3, p1, p2, b1, or a fisheye with k1 to k4 and b1, for the "

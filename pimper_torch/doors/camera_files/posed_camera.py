@@ -49,6 +49,17 @@ def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> 
     return Lens(camera=1, model="PINHOLE", params=params, width=size_px[0], height=size_px[1])
 
 
+def polynomial_lens(
+    k1: float, k2: float, p1: float, p2: float, k3: float
+) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's model of a lens with OpenCV's distortion, and its parameters behind ``K``'s.
+
+    Without any distortion it is a pinhole.
+    """
+    params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
+
+
 def rigid_or_refuse(
     rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
@@ -82,13 +93,13 @@ def decompose_projections(
     Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
     """
     intrinsics, poses = [], []
-    for matrix in projections.detach().cpu().double().numpy():
+    for index, matrix in enumerate(projections.detach().cpu().double().numpy()):
         left = matrix[:, :3]
         determinant = float(np.linalg.det(left))
         size = float(np.linalg.norm(left))
         # Rows of K [R | t] differ by the focal length in pixels, cubes of it at most.
         if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
-            raise ValueError("the left 3x3 block has no inverse")
+            raise ValueError(f"the left 3x3 block of number {index} has no inverse")
         proper = matrix if determinant > 0 else -matrix
         K, R = scipy.linalg.rq(proper[:, :3])
         signs = np.where(np.diag(K) < 0, -1.0, 1.0)

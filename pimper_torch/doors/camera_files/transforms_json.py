@@ -11,6 +11,7 @@ from pimper_torch.doors.camera_files.posed_camera import (
     PosedCamera,
     SizesOf,
     number_lenses,
+    polynomial_lens,
     rigid_or_refuse,
 )
 from pimper_torch.ground.geometry.rigid import invert_rigid
@@ -117,12 +118,9 @@ def _lens(
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(frame.get("camera_model") or "OPENCV")
-    kind, params = "PINHOLE", tuple[float, ...]()
-    if model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True:
-        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    else:
-        file.expect(model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
-        file.expect(k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
-        if any((k1, k2, k3, p1, p2)):
-            kind, params = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    fisheye = model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True
+    file.expect(fisheye or model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
+    file.expect(fisheye or k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
+    bent = ("OPENCV_FISHEYE", (k1, k2, k3, k4)) if fisheye else polynomial_lens(k1, k2, p1, p2, k3)
+    kind, params = bent
     return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
