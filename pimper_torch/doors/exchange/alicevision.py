@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pimper_torch.doors.exchange.map_files import colours, with_axes
 from pimper_torch.doors.exchange.openexr import write_exr
-from pimper_torch.doors.exchange.picture_files import file_names, write_mask, write_picture
+from pimper_torch.doors.exchange.picture_files import write_pictures
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.doors.io.reports import write_json
 from pimper_torch.ground.geometry.pixels import indices_from_pixels
@@ -26,23 +26,24 @@ def write_alicevision(result: Result, folder: Path) -> None:
     Normals are EXR in OpenGL's camera axes (x right, y up, z to the viewer), as Open-RNb turns
     them to the world; albedo is EXR, linear, scaled into [0, 1]. Photographs are undistorted.
     """
-    views, cameras = result.masked_views, result.cameras
-    files, scale = file_names(views.names), albedo_scale(result.mesh)
+    views, cameras, scale = result.masked_views, result.cameras, albedo_scale(result.mesh)
+    files = write_pictures(views.replace(masks=result.silhouettes.masks), folder)
     maps_of = [f"{Path(file).stem}.exr" for file in files]
     for kind in ("normals", "albedos"):
         (folder / kind).mkdir(parents=True)
-    for view, (file, map_file) in enumerate(zip(files, maps_of, strict=True)):
-        write_picture(views, view, folder / "images" / file)
-        write_mask(views, view, folder / "masks" / file)
+    for view, file in enumerate(maps_of):
         maps = view_maps(result.mesh, result.scene.cameras, view)
         normals = with_axes(maps.normals_cam, "opengl")
-        write_exr(normals, folder / "normals" / map_file, "x right, y up, z to the viewer")
+        write_exr(normals, folder / "normals" / file, "x right, y up, z to the viewer")
         albedo = colours((scale * maps.albedo).clamp(0, 1))
-        write_exr(albedo, folder / "albedos" / map_file, "linear, sRGB primaries")
-    write_sfm(cameras, [f"images/{file}" for file in files], folder / "cameras.sfm")
-    write_sfm(cameras, [f"normals/{file}" for file in maps_of], folder / "normalMaps.sfm")
-    write_sfm(cameras, [f"albedos/{file}" for file in maps_of], folder / "albedoMaps.sfm")
-    write_sfm(cameras, [f"masks/{file}" for file in files], folder / "masks.sfm")
+        write_exr(albedo, folder / "albedos" / file, "linear, sRGB primaries")
+    for name, kind, paths in (
+        ("cameras", "images", files),
+        ("normalMaps", "normals", maps_of),
+        ("albedoMaps", "albedos", maps_of),
+        ("masks", "masks", files),
+    ):
+        write_sfm(cameras, [f"{kind}/{file}" for file in paths], folder / f"{name}.sfm")
 
 
 def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
@@ -55,42 +56,24 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
         cameras: Float64; a skew is left out.
         paths: Of the pictures, one a camera, from the file's folder on.
     """
-    sizes = cameras.sizes_px.tolist()
-    whole = {
-        "version": _VERSION,
-        "views": [
+    views, intrinsics, poses = [], [], []
+    sizes, centers = cameras.sizes_px.tolist(), cameras.centers_world
+    for index, (path, (width, height)) in enumerate(zip(paths, sizes, strict=True)):
+        key, turn = str(index + 1), cameras.cam_from_world[index, :3, :3]
+        views.append(
             {
-                "viewId": str(index),
-                "poseId": str(index),
-                "frameId": str(index),
-                "intrinsicId": str(index),
+                **dict.fromkeys(("viewId", "poseId", "frameId", "intrinsicId"), key),
                 "path": path,
                 "width": str(width),
                 "height": str(height),
                 "metadata": "",
             }
-            for index, (path, (width, height)) in enumerate(zip(paths, sizes, strict=True), start=1)
-        ],
-        "intrinsics": [
-            _intrinsic(str(index), K, width, height)
-            for index, (K, (width, height)) in enumerate(
-                zip(cameras.intrinsics, sizes, strict=True), start=1
-            )
-        ],
-        "poses": [
-            {
-                "poseId": str(index),
-                "pose": {
-                    # Column by column.
-                    "transform": {"rotation": _texts(turn.T.flatten()), "center": _texts(center)},
-                    "locked": "1",
-                },
-            }
-            for index, (turn, center) in enumerate(
-                zip(cameras.cam_from_world[:, :3, :3], cameras.centers_world, strict=True), start=1
-            )
-        ],
-    }
+        )
+        intrinsics.append(_intrinsic(key, cameras.intrinsics[index], width, height))
+        # Column by column.
+        transform = {"rotation": _texts(turn.T.flatten()), "center": _texts(centers[index])}
+        poses.append({"poseId": key, "pose": {"transform": transform, "locked": "1"}})
+    whole = {"version": _VERSION, "views": views, "intrinsics": intrinsics, "poses": poses}
     write_json(whole, file, indent=4)
 
 

@@ -8,12 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.doors.exchange.picture_files import (
-    file_names,
-    refuse_skew,
-    write_mask,
-    write_picture,
-)
+from pimper_torch.doors.exchange.picture_files import refuse_skew, write_pictures
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses, undistort_pixels
 from pimper_torch.ground.geometry.pixels import homogeneous
@@ -47,7 +42,7 @@ def write_colmap(
     """
     folder = Path(folder)
     refuse_skew(cameras, views.names, "a COLMAP model")
-    files = _write_pictures(views, folder)
+    files = write_pictures(views, folder, ".png")
     points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
     nothing = torch.zeros(0, dtype=torch.long)
     model = SparseModel(
@@ -66,15 +61,21 @@ def write_colmap(
 def write_workspace(result: Result, folder: Path) -> None:
     """Write what COLMAP's undistorter and dense stereo would: the surface as depths and normals.
 
+    The undistorter itself is not run: it would resample the photographs once more.
+
     ``images/`` and ``masks/`` are as in :func:`write_colmap`, ``sparse/`` is the model with its
     tracks. Depths are along the camera's z, normals in its frame (x right, y down, z forward),
     both 0 where a view does not see the surface: ``stereo_fusion`` and the meshers run on them.
     """
     scene = result.scene
-    files = _write_pictures(result.masked_views, folder)
+    files = write_pictures(result.masked_views, folder, ".png")
     write_pinholes(scene, result.cameras, files, folder / "sparse")
     stereo = folder / "stereo"
-    write_stereo_folder(files, stereo)
+    for kind in _KINDS:
+        (stereo / kind).mkdir(parents=True)
+    pairs = "".join(f"{name}\n__auto__, 20\n" for name in files)
+    (stereo / "patch-match.cfg").write_text(pairs, encoding="utf-8")
+    (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in files), encoding="utf-8")
     for view, file in enumerate(files):
         maps = view_maps(result.mesh, scene.cameras, view)
         depths = maps.depth.nan_to_num(0)[..., None]
@@ -106,28 +107,6 @@ def write_pinholes(
     )
     tied = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
     write_binary(select_views(model, range(model.num_views)), point_colors(scene)[tied], folder)
-
-
-def write_stereo_folder(names: Sequence[str], folder: Path) -> None:
-    """Write what COLMAP's undistorter would: which views to compare and to fuse, and folders.
-
-    The photographs have no lenses any more, so the undistorter itself is not run: it would
-    resample them once more.
-    """
-    for kind in _KINDS:
-        (folder / kind).mkdir(parents=True)
-    pairs = "".join(f"{name}\n__auto__, 20\n" for name in names)
-    (folder / "patch-match.cfg").write_text(pairs, encoding="utf-8")
-    (folder / "fusion.cfg").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-
-
-def _write_pictures(views: Views, folder: Path) -> tuple[str, ...]:
-    files = file_names(views.names)
-    for index, file in enumerate(files):
-        write_picture(views, index, folder / "images" / file)
-        if views.masks is not None:
-            write_mask(views, index, folder / "masks" / f"{file}.png")
-    return files
 
 
 def _write_array(values: Float[Tensor, "height width channel"], path: Path) -> None:

@@ -7,12 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.transforms_json import FLIP
-from pimper_torch.doors.exchange.picture_files import (
-    file_names,
-    refuse_skew,
-    write_mask,
-    write_picture,
-)
+from pimper_torch.doors.exchange.picture_files import refuse_skew, write_pictures
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.reports import write_json
@@ -41,15 +36,13 @@ def write_transforms(
     """
     folder = Path(folder)
     refuse_skew(cameras, views.names, "transforms.json")
-    files = file_names(views.names)
+    files = write_pictures(views, folder)
     world_from_cam = invert_rigid(cameras.cam_from_world.detach().cpu().double()).clone()
     world_from_cam[:, :3, :3] *= FLIP
     lenses, frames = [], []
     for index, file in enumerate(files):
-        write_picture(views, index, folder / "images" / file)
         frame: dict[str, object] = {"file_path": f"images/{file}"}
         if views.masks is not None:
-            write_mask(views, index, folder / "masks" / file)
             frame["mask_path"] = f"masks/{file}"
         frame["transform_matrix"] = world_from_cam[index].tolist()
         frames.append(frame)

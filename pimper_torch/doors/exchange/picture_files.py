@@ -36,6 +36,23 @@ def write_mask(views: Views, index: int, path: Path) -> None:
     Image.fromarray(np.ascontiguousarray(array)).save(path)
 
 
+def write_pictures(views: Views, folder: Path, mask_suffix: str = "") -> tuple[str, ...]:
+    """Write photographs in ``images/``, and in ``masks/`` the masks of the same names if any.
+
+    Args:
+        mask_suffix: Behind the names of the masks.
+
+    Returns:
+        The names of the photographs, see :func:`file_names`.
+    """
+    files = file_names(views.names)
+    for index, file in enumerate(files):
+        write_picture(views, index, folder / "images" / file)
+        if views.masks is not None:
+            write_mask(views, index, folder / "masks" / f"{file}{mask_suffix}")
+    return files
+
+
 def file_names(names: Sequence[str]) -> tuple[str, ...]:
     """Name a PNG file for each photograph: no folders, no two the same.
 
