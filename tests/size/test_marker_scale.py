@@ -169,25 +169,6 @@ def test_overexposed_paper_makes_no_marker_smaller(sheet):
     assert scale_of_markers(everywhere) is None
 
 
-def partly_smaller(sheet, rows_mm):
-    """Print the sheet's upper part at three quarters."""
-    high, wide = sheet.shape
-    small = torch.ones_like(sheet)
-    part = shrunk(sheet[None], 3 * wide // 4, 3 * high // 4)[0]
-    small[: len(part), : part.shape[1]] = part
-    cut = 6 * rows_mm
-    return torch.cat([small[: 3 * cut // 4], torch.ones(cut - 3 * cut // 4, wide), sheet[cut:]])
-
-
-def test_a_marker_of_another_size_than_most_does_not_count(sheet):
-    cameras = cameras_of(4)
-    scene = scene_of(photographed(partly_smaller(sheet, 46), cameras), cameras)
-    assert len(find_markers(scene)) > 12
-    scale = scale_of_markers(scene)
-    assert scale.factor * MM == pytest.approx(1, rel=2e-3)
-    assert scale.count == 12
-
-
 def square(code, side):
     corners = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     return Marker(code=code, corners_world=side * corners, num_views=3)
