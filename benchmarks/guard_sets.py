@@ -35,16 +35,6 @@ class Set:
     masks: bool = False
 
 
-def zoomed(folder: Path) -> list[str]:
-    """Enlarge the middle of every second photograph, without EXIF."""
-    for path in sorted((folder / "photos").iterdir())[::2]:
-        picture = Image.open(path)
-        width, height = picture.size
-        part = picture.crop((width // 6, height // 6, width - width // 6, height - height // 6))
-        part.resize(picture.size, Image.Resampling.LANCZOS).save(path)
-    return []
-
-
 def stamped(folder: Path) -> list[str]:
     """Write a date into the corner of every photograph."""
     for path in sorted((folder / "photos").iterdir()):
@@ -101,9 +91,8 @@ SETS = {
     "skull": Set("skull", 24, 900),
     "turned-over": Set("mug", 20, 480, TURNED, ("sfm.moved_object",)),
     "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
-    "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.shifted_room",)),
+    "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.moved_object",)),
     "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),
-    "zoomed": Set("potatoes", 16, 480, PATTERN, ("sfm.one_lens",), zoomed),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
     "inverted": Set("mug", 16, 480, PATTERN, ("remesh.outside",), inverted, masks=True),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),

@@ -62,12 +62,10 @@ def everything(like: int) -> Callable[..., Tensor]:
 
 # What stands in for each guard that can be switched off, and settings that switch it off.
 PATCHES: dict[str, dict[str, object]] = {
-    "sfm.room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
-    "sfm.shifted_room": {"sfm.registration._leave_out_room": lambda *_: (None, {})},
+    "sfm.room": {"sfm.static_background.StaticBackground.room": False},
     "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: ()},
     "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
     "sfm.misplaced": {"sfm.doubt._MIN_AGREEMENT": 0.0},
-    "sfm.one_lens": {"sfm.reconstruct.doubt_one_lens": lambda _: ""},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
     "silhouettes.shadows": {"silhouettes.reliability._without_shadows": lambda cuts: cuts},

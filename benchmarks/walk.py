@@ -45,7 +45,6 @@ PARTS = (
     (registration, "leave_out_room", "others"),
     (registration, "tie_series", "others"),
     (reconstruct, "refine_tracks", "tracks"),
-    (reconstruct, "doubt_one_lens", "doubts"),
 )
 COLUMNS = (*dict.fromkeys(part for _, _, part in PARTS), "rest", "all", "growth")
 FIGURES = ("views", "points", "centres %", "rotation °", "focal %", "peak MB")

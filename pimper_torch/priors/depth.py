@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.sfm.conventions.choice import surely_better
 from pimper_torch.priors.at_points import AtPoints, at_points, means_by
+from pimper_torch.priors.choice import surely_better
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.runtime.errors import InputError, caution, some
 

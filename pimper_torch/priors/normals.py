@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.contours import RayConfig, contour_rays
-from pimper_torch.method.sfm.conventions.choice import surely_better
 from pimper_torch.priors.at_points import at_points, means_by, places
+from pimper_torch.priors.choice import surely_better
 from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
 from pimper_torch.runtime.errors import InputError, caution, some

@@ -17,16 +17,13 @@ from pimper_torch.runtime.journal import Journal, current, writing
 
 GUARDS: dict[str, tuple[What, str]] = {
     "sfm.room": ("features", "at rest while others move"),
-    "sfm.shifted_room": ("features", "shift together while others move"),
     "sfm.moved_object": ("matches", "of the surroundings, between series"),
     "sfm.weak_views": ("photographs", "see too few points"),
     "sfm.misplaced": ("doubt", "their strongest pairs contradict the model"),
     "sfm.small_series": ("photographs", "of a series of few"),
     "sfm.tracks": ("points", "reproject far off"),
-    "sfm.one_lens": ("doubt", "a lens for each photograph fits better"),
     "sfm.missing": ("photographs", "not registered"),
     "sfm.doubt": ("doubt", "points tell no depth"),
-    "sfm.broken_points": ("points", "broken in the given model"),
     "sfm.sound_points": ("points", "not finite"),
     "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),
     "silhouettes.doubt": ("doubt", "silhouettes agree too little"),

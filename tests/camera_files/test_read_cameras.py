@@ -17,7 +17,7 @@ from pimper_torch.doors.exchange.nerfstudio import write_transforms
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.method.sfm import colmap
-from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Views
@@ -25,10 +25,6 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 WIDTH, HEIGHT = 64, 48
 NAMES = ("10.png", "2.png", "a b.png")
-
-
-def existing_model(views: Views, path: Path) -> SparseModel:
-    return existing_ways(views, path).plain[0]
 
 
 def rig_of(seed: int) -> Cameras:

@@ -51,7 +51,7 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.colmap import read_model, reconstruction_of, write_binary
-from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
@@ -232,7 +232,7 @@ def _models(root: Path) -> list[Seed]:
         files = tuple(sorted(path.name for path in (root / kind).iterdir()))
         seeds += [
             Seed(f"model {kind}", root / kind, files, read_model),
-            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_ways(views, at)),
+            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_model(views, at)),
         ]
     return seeds
 

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from pimper_bench.scenes.scene_cameras import FRONT, UP, arc_cameras
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.camera_in_place import mapped
 from pimper_torch.method.sfm.static_background import StaticBackground, find_static_background
 from pimper_torch.records import Cameras
 
@@ -91,48 +90,19 @@ def turntable(
     elevation_deg: float = 25.0,
     count: int = 12,
     span_deg: float = 330.0,
-    shift_px: float = 0.0,
-    table: int = 0,
-    moved: float = 0.0,
 ) -> Captured:
     """Turn a ball before a room at rest; things from ``turning`` on are the room's.
 
     Args:
         generator: Of everything.
-        turning: Points of the ball, then of its table.
+        turning: Points of the ball.
         resting: Points of the room.
         elevation_deg: Of the camera.
         count: Photographs.
         span_deg: Turn of the ball, in all.
-        shift_px: The camera pans, so that the middle of its picture shifts by up to so much.
-        table: Of the ``turning`` points, those of a plane that turns along.
-        moved: How far the camera moves sideways and up at most, as a part of its distance; the
-            room is up to twice as far behind the ball as the ball is from the camera.
     """
     cameras = orbit(count, span_deg, elevation_deg)
-    ball = seen_of_ball(generator, turning - table, cameras)
-    if table:
-        points = 5 * torch.rand(table, 3, generator=generator, dtype=torch.float64) - 2.5
-        points[:, 2] = -1
-        flat, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-        ball = torch.cat([ball, flat], dim=1)
+    ball = seen_of_ball(generator, turning, cameras)
     room = torch.rand(resting, 2, generator=generator, dtype=torch.float64)
     room = room * room.new_tensor([WIDTH, HEIGHT])
-    room = room.expand(count, -1, -1)
-    if moved:
-        depth = 1 + torch.rand(resting, 1, generator=generator, dtype=torch.float64)
-        moves = 2 * torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) - 1
-        room = room + FOCAL * moved * moves / depth
-    pixels = torch.cat([ball, room], dim=1)
-    return Captured(generator, panned(generator, pixels, shift_px) if shift_px else pixels)
-
-
-def panned(generator: torch.Generator, pixels: Tensor, shift_px: float) -> Tensor:
-    """Turn the camera in its place, by up to so many pixels sideways and up; 2 degrees of roll."""
-    skew = pixels.new_zeros(len(pixels), 3, 3)
-    drawn = 2 * torch.rand(len(pixels), 3, generator=generator, dtype=torch.float64) - 1
-    angles = drawn * torch.tensor([shift_px / FOCAL, shift_px / FOCAL, 0.035])
-    skew[:, 0, 2], skew[:, 1, 2], skew[:, 0, 1] = angles.unbind(dim=1)
-    K = pixels.new_tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    turn = K @ torch.linalg.matrix_exp(skew - skew.mT) @ K.inverse()
-    return torch.stack([mapped(one, its) for one, its in zip(turn, pixels, strict=True)])
+    return Captured(generator, torch.cat([ball, room.expand(count, -1, -1)], dim=1))

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.camera_in_place import follows_camera_in_place, mapped
 from pimper_torch.method.sfm.doubt import count_views_with_depth, doubt, following_fraction
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct import Reconstruct
@@ -115,3 +116,37 @@ def test_of_a_room_and_an_object_the_object_has_depth_and_a_room_alone_is_gone_o
     room, ball = of_a_room(generator), of_a_ball(generator, 6, 90.0)
     assert count_views_with_depth([room, ball], 30) == [0, 6]
     assert count_views_with_depth([room], 30) == [12]
+
+
+def random_pixels(generator, count=500):
+    return 600 * torch.rand(count, 2, generator=generator, dtype=torch.float64)
+
+
+def follows(first, second, generator):
+    return follows_camera_in_place(first, second, first.new_tensor([300.0, 300]), 2.0, generator)
+
+
+def test_what_a_camera_in_its_place_sees_is_found_among_matches_of_which_most_follow_none(
+    generator,
+):
+    first, second = random_pixels(generator), random_pixels(generator)
+    panned = torch.tensor([[1.02, -0.03, 90], [0.03, 1.02, -40], [8e-5, -5e-5, 1]]).double()
+    second[:100] = 300 + mapped(panned, first[:100] - 300)
+    found = follows(first, second, generator)
+    assert found[:100].all()
+    assert found[100:].double().mean() < 0.02
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        [[0.83, 0.56, 0], [-0.56, 0.83, 0], [0, 0, 1]],  # a roll by 34 degrees
+        [[1.5, 0, 0], [0, 1.5, 0], [0, 0, 1]],
+        [[1.1, -0.2, 30], [0.1, 0.9, -20], [1e-4, -2e-4, 1]],  # a plane, seen from round it
+    ],
+)
+def test_what_moves_otherwise_does_not_follow_a_camera_in_its_place(generator, moved):
+    first = random_pixels(generator)
+    found = follows(first, mapped(torch.tensor(moved).double(), first), generator)
+    assert found.double().mean() < 0.2
+    assert not follows(first[:1], first[:1], generator).any()

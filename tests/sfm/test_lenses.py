@@ -5,8 +5,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sfm.colmap import bundle
-from pimper_torch.method.sfm.doubt import doubt_one_lens
 from pimper_torch.method.sfm.lenses import (
     choose_lenses,
     group_lenses,
@@ -18,9 +16,7 @@ from tests.sfm.ball import (
     HEIGHT,
     WIDTH,
     cameras_on_an_arc,
-    model_of,
     photographs,
-    points_on_the_ball,
 )
 
 NAN = math.nan
@@ -91,21 +87,3 @@ def test_every_other_photograph_zoomed_as_exif_says_is_of_a_lens_of_its_own():
     assert len({lens.camera for lens in model.lenses}) == 2
     assert_close(found[1::2] / found[::2], torch.full((5,), 1.4), rtol=0.01, atol=0)
     assert_close(found, focals.to(found), rtol=0.05, atol=0)  # an arc tells it from distance badly
-
-
-@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1.02, False), (1.4, True)])
-def test_photographs_of_two_lenses_that_are_taken_for_one_are_warned_of(factor, doubted, generator):
-    cameras = cameras_on_an_arc(8)
-    K = cameras.intrinsics.clone()
-    K[1::2, 0, 0] *= factor
-    K[1::2, 1, 1] *= factor
-    points = points_on_the_ball(300, generator)
-    two = model_of(cameras.replace(intrinsics=K), points, generator, 0.2)
-    model = bundle(two, 1.0)  # of one lens
-    reason = doubt_one_lens(model)
-    assert bool(reason) == doubted
-    if doubted:
-        assert "a lens of its own" in reason
-        assert "--reconstruct.own-cameras" in reason
-        each = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(model.lenses))
-        assert doubt_one_lens(model.replace(lenses=each)) == ""

@@ -6,6 +6,8 @@ import warnings
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -13,16 +15,14 @@ from pimper_torch.ground.geometry.colmap_library import loaded
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
-from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.model_files import CAMERA_MODELS
+from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 POINTS, VIEWS = 20, 4
 COLORS = torch.zeros(POINTS, 3, dtype=torch.uint8)
 
 
-@pytest.fixture
-def model():
+def four_views():
     """Four views of twenty points, each of which three views see."""
     generator = torch.Generator().manual_seed(4)
     cameras = arc_cameras(VIEWS, width=64, height=48, focal_px=80.0, distance=5.0)
@@ -43,30 +43,27 @@ def model():
 
 
 @pytest.fixture
+def model():
+    return four_views()
+
+
+@pytest.fixture
 def folder(model, tmp_path):
     write_binary(model, COLORS, tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("damaged")
+    write_binary(four_views(), COLORS, folder)
+    return folder
 
 
 def change(path, layout, at, *values):
     data = bytearray(path.read_bytes())
     struct.pack_into(layout, data, at, *values)
     path.write_bytes(data)
-
-
-def image_at(folder, index):
-    """Find where an image begins in its file."""
-    data, at = (folder / "images.bin").read_bytes(), 8
-    for _ in range(index):
-        end = data.index(b"\0", at + 64) + 1
-        at = end + 8 + 24 * struct.unpack_from("<Q", data, end)[0]
-    return at
-
-
-def quietly(folder):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PimperWarning)
-        return read_model(folder)
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -105,89 +102,96 @@ def test_lines_that_end_as_windows_ends_them_are_read(model, tmp_path):
     assert read_model(tmp_path).names == model.names
 
 
-def test_camera_models_are_colmaps():
-    pycolmap = loaded()
-    known = {
-        int(kind): name
-        for name, kind in pycolmap.CameraModelId.__members__.items()
-        if int(kind) >= 0
-    }
-    assert [known[index] for index in range(len(known))] == [name for name, _ in CAMERA_MODELS]
-    for name, count in CAMERA_MODELS:
-        camera = pycolmap.Camera.create_from_model_name(1, name, 1.0, 8, 8)
-        assert len(camera.params) == count
-
-
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(folder, name):
-    for content in (b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"):
-        (folder / name).write_bytes(content)
-        with pytest.raises(InputError, match=f"{name} is cut short"):
-            read_model(folder)
+@pytest.mark.parametrize("content", [b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"])
+def test_a_count_beyond_the_files_length_is_refused_before_memory_is_taken(folder, name, content):
+    (folder / name).write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read: cut short, or of another format"):
+        read_model(folder)
 
 
 @pytest.mark.parametrize("count", [2**64 - 1, 10**9])
 def test_a_track_longer_than_the_file_is_refused(folder, count):
     change(folder / "points3D.bin", "<Q", 8 + 43, count)
-    with pytest.raises(InputError, match=r"points3D\.bin is cut short"):
+    with pytest.raises(InputError, match="cannot be read: cut short"):
         read_model(folder)
 
 
-@pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
-def test_an_image_without_a_rotation_is_refused_by_name(folder, value):
-    change(folder / "images.bin", "<4d", image_at(folder, 1) + 4, *[value] * 4)
-    with pytest.raises(InputError, match=r"c/d\.png has a pose whose quaternion"):
+@given(data=st.data())
+def test_of_bytes_that_are_damaged_comes_a_model_or_a_refusal(damaged, data):
+    part = data.draw(st.sampled_from(["cameras.bin", "images.bin", "points3D.bin"]))
+    whole = (damaged / part).read_bytes()
+    at = data.draw(st.integers(0, len(whole) - 1))
+    some = data.draw(st.binary(max_size=8))
+    (damaged / part).write_bytes(whole[:at] + some + whole[at + data.draw(st.integers(0, 8)) :])
+    try:
+        model = quietly(damaged)
+    except InputError:
+        return
+    finally:
+        (damaged / part).write_bytes(whole)
+    assert model.points_world.isfinite().all()
+    assert model.cam_from_world.isfinite().all()
+    select_views(model, range(model.num_views))
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "at", "values"),
+    [
+        ("images", "<4d", 4, [0.0] * 4),
+        ("images", "<4d", 4, [NAN] * 4),
+        ("images", "<d", 4 + 32, [NAN]),
+        ("images", "<I", 60, [99]),  # a camera that is not there
+        ("cameras", "<d", 24, [NAN]),
+        ("cameras", "<d", 24, [0.0]),
+        ("cameras", "<d", 32, [-1.0]),
+        ("cameras", "<Q", 8, [0]),  # a picture without width
+    ],
+)
+def test_an_image_without_a_sound_pose_or_camera_is_refused_by_name(
+    folder, name, layout, at, values
+):
+    change(folder / f"{name}.bin", layout, 8 + at, *values)
+    with pytest.raises(InputError, match=r"is broken: a b\.png has no sound pose or camera"):
         read_model(folder)
 
 
-def test_points_that_are_nowhere_are_left_out_and_counted(folder, model):
-    record = 8 + 43 + 8 + 3 * 8
-    size = record - 8
+def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
+    twice = model.replace(names=("a.png", "b.png", "a.png", "c.png"))
+    reconstruction_of(twice, COLORS).write_text(str(tmp_path))
+    with pytest.raises(InputError, match=r"is broken: a\.png is in it twice"):
+        read_model(tmp_path)
+
+
+def test_points_and_observations_of_nothing_are_left_out_and_counted(folder, model):
+    size = 43 + 8 + 3 * 8
     for index in range(0, POINTS, 2):
-        change(folder / "points3D.bin", "<d", 8 + size * index + 8, math.nan)
-    with pytest.warns(PimperWarning, match=f"{POINTS // 2} of {POINTS} points"):
+        change(folder / "points3D.bin", "<d", 8 + size * index + 8, NAN)
+    change(folder / "points3D.bin", "<2I", 8 + size + 51, 99, 0)
+    change(folder / "points3D.bin", "<I", 8 + size + 51 + 8 + 4, 2**32 - 1)
+    with pytest.warns(PimperWarning, match=f"{POINTS // 2} of {POINTS} points.*2 observations"):
         read = read_model(folder)
     assert_close(read.points_world, model.points_world[1::2])
     assert int(read.observation_point.max()) == POINTS // 2 - 1
-    change(folder / "points3D.bin", "<d", 8 + size + 8, math.inf)
-    with pytest.raises(InputError, match=f"broken.*{POINTS // 2 + 1} of {POINTS} points"):
-        read_model(folder)
+    assert torch.bincount(read.observation_point).tolist() == [1] + [3] * (POINTS // 2 - 1)
 
 
-def test_cameras_that_are_none_are_the_reason_that_is_given(folder):
-    for at, value, why in ((24, math.nan, "not finite"), (24, 0.0, "focal"), (24, -1.0, "focal")):
-        change(folder / "cameras.bin", "<d", 8 + at, value)
-        with pytest.raises(InputError, match=f"a b.png has a camera .*{why}"):
-            read_model(folder)
-
-
-def test_poses_that_are_none_are_the_reason_that_is_given(folder):
-    change(folder / "images.bin", "<d", image_at(folder, 2) + 4 + 32, math.nan)
-    with pytest.raises(InputError, match=r"e\.png has a pose that is not finite"):
-        read_model(folder)
-
-
-def test_observations_of_nothing_are_left_out_and_counted(folder, model):
-    first = 8 + 43 + 8
-    change(folder / "points3D.bin", "<2I", first, 99, 0)
-    change(folder / "points3D.bin", "<I", first + 8 + 4, 2**32 - 1)
-    with pytest.warns(PimperWarning, match="and 2 observations"):
-        read = read_model(folder)
-    assert len(read.observation_point) == 3 * POINTS - 2
-    assert int((read.observation_point == 0).sum()) == 1
-
-
-def test_text_that_is_none_of_colmaps_names_its_line(model, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [("cameras", "1 PINHOLE 64 48 80"), ("images", "1 1 0 0 0"), ("points3D", "x")],
+)
+def test_text_that_is_none_of_colmaps_is_refused(model, tmp_path, name, line):
     reconstruction_of(model, COLORS).write_text(str(tmp_path))
-    for name, line in (
-        ("cameras", "1 PINHOLE 64 48 80"),
-        ("images", "1 1 0 0 0"),
-        ("points3D", "x"),
-    ):
-        path = tmp_path / f"{name}.txt"
-        sound = path.read_text()
-        path.write_text(f"{line}\n{sound}")
-        with pytest.raises(InputError, match=rf"{name}.txt has in line 1 "):
-            read_model(tmp_path)
-        path.write_text(sound)
-    assert quietly(tmp_path).num_views == VIEWS
+    path = tmp_path / f"{name}.txt"
+    path.write_text(f"{line}\n{path.read_text()}")
+    with pytest.raises(InputError, match="cannot be read: cut short, or of another format"):
+        read_model(tmp_path)
+
+
+def quietly(folder):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PimperWarning)
+        return read_model(folder)

@@ -21,7 +21,6 @@ RIGID = StaticBackground(features=(), still_fraction=0.0, moving_pairs=0, violat
 ROOM = RIGID.replace(
     features=5 * (torch.tensor([True, False]),),
     violating_fraction=0.5,
-    maps=5 * (torch.eye(3, dtype=torch.float64),),
 )
 
 NOTHING = torch.zeros(3, 2).double()
@@ -184,7 +183,7 @@ def test_features_of_a_room_are_left_out_where_the_plain_model_is_doubtful(
     monkeypatch.setattr(registration, "doubt", lambda model, count: doubts.pop(0))
     with pytest.warns(PimperWarning, match="5 of 10 features lie still"):
         found = register(space, SETTINGS)
-    assert found.background.keys() == set(space.files)
+    assert len(found.background) == 5
     assert found.explained == 1
 
 

@@ -13,9 +13,8 @@ from pimper_torch.ground.geometry.local_frame import from_local
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.sfm.colmap import observation_errors
-from pimper_torch.method.sfm.conventions.resized_pictures import Ways
 from pimper_torch.method.sfm.epipolar import explained, pinholes_of
-from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.matching import VerifiedPair
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
@@ -51,7 +50,7 @@ def without_points(model: SparseModel) -> SparseModel:
 def test_points_lie_on_the_surface_and_cameras_come_back_bit_for_bit(views, bare):
     assert lacks_points(bare)
     with pytest.warns(PimperWarning, match=r"model: hardly any.*points were triangulated.*px"):
-        found = triangulate(views, Ways([bare]), SETTINGS, "The model")
+        found = triangulate(views, bare, SETTINGS, "The model")
     assert torch.equal(found.cam_from_world, bare.cam_from_world)
     assert found.lenses == bare.lenses
     assert found.names == bare.names
@@ -69,7 +68,7 @@ def test_the_number_of_threads_changes_no_bit(views, bare):
     for threads in (1, 2):
         settings = ReconstructConfig(threads=threads)
         with pytest.warns(PimperWarning, match="were triangulated"):
-            found.append(triangulate(views, Ways([bare]), settings, "The model"))
+            found.append(triangulate(views, bare, settings, "The model"))
     assert torch.equal(found[0].points_world, found[1].points_world)
     assert torch.equal(found[0].observation_pixels, found[1].observation_pixels)
 
@@ -88,7 +87,7 @@ def test_matches_follow_the_lens(views, bare):
     lens = bare.lenses[0].replace(params=(*bare.lenses[0].params[:3], 0.3))  # 10 px in the corners
     model = bare.replace(lenses=(lens,) * bare.num_views)
     with pytest.warns(PimperWarning, match="were triangulated"):
-        found = triangulate(bent(views, lens), Ways([model]), SETTINGS, "The model")
+        found = triangulate(bent(views, lens), model, SETTINGS, "The model")
     assert found.lenses == model.lenses
     assert float((found.points_world.norm(dim=1) - 1).abs().median()) < 0.001
     assert float(observation_errors(found).median()) < 0.3
@@ -98,7 +97,7 @@ def test_georeferenced_cameras_give_the_points_of_those_near_the_origin(views, b
     offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
     far = bare.replace(cam_from_world=from_local(bare.cam_from_world, tuple(offset.tolist())))
     with pytest.warns(PimperWarning, match="were triangulated"):
-        found = triangulate(views, Ways([far]), SETTINGS, "The model")
+        found = triangulate(views, far, SETTINGS, "The model")
     assert torch.equal(found.cam_from_world, far.cam_from_world)
     assert len(found.points_world) > 100
     assert float(((found.points_world - offset).norm(dim=1) - 1).abs().median()) < 0.001
@@ -121,13 +120,13 @@ def axes(*signs: int) -> torch.Tensor:
 def test_cameras_that_photographs_contradict_are_refused(views, bare, wrong):
     model = bare.replace(cam_from_world=wrong(bare.cam_from_world))
     with pytest.raises(InputError, match=r"The model: these cameras.*at least 50%.*x right"):
-        triangulate(views, Ways([model]), SETTINGS, "The model")
+        triangulate(views, model, SETTINGS, "The model")
 
 
 def test_photographs_without_texture_give_no_points_and_a_warning(views, bare):
     blank = views.replace(images=torch.full_like(views.images, 0.3))
     with pytest.warns(PimperWarning, match="0 could be triangulated from features"):
-        found = triangulate(blank, Ways([bare]), SETTINGS, "The model")
+        found = triangulate(blank, bare, SETTINGS, "The model")
     assert found is bare
 
 
@@ -135,7 +134,7 @@ def test_photographs_of_a_few_pixels_are_not_looked_at(views, bare):
     """COLMAP's features end the process there."""
     tiny = views.replace(images=views.images[..., :6, :8], sizes_px=torch.tensor([[8, 6]] * 6))
     with pytest.warns(PimperWarning, match="0 could be triangulated from features"):
-        assert triangulate(tiny, Ways([bare]), SETTINGS, "The model") is bare
+        assert triangulate(tiny, bare, SETTINGS, "The model") is bare
 
 
 def test_points_that_there_are_stay_where_no_more_are_found(views, generator):
@@ -143,22 +142,10 @@ def test_points_that_there_are_stay_where_no_more_are_found(views, generator):
     assert lacks_points(few)
     blank = views.replace(images=torch.full_like(views.images, 0.3))
     with pytest.warns(PimperWarning, match="could be triangulated"):
-        assert triangulate(blank, Ways([few]), SETTINGS, "The model") is few
+        assert triangulate(blank, few, SETTINGS, "The model") is few
     with pytest.warns(PimperWarning, match="were triangulated"):
-        more = triangulate(views, Ways([few]), SETTINGS, "The model")
+        more = triangulate(views, few, SETTINGS, "The model")
     assert len(more.points_world) > 10 * len(few.points_world)
-
-
-def test_of_two_ways_to_read_cameras_the_one_that_photographs_show_is_taken(views, bare):
-    over = bare.replace(cam_from_world=axes(-1, -1, 1) @ bare.cam_from_world)
-    with pytest.warns(PimperWarning) as told:
-        found = triangulate(views, Ways([over, bare]), SETTINGS, "The model")
-    assert "before EXIF turns them" in str(told[0].message)
-    assert torch.equal(found.cam_from_world, bare.cam_from_world)
-    blank = views.replace(images=torch.full_like(views.images, 0.3))
-    with pytest.warns(PimperWarning) as told:
-        assert triangulate(blank, Ways([over, bare]), SETTINGS, "The model") is over
-    assert "neither sizes nor matches tell" in str(told[0].message)
 
 
 def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
@@ -179,7 +166,7 @@ def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_th
     settings = replace(SETTINGS, track_iterations=0)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        found = triangulate(views, Ways([bare]), settings, "The model")
+        found = triangulate(views, bare, settings, "The model")
     assert [str(one.message).count("points were triangulated") for one in told] == [1]
     assert torch.equal(found.cam_from_world, bare.cam_from_world)
 
@@ -190,4 +177,4 @@ def test_a_file_that_has_no_camera_of_the_photographs_is_refused(views, tmp_path
     whole = {"w": 80, "h": 60, "fl_x": 90.0, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(whole))
     with pytest.raises((InputError, ReconstructionError), match="has none of the photographs"):
-        existing_ways(views, tmp_path / "transforms.json")
+        existing_model(views, tmp_path / "transforms.json")

@@ -17,7 +17,7 @@ from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding
-from pimper_torch.method.sfm.conventions.resized_pictures import resize_fits
+from pimper_torch.method.sfm.existing import resize_fits
 from pimper_torch.method.sfm.undistort import pinhole_for, undistort
 from pimper_torch.records import Cameras, Lens, Views
 from pimper_torch.runtime.errors import InputError, some
@@ -124,7 +124,7 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
     lenses = []
     for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
         lens = one.lens
-        if not resize_fits((lens.width, lens.height), width, height):
+        if not resize_fits(lens, width, height):
             raise InputError(
                 f"{one.image}: has the shape {width} x {height}, but its camera is for "
                 f"{lens.width} x {lens.height}. Needed: the photograph that the camera belongs to, "

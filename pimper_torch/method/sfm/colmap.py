@@ -12,19 +12,8 @@ from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.geometry.lens_models import camera_of, distort, lens_of
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.model_files import read_files, sound_model
+from pimper_torch.method.sfm.model_files import read_model as read_model
 from pimper_torch.runtime.errors import OutputError
-
-
-def read_model(folder: Path) -> SparseModel:
-    """Read a COLMAP model, text or binary.
-
-    Raises:
-        InputError: The folder holds no model, one that is cut short or of another format, or one of
-            which more than half is broken. A :class:`~pimper_torch.runtime.errors.PimperWarning`
-            counts what was broken and left out.
-    """
-    return sound_model(read_files(folder), folder)
 
 
 def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: Path) -> None:

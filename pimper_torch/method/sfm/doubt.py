@@ -13,7 +13,6 @@ agree with a right model; those of a misplaced view do not. Pairs with few match
 third of a carton's disagree with the right model, too, for its sides look alike.
 """
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -23,11 +22,11 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.projection import triangulation_angles
 from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.sfm.camera_in_place import picture_centre, references, tied_to
-from pimper_torch.method.sfm.colmap import bundle, observation_errors
+from pimper_torch.method.sfm.camera_in_place import follows_camera_in_place
 from pimper_torch.method.sfm.epipolar import match_errors
-from pimper_torch.method.sfm.matching import MOST_PAIRED, VerifiedPair
-from pimper_torch.method.sfm.model import SparseModel, longest_tracks, select_views
+from pimper_torch.method.sfm.matching import VerifiedPair
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES
 from pimper_torch.runtime.errors import ReconstructionError, some
 
 FEWEST_VIEWS = 3
@@ -168,22 +167,23 @@ def following_fraction(model: SparseModel) -> float:
         [values[mine] for mine in seen]
         for values in (model.observation_point, model.observation_pixels)
     )
-    centre = picture_centre(pixels)
+    everywhere = torch.cat(pixels).double()
+    centre = (everywhere.amin(dim=0) + everywhere.amax(dim=0)) / 2
     # 2 px of 800, or 0.09 degrees of parallax with a normal lens.
     max_error_px = 0.0025 * max(max(lens.width, lens.height) for lens in model.lenses)
     generator = torch.Generator().manual_seed(0)
     best = 0.0
-    for reference in references(model.num_views):
-        matched = {}
+    # Three references, evenly over the sequence: one alone may be blurred or covered.
+    for reference in sorted({(2 * slot + 1) * model.num_views // 6 for slot in range(3)}):
+        fractions = []
         for view in range(model.num_views):
-            here, there = _same(points[reference], points[view])
-            if view != reference and len(here):
-                matched[view] = pixels[reference][here], pixels[view][there]
-        tied = tied_to(matched, centre, max_error_px, 15, generator, any_homography=False)
-        fractions = torch.zeros(max(model.num_views - 1, 1))
-        for slot, (_, follows) in enumerate(tied.values()):
-            fractions[slot] = follows.double().mean()
-        best = max(best, float(fractions.median()))
+            if view != reference:
+                here, there = _same(points[reference], points[view])
+                ends = pixels[view][there], pixels[reference][here]
+                follows = follows_camera_in_place(*ends, centre, max_error_px, generator)
+                enough = int(follows.sum()) >= MIN_MATCHES
+                fractions.append(float(follows.double().mean()) if enough else 0.0)
+        best = max(best, float(torch.tensor(fractions or [0.0]).median()))
     return best
 
 
@@ -192,33 +192,6 @@ def _same(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     here = torch.nonzero(torch.isin(points, others))[:, 0]
     order = others.argsort()
     return here, order[torch.searchsorted(others[order], points[here])]
-
-
-def doubt_one_lens(model: SparseModel) -> str:
-    """State why photographs were taken with several lenses, if a lens each fits much better.
-
-    On 8 simulated views of a ball with 0.2 px of noise, a lens each leaves 1.00 of the errors with
-    one lens where it is one, 0.93 of two whose focal lengths are as 1 to 1.1, 0.76 as 1 to 1.25,
-    0.60 as 1 to 1.5.
-    """
-    shared = Counter(lens.camera for lens in model.lenses)
-    if not shared or max(shared.values()) < 4 or not len(model.points_world):
-        return ""
-    step = -(-model.num_views // MOST_PAIRED)
-    one = longest_tracks(select_views(model, range(0, model.num_views, step)), 100)
-    own = tuple(lens.replace(camera=view + 1) for view, lens in enumerate(one.lenses))
-    one, freed = (bundle(start, 1.0, tolerance=1e-5) for start in (one, one.replace(lenses=own)))
-    before, after = (float(observation_errors(each).median()) for each in (one, freed))
-    focals = torch.tensor([lens.params[0] for lens in freed.lenses])
-    low, high = torch.quantile(focals, torch.tensor([0.1, 0.9])).tolist()
-    if after > 0.8 * before or high < 1.05 * low:
-        return ""
-    return (
-        f"Points reproject {before:.2f} px off with one lens for {max(shared.values())} "
-        f"photographs, and {after:.2f} px with a lens of its own for each, of focal lengths from "
-        f"{low:.0f} to {high:.0f} px. The photographs seem to be zoomed or cropped: keep EXIF in "
-        "their files, or give `--reconstruct.own-cameras`."
-    )
 
 
 # Fraction of the matches in a view's 3 strongest pairs that must agree with the model: 91 to 100 %

@@ -10,31 +10,26 @@ from PIL import Image
 from pimper_torch.doors.camera_files.read_cameras import read_cameras
 from pimper_torch.ground.geometry.lens_models import rescale_lens
 from pimper_torch.method.sfm import colmap
-from pimper_torch.method.sfm.conventions.resized_pictures import (
-    REACHES,
-    Ways,
-    changed_views,
-    choose_turned,
-    points_tell,
-    possible_crops,
-    possible_turns,
-    tell_crop,
-    tell_turned,
+from pimper_torch.method.sfm.lenses import (
+    QUARTERS,
+    turned_lens,
+    turned_pixels,
+    turned_pose,
+    turned_size,
 )
-from pimper_torch.method.sfm.lenses import turned_lens, turned_pixels, turned_pose, turned_size
 from pimper_torch.method.sfm.model import SparseModel, match_names
 from pimper_torch.method.sfm.model_files import largest_model
-from pimper_torch.records import Views
-from pimper_torch.runtime.errors import InputError, ReconstructionError, some
+from pimper_torch.records import Lens, Views
+from pimper_torch.runtime.errors import InputError, ReconstructionError, caution, some
 from pimper_torch.runtime.file_names import match_files
 
 
-def existing_ways(views: Views, path: Path) -> Ways:
+def existing_model(views: Views, path: Path) -> SparseModel:
     """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
         views: Matched by file name; cameras may have been made from photographs of another size,
-            and from the pixels that files store where EXIF turns them.
+            and from the pixels that files store where EXIF turns them by a quarter.
         path: Folder of a COLMAP model, or of several in folders, of which the
             largest is read; or a file of cameras, see
             :func:`~pimper_torch.doors.camera_files.read_cameras.read_cameras`.
@@ -54,30 +49,56 @@ def existing_ways(views: Views, path: Path) -> Ways:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    sizes = []  # before photographs were shrunk on reading, as the pictures lie
-    for view, lens in enumerate(model.lenses):
-        wide, high = _stored_size(shown, view)
-        sizes.append(turned_size(wide, high, int((wide > high) != (lens.width > lens.height))))
-    changed = changed_views(model, sizes)
-    plain, cropped = (
-        [follow_pictures(one, shown, way) for one in models for way in possible_turns(one, shown)]
-        for models in ([model], possible_crops(model, sizes))
+    return follow_pictures(model, shown, _quarter_turns(model, shown, where))
+
+
+def resize_fits(lens: Lens, width: int, height: int) -> bool:
+    """Return whether a resize alone leads from a lens's picture to one of another size."""
+    # Rounding a side to whole pixels changes the shape by less than this.
+    ratio = width / lens.width / (height / lens.height)
+    return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
+
+
+def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
+    """Return the clockwise quarters by which a model's pictures are turned in the photographs.
+
+    Programs work on the pixels of files, which EXIF may say are to be turned; photographs are
+    turned when they are read. One photograph whose shape shows it decides for all.
+    """
+    tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
+    exif = [QUARTERS.get(tag, 0) for tag in tags]
+    sizes = views.sizes_px.tolist()
+    odd = [
+        f"{name} is {width}x{height}, its camera's picture {lens.width}x{lens.height}"
+        for name, lens, (width, height) in zip(model.names, model.lenses, sizes, strict=True)
+        if not resize_fits(lens, width, height)
+    ]
+    as_stored = all(
+        resize_fits(lens, *turned_size(*size, quarters))
+        for lens, size, quarters in zip(model.lenses, sizes, exif, strict=True)
     )
-    # That photographs were resized is the plain explanation: it may be told in larger steps.
-    reaches = (*REACHES, float(shown.sizes_px.max()) / 100)
-    if changed and not any(points_tell(one, shown, changed, reaches) for one in plain):
-        scores = [points_tell(one, shown, changed) for one in cropped]
-        if not any(scores):
-            return Ways(plain, cropped, changed)
-        crop = cropped[scores.index(max(scores))]
-        tell_crop(where, crop, changed, "what they show round its points")
-        return Ways([crop])
-    if not len(model.points_world):
-        return Ways(plain)
-    chosen = choose_turned(plain, shown, where)
-    if not torch.equal(chosen.cam_from_world, model.cam_from_world):
-        tell_turned(where, "what they show round its points")
-    return Ways([chosen])
+    if odd and not as_stored:
+        raise InputError(
+            f"{where} is of pictures of another shape than {len(odd)} of {model.num_views} "
+            f"photographs: {some(odd, 2)}. Needed: the photographs that it was made of, resized "
+            "if you like, but neither cropped nor turned since. Give those, or leave the cameras "
+            "out to find them by structure from motion."
+        )
+    if odd:
+        caution(
+            f"{where}: its cameras are of the pixels that files store before EXIF turns them, and "
+            "are turned with the photographs.",
+            stacklevel=4,
+        )
+        return exif
+    if as_stored and any(exif):
+        caution(
+            f"EXIF turns photographs, and their shapes do not show whether {_within(where)} was "
+            "made of them before or after that; it is taken as made after. If it was made of the "
+            "pixels that files store, remove EXIF's orientation (`exiftool -n -Orientation=1`).",
+            stacklevel=4,
+        )
+    return [0] * model.num_views
 
 
 def place(path: Path) -> str:
@@ -89,6 +110,10 @@ def taken(views: Views, model: SparseModel) -> Views:
     """Take the photographs of a model, in its order."""
     number = {name: index for index, name in enumerate(views.names)}
     return views.take([number[name] for name in model.names])
+
+
+def _within(where: str) -> str:
+    return where.replace("The ", "the ", 1)
 
 
 def _model_of_file(views: Views, path: Path) -> SparseModel:

@@ -1,4 +1,4 @@
-"""Lenses: which photographs share one by their files, and lenses of turned and cropped pictures."""
+"""Lenses: which photographs share one by their files, and lenses of turned pictures."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,6 @@ from pimper_torch.runtime.errors import InputError, some
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Clockwise quarters by which EXIF's orientations turn a file's pixels; the others mirror, too."""
 
-# Where a model's focal lengths are two, its principal point stands behind them, else behind one.
 _ONE_FOCAL = ("SIMPLE_", "RADIAL")
 # Positions of pairs of parameters that turn as vectors: decentering and thin prisms.
 _VECTORS = {
@@ -43,11 +42,6 @@ def turned_pixels(
     return pixels
 
 
-def turned_vectors(vectors: Float[Tensor, "*batch 2"], quarters: int) -> Float[Tensor, "*batch 2"]:
-    """Return what differences of pixels are after clockwise quarter turns."""
-    return turned_pixels(vectors, 0, 0, quarters)
-
-
 def turned_pose(
     cam_from_world: Float[Tensor, "*batch 4 4"], quarters: int
 ) -> Float[Tensor, "*batch 4 4"]:
@@ -65,27 +59,19 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
     vectors in the picture are turned: ``p2, p1`` and ``sx1, sy1``.
     """
     size = lens.width, lens.height
-    values, focals = list(lens.params), _focals(lens)
+    values, focals = list(lens.params), count_focals(lens)
     if focals == 2 and quarters % 2:
         values[0], values[1] = values[1], values[0]
     center = torch.tensor(values[focals : focals + 2], dtype=torch.float64)
     values[focals : focals + 2] = turned_pixels(center, *size, quarters).tolist()
     for first, second in _VECTORS.get(lens.model, ()):
         vector = torch.tensor([values[first], values[second]], dtype=torch.float64)
-        values[first], values[second] = turned_vectors(vector, quarters).tolist()
+        values[first], values[second] = turned_pixels(vector, 0, 0, quarters).tolist()
     width, height = turned_size(*size, quarters)
     return lens.replace(params=tuple(values), width=width, height=height)
 
 
-def cropped_lens(lens: Lens, width: int, height: int, corner: Float[Tensor, "2"]) -> Lens:
-    """Cut a lens's picture, of whatever model of COLMAP's; its principal point moves."""
-    values, focals = list(lens.params), _focals(lens)
-    values[focals] -= float(corner[0])
-    values[focals + 1] -= float(corner[1])
-    return lens.replace(params=tuple(values), width=width, height=height)
-
-
-def _focals(lens: Lens) -> int:
+def count_focals(lens: Lens) -> int:
     """Count the focal lengths, behind which the principal point stands."""
     return 1 if lens.model.startswith(_ONE_FOCAL) else 2
 

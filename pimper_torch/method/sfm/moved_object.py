@@ -295,9 +295,18 @@ def with_series(
     """Note which series the views of a model are of, and say what that means.
 
     Views of a series that is hardly in the model are left out: little but the object ties them to
-    the others.
+    the others. Where no series has more than two views, all stay, and masks are asked for: a
+    background shifted while the object turned, as where a tripod was touched.
     """
     small = torch.bincount(numbers)[numbers] < FEWEST_VIEWS
+    if bool(small.all()):
+        caution(
+            "The background shifts against the object from photograph to photograph, so that only "
+            "the object's features are matched, and these with errors. Give masks of the object "
+            "(`--masks`); a tripod that is not touched needs none.",
+            stacklevel=4,
+        )
+        return model
     leave_out("sfm.small_series", small, names=model.names)
     if bool(small.any()):
         model, numbers = select_views(model, (~small).nonzero()[:, 0].tolist()), numbers[~small]

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.method.sfm.conventions.resized_pictures import Ways
-from pimper_torch.method.sfm.doubt import choose_component, doubt, doubt_one_lens
-from pimper_torch.method.sfm.existing import existing_ways, place, taken
+from pimper_torch.method.sfm.doubt import choose_component, doubt
+from pimper_torch.method.sfm.existing import existing_model, place, taken
 from pimper_torch.method.sfm.features import SMALLEST_PX, find_features, too_small, workspace
 from pimper_torch.method.sfm.lenses import choose_lenses
 from pimper_torch.method.sfm.model import SparseModel, select_views
@@ -82,26 +81,25 @@ class Reconstruct(Stage):
         if not lacks_points(model) or not scene.lenses:
             return scene
         bare = scene.views.replace(priors=())
-        found = self._triangulated(bare, Ways([model]), "The scene")
+        found = self._triangulated(bare, model, "The scene")
         return scene if found is model else with_model_points(scene, found)
 
     def _given(self, views: Views, path: Path) -> SparseModel:
         """Read cameras, and triangulate points where they come without."""
-        ways = existing_ways(views, path)
-        first = (ways.plain or ways.cropped)[0]
-        if not ways.cropped and not lacks_points(first):
-            return first
-        return self._triangulated(taken(views, first), ways, place(path))
+        model = existing_model(views, path)
+        if not lacks_points(model):
+            return model
+        return self._triangulated(taken(views, model), model, place(path))
 
-    def _triangulated(self, views: Views, ways: Ways, where: str) -> SparseModel:
+    def _triangulated(self, views: Views, model: SparseModel, where: str) -> SparseModel:
         """Take points that were kept, or triangulate them and keep them."""
         alone = replace(self.config, threads=0)
-        hashed = digest(code(), views, *ways, alone) if self.store else None
+        hashed = digest(code(), views, model, alone) if self.store else None
         found, _ = kept(
             self.store,
             f"triangulate-{hashed}" if hashed else None,
             SparseModel,
-            lambda: triangulate(views, ways, self.config, where),
+            lambda: triangulate(views, model, self.config, where),
         )
         return found
 
@@ -166,10 +164,6 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     model = _registered_model(views, config)
     model = refine_tracks(taken(views, model), model, config.track_iterations)
     release_memory()
-    reason = doubt_one_lens(model)
-    leave_out("sfm.one_lens", bool(reason))
-    if reason:
-        caution(reason, stacklevel=3)
     return upright(model)
 
 
@@ -208,7 +202,7 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
             stacklevel=4,
         )
     if found.background:
-        maps = {name_of[file]: rest for file, rest in found.background.items()}
+        maps = dict(zip(views.names, found.background, strict=True))
         rests = torch.stack([maps[name] for name in model.names])
         model = model.replace(background_from_view=rests)
     if found.around:

@@ -8,7 +8,7 @@ is taken if it explains clearly more of its verified matches.
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 
 from jaxtyping import Float
@@ -31,7 +31,7 @@ from pimper_torch.method.sfm.model import SparseModel, drop_weak_views
 from pimper_torch.method.sfm.moved_object import tie_series
 from pimper_torch.method.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.method.sfm.retrieval import pairs_to_match
-from pimper_torch.method.sfm.static_background import StaticBackground, enter_room, leave_out_room
+from pimper_torch.method.sfm.static_background import enter_room, leave_out_room
 from pimper_torch.runtime.errors import ReconstructionError, caution
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.progress import report
@@ -101,8 +101,8 @@ class Registration:
             the matches in those that agrees.
         explained: Fraction of the verified matches that the first model explains; 0 where its
             cameras are doubtful.
-        background: Map from each file's pixels to those where a static background is at rest, NaN
-            where the file shows too little of it; none without a static background.
+        background: Map from each file's pixels to those where a static background is at rest, see
+            :class:`~pimper_torch.method.sfm.static_background.StaticBackground`.
         around: Matches of the surroundings on which the object was moved between series of files;
             none where it was not.
     """
@@ -112,7 +112,7 @@ class Registration:
     missing: tuple[str, ...]
     misplaced: Mapping[str, float]
     explained: float
-    background: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
+    background: tuple[Float[Tensor, "3 3"], ...] = ()
     around: tuple[VerifiedPair, ...] = ()
 
     @property
@@ -138,9 +138,9 @@ class Registration:
 def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     """Match pairs and grow a model; look for another explanation only where that fails.
 
-    Other explanations are a room at rest, or one that shifts, before which the object turns: its
-    features are left out; and an object that was moved between two series of photographs: between
-    these only matches of the object are used, see :mod:`pimper_torch.method.sfm.moved_object`.
+    Other explanations are a room at rest before which the object turns: its features are left out;
+    and an object that was moved between two series of photographs: between these only matches of
+    the object are used, see :mod:`pimper_torch.method.sfm.moved_object`.
 
     Where a model stays incomplete or contradicts matches, the thorough pass matches along epipolar
     lines: pairs of missing photographs, or all where some are misplaced. Then it starts the mapper
@@ -156,22 +156,34 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     plain = _registered(space, settings)
     if plain.sound:
         return plain
-    rest, background = _leave_out_room(other, settings)
-    around = () if background else tie_series(other.database, settings)
-    if not background and not around:
+    rest = leave_out_room(other.database, settings)
+    if rest.nothing_moves:
+        raise ReconstructionError(
+            f"Nothing moves in {len(space.files)} photographs: {rest.still_fraction:.0%} of the "
+            "matches lie at the same pixel, and in no pair do enough others agree on a motion. "
+            "Camera and background were at rest, and an object that turned has too little "
+            f"texture. {MOVE}"
+        )
+    around = () if rest.room else tie_series(other.database, settings)
+    if not rest.room and not around:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)
     if not rival.sound:
         rival, plain = (_thorough(*one, settings) for one in ((other, rival), (space, plain)))
     if rival.explained <= plain.explained + _MARGIN:
         return plain
-    if background:
-        _tell_room(rest)
+    if rest.room:
+        left, total = enter_room(rest)
+        caution(
+            f"{left} of {total} features lie still in the photographs while others move: they are "
+            "taken for those of a room before which the object turns, and are left out.",
+            stacklevel=2,
+        )
     else:
         surroundings = sum(pair.num_matches for pair in around)
         verified = sum(pair.num_matches for pair in verified_pairs(space))
         leave_out("sfm.moved_object", surroundings, total=verified)
-    return replace(rival, background=background, around=around)
+    return replace(rival, background=tuple(rest.maps), around=around)
 
 
 def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
@@ -203,37 +215,6 @@ def _thorough(space: Workspace, best: Registration, settings: ReconstructConfig)
         if best.complete:
             break
     return best
-
-
-def _leave_out_room(
-    space: Workspace, settings: ReconstructConfig
-) -> tuple[StaticBackground, Mapping[str, Float[Tensor, "3 3"]]]:
-    """Leave out the features of a room at rest; return it with each file's map to where it is."""
-    rest = leave_out_room(space.database, settings)
-    if rest.nothing_moves:
-        raise ReconstructionError(
-            f"Nothing moves in {len(space.files)} photographs: {rest.still_fraction:.0%} of the "
-            "matches lie at the same pixel, and in no pair do enough others agree on a motion. "
-            "Camera and background were at rest, and an object that turned has too little "
-            f"texture. {MOVE}"
-        )
-    return rest, dict(zip(space.files, rest.maps, strict=True)) if rest.room else {}
-
-
-def _tell_room(rest: StaticBackground) -> None:
-    left, total = enter_room(rest)
-    how = "lie still in the photographs while others move"
-    if rest.shift_px:
-        how = (
-            f"shift together between photographs, by up to {rest.shift_px:.0f} px, as "
-            "where a camera is turned in its place or pictures are cropped, while others move "
-            "otherwise"
-        )
-    caution(
-        f"{left} of {total} features {how}: they are taken for those of a room before which "
-        "the object turns, and are left out.",
-        stacklevel=3,
-    )
 
 
 def _mapped(

@@ -4,21 +4,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from pimper_torch.ground.geometry.lens_models import photographed, pinhole_lenses, undistort_pixels
+from pimper_torch.ground.geometry.lens_models import photographed, pinhole_lenses
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import SATURATED, to_bytes
 from pimper_torch.method.sfm import colmap
-from pimper_torch.method.sfm.camera_in_place import least_squares_map, mapped
 from pimper_torch.method.sfm.colmap import reprojection_errors
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import undistort, with_undistorted_priors
-from pimper_torch.records import Cameras, Failure, Lens, SparseScene, Views
+from pimper_torch.records import Cameras, Failure, SparseScene, Views
 from pimper_torch.records.scene_parts import with_points, with_views
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.failures import skipped
@@ -44,8 +43,6 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         views.take([number[name] for name in model.names]), model.lenses
     )
     like = views.images
-    lensed = zip(model.background_from_view, model.lenses, intrinsics, strict=False)
-    maps = [_undistorted_map(one, lens, to_pinhole.to(one)) for one, lens, to_pinhole in lensed]
     scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
         cameras=Cameras(
@@ -60,27 +57,11 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         observation_pixels=model.observation_pixels.to(like),
         lenses=model.lenses,
         unregistered=tuple(name for name in views.names if name not in model.names),
-        background_from_view=torch.stack([torch.eye(3).double(), *maps])[1:].to(like),
+        background_from_view=model.background_from_view.to(like),
         offset_world=offset,
         series=model.series.to(like.device),
     )
     return with_undistorted_priors(scene)
-
-
-def _undistorted_map(
-    one: Float[Tensor, "3 3"], lens: Lens, intrinsics: Float[Tensor, "3 3"]
-) -> Float[Tensor, "3 3"]:
-    """Return a map to a static background between undistorted pictures, as one lens has them.
-
-    A homography between distorted pictures is none between undistorted ones: fitted to a raster.
-    """
-    if not bool(one.isfinite().all()):
-        return one
-    across = torch.linspace(0, 1, 9, dtype=one.dtype)
-    raster = torch.cartesian_prod(lens.width * across, lens.height * across)
-    ends = raster, mapped(one, raster)
-    first, second = (mapped(intrinsics, undistort_pixels(lens, pixels)) for pixels in ends)
-    return least_squares_map(first, second)
 
 
 def model_of_scene(scene: SparseScene) -> SparseModel:

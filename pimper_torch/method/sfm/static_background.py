@@ -6,12 +6,11 @@ A rigid scene has still matches, too: points at infinity before a camera that on
 near the axis of a turn. But there one epipolar geometry explains them together with the matches
 that move. No geometry explains a room at rest together with an object that turns.
 
-Where the room shifts from photograph to photograph, because the camera was turned in its place or
-pictures were cropped, it is at rest once photographs are mapped to one of them, see
-:mod:`pimper_torch.method.sfm.camera_in_place`.
+A room that shifts, because the tripod was touched, is not found. A model that was registered on it
+is doubted, see :mod:`pimper_torch.method.sfm.doubt`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
-from pimper_torch.method.sfm.camera_in_place import (
-    mapped,
-    reference_from_photographs,
-    shift_px,
-    still_length_px,
-)
 from pimper_torch.method.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.method.sfm.matching import (
     Keypoints,
@@ -52,8 +45,7 @@ from pimper_torch.runtime.progress import track
 # rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
 _CONTRADICTION = 0.1
 # Longest still match. Of 24 rendered photographs of 640x480, 99 % of the matches of a room at rest
-# are shorter, and 0.4 % of those of a turning mug; where the room shifts and is brought back (20 of
-# 800x600, panned by up to 80 px), 99 % and 0.8 % are shorter than twice as much.
+# are shorter, and 0.4 % of those of a turning mug.
 _STILL_PX = 1.0
 
 
@@ -67,23 +59,27 @@ class StaticBackground(Record):
         moving_pairs: Pairs with still matches in which others move by one epipolar geometry.
         violating_fraction: Of the moving matches in those, the ones that no geometry explains
             together with the still ones; 0 without such pairs.
-        shift_px: How far the room shifts in a photograph, at most, before a camera that was turned
-            in its place or whose pictures were cropped; 0 where it is at rest.
-        maps: From the pixels of each photograph to those where the room is at rest; NaN where a
-            photograph shows too little of it; none without a room.
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
     still_fraction: float
     moving_pairs: int
     violating_fraction: float
-    shift_px: float = 0.0
-    maps: tuple[Float[Tensor, "3 3"], ...] = ()
 
     @property
     def room(self) -> bool:
         """True where something is at rest while something else moves."""
         return self.violating_fraction > _CONTRADICTION
+
+    @property
+    def maps(self) -> list[Float[Tensor, "3 3"]]:
+        """Maps from the pixels of each photograph to those where the room is at rest.
+
+        The identity; NaN where a photograph shows too little of it. None without a room.
+        """
+        identity = torch.eye(3).double()
+        enough = [int(one.sum()) >= MIN_MATCHES for one in self.features]
+        return [identity if one else identity * torch.nan for one in enough] if self.room else []
 
     @property
     def nothing_moves(self) -> bool:
@@ -103,25 +99,17 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
     with quiet(), loaded().Database.open(database) as stored:
         matched = read_matched(stored)
         verifier = Verifier(matched=matched, settings=settings)
-        for maps, pixels, still_px in _ways(matched, settings):
-            rest = find_static_background(
-                pixels,
-                matched.pairs,
-                verifier,
-                still_px=still_px,
-                max_error_px=settings.max_error_px,
-                fewest=MIN_MATCHES,
-            )
-            if rest.room:
-                geometries = read_geometries(stored, matched) | verifier.geometries
-                _keep_moving(stored, matched, pixels, rest, still_px, geometries)
-                few = [int(one.sum()) < MIN_MATCHES for one in rest.features]
-                shown = [
-                    torch.full_like(one, torch.nan) if lacks else one
-                    for one, lacks in zip(maps, few, strict=True)
-                ]
-                shift = shift_px(maps, matched.keypoints)
-                return rest.replace(maps=tuple(shown), shift_px=shift)
+        rest = find_static_background(
+            matched.keypoints,
+            matched.pairs,
+            verifier,
+            still_px=_STILL_PX,
+            max_error_px=settings.max_error_px,
+            fewest=MIN_MATCHES,
+        )
+        if rest.room:
+            geometries = read_geometries(stored, matched) | verifier.geometries
+            _keep_moving(stored, matched, rest, geometries)
     return rest
 
 
@@ -129,25 +117,8 @@ def enter_room(rest: StaticBackground) -> tuple[int, int]:
     """Enter in the ledger how many features rest with a room; return their and all numbers."""
     resting = sum(int(one.sum()) for one in rest.features)
     total = sum(map(len, rest.features))
-    leave_out("sfm.shifted_room" if rest.shift_px else "sfm.room", resting, total=total)
+    leave_out("sfm.room", resting, total=total)
     return resting, total
-
-
-def _ways(
-    matched: Matched, settings: ReconstructConfig
-) -> Iterator[tuple[Sequence[Float[Tensor, "3 3"]], Keypoints, float]]:
-    """List maps of photographs under which a room may rest, pixels there, and still lengths."""
-    maps = reference_from_photographs(
-        matched.keypoints,
-        matched.pairs,
-        max_error_px=2 * _STILL_PX,
-        fewest=MIN_MATCHES,
-        generator=torch.Generator().manual_seed(settings.seed),
-    )
-    if maps is not None:
-        pixels = [mapped(*one).float() for one in zip(maps, matched.keypoints, strict=True)]
-        yield maps, pixels, still_length_px(pixels, matched.pairs, 2 * _STILL_PX)
-    yield [torch.eye(3).double()] * len(matched.keypoints), matched.keypoints, _STILL_PX
 
 
 def find_static_background(
@@ -222,9 +193,7 @@ def _split(
 def _keep_moving(
     stored: Any,  # noqa: ANN401 - pycolmap is untyped
     matched: Matched,
-    pixels: Keypoints,
     rest: StaticBackground,
-    still_px: float,
     geometries: Mapping[PhotographPair, Any],
 ) -> None:
     """Drop features at rest and their matches from the database."""
@@ -238,7 +207,7 @@ def _keep_moving(
     number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
 
     def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
-        rows = rows[moving_matches(pixels, pair, rows, rest, still_px)]
+        rows = rows[moving_matches(matched.keypoints, pair, rows, rest, _STILL_PX)]
         ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
         return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 

@@ -10,7 +10,7 @@ from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.method.sfm import reconstruct
-from pimper_torch.method.sfm.existing import existing_ways
+from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.records import Mesh
 
 
@@ -31,7 +31,7 @@ def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run
     def structure_from_motion(views, config):
         runs.append(config)
         time.sleep(0.3)
-        return existing_ways(views, rendered / "truth" / "sparse").plain[0]
+        return existing_model(views, rendered / "truth" / "sparse")
 
     monkeypatch.setattr(reconstruct, "structure_from_motion", structure_from_motion)
     config = BenchConfig(scenes=(str(rendered),), samples=500)

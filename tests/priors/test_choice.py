@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pimper_torch.method.sfm.conventions.choice import standard_errors, surely_better
+from pimper_torch.priors.choice import standard_errors, surely_better
 
 
 def test_standard_errors_of_a_mean_are_those_of_statistics(generator):

@@ -1,1 +1,0 @@
-"""Conventions that data leave open: candidates, their scores, and when one is believed."""
