@@ -317,3 +317,38 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
     again = pt.load_chain(preset, {REFERENCES[preset]: {"reference": names[7]}})
     named = next(again.steps(scene, mesh=some.replace(faces=faces[:8])))
     assert named.coarse.reference == 7
+
+
+class Mine(nn.Module):
+    """Another structure from motion: it knows the cameras of a scene, and keeps what it is asked."""
+
+    def __init__(self, scene: SparseScene) -> None:
+        super().__init__()
+        self.scene, self.asked = scene, []
+
+    def forward(self, views: pt.Views, sparse_model: object = None) -> SparseScene:
+        self.asked.append((views.names, sparse_model))
+        return self.scene.replace(views=views)
+
+
+class MineWithPoints(Mine):
+    def with_points(self, scene: SparseScene) -> SparseScene:
+        return scene.replace(points_world=scene.points_world + 1)
+
+
+# Hardly any points, and depth maps that agree by chance.
+@pytest.mark.filterwarnings("ignore:No points:pimper_torch.runtime.errors.PimperWarning")
+@pytest.mark.parametrize("preset", PRESETS)
+def test_another_structure_from_motion_places_photographs_and_may_add_points(
+    reconstruction, preset
+):
+    scene, points = reconstruction.scene, reconstruction.scene.points_world
+    for mine, added in ((Mine(scene), 0), (MineWithPoints(scene), 1)):
+        chain = pt.load_chain(preset, reconstruct=mine)
+        placed = chain.placed(chain.running(), scene.views, "model")
+        assert mine.asked == [(scene.views.names, "model")]
+        assert torch.equal(placed.points_world, points)
+        # A scene has its cameras: only points may be asked for.
+        given = chain.placed(chain.running(), scene, None)
+        assert torch.equal(given.points_world, points + added)
+        assert len(mine.asked) == 1

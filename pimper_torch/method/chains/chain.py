@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from torch import nn
 
@@ -14,7 +14,6 @@ from pimper_torch.method.chains.running import Running
 from pimper_torch.method.coarse.depth_points import depth_points
 from pimper_torch.method.coarse.given_mesh import prepared
 from pimper_torch.method.sfm.poses import with_poses
-from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.sfm.sparse_scene import sound
 from pimper_torch.method.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.method.sfm.undistort import with_undistorted_priors
@@ -96,6 +95,17 @@ class Step(Record):
         return self.heights.patches.coarse
 
 
+@runtime_checkable
+class AddsPoints(Protocol):
+    """Structure from motion that finds points for known cameras, too.
+
+    A stage ``reconstruct`` without this method leaves scenes as they are.
+    """
+
+    def with_points(self, scene: SparseScene) -> SparseScene:
+        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed."""
+
+
 class Chain(Stage):
     """A graph of stages from photographs to a mesh.
 
@@ -174,7 +184,7 @@ class Chain(Stage):
             )
         elif mesh is not None:
             refuse_other_axes(mesh, views)
-        elif isinstance(self.reconstruct, Reconstruct):
+        elif isinstance(self.reconstruct, AddsPoints):
             views = self.reconstruct.with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
