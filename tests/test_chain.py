@@ -320,7 +320,7 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
 
 
 class Mine(nn.Module):
-    """Another structure from motion: it knows the cameras of a scene, and keeps what it is asked."""
+    """Another structure from motion: it knows a scene's cameras, and keeps what it is asked."""
 
     def __init__(self, scene: SparseScene) -> None:
         super().__init__()

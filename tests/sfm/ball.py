@@ -1,10 +1,11 @@
 """A textured ball, or a wall, before cameras on an arc, each under its own light; closed forms."""
 
 import torch
+from sparse_models import observed, views_of
 from torch import Tensor
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through
+from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.records import Cameras, Lens, Views
@@ -61,14 +62,7 @@ def photographs(cameras: Cameras, *, lit: bool = True, wall: bool = False) -> Vi
             light *= 1 + 0.3 * view
         shading = (light[0] + points @ light[1:]).clamp_min(0)
         images.append(torch.where(root > 0, 0.1 * albedo(points) * shading, 0.01))
-    stacked = torch.stack(images).reshape(-1, 1, HEIGHT, WIDTH)
-    count = cameras.num_views
-    return Views(
-        images=stacked.clamp_max(0.99),
-        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * count),
-        names=tuple(f"{view}.png" for view in range(count)),
-        focals_px=torch.full((count,), torch.nan, dtype=torch.float64),
-    )
+    return views_of(torch.stack(images).reshape(-1, 1, HEIGHT, WIDTH).clamp_max(0.99))
 
 
 def points_on_the_wall(count: int, generator: torch.Generator) -> Tensor:
@@ -93,24 +87,8 @@ def model_of(
     fraction: float = 1.0,
 ) -> SparseModel:
     """Observe points with noise, in a fraction of the views."""
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = torch.rand(len(points), cameras.num_views, generator=generator) < fraction
     seen[:, :2] = True
-    point, view = torch.nonzero(seen, as_tuple=True)
-    noise = torch.randn(len(point), 2, generator=generator, dtype=torch.float64)
-    lens = Lens(
-        camera=1,
-        model="SIMPLE_RADIAL",
-        params=(FOCAL, WIDTH / 2, HEIGHT / 2, 0.0),
-        width=WIDTH,
-        height=HEIGHT,
-    )
-    return SparseModel(
-        names=tuple(f"{view}.png" for view in range(cameras.num_views)),
-        lenses=(lens,) * cameras.num_views,
-        cam_from_world=cameras.cam_from_world,
-        points_world=points,
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point] + noise_px * noise,
-    )
+    params = (FOCAL, WIDTH / 2, HEIGHT / 2, 0.0)
+    lens = Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=WIDTH, height=HEIGHT)
+    return observed(cameras, points, seen, lens=lens, noise_px=noise_px, generator=generator)

@@ -1,46 +1,26 @@
 import pytest
 import torch
+from sparse_models import observed, views_of
 
-from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.sfm.camera_in_place import follows_camera_in_place, mapped
 from pimper_torch.method.sfm.doubt import count_views_with_depth, doubt, following_fraction
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.sfm.sparse_scene import assemble_scene, write_model
-from pimper_torch.records import Lens, Views
 from pimper_torch.runtime.errors import PimperWarning
-from tests.sfm.captured import FOCAL, HEIGHT, UP, WIDTH, orbit, seen_of_ball
-
-LENS = Lens(
-    camera=1,
-    model="SIMPLE_PINHOLE",
-    params=(FOCAL, WIDTH / 2, HEIGHT / 2),
-    width=WIDTH,
-    height=HEIGHT,
-)
+from tests.sfm.captured import HEIGHT, UP, WIDTH, orbit, seen_of_ball
 
 
-def model_of(points, cam_from_world, pixels, generator):
-    """Give a model that explains its observations to 0.3 px; NaN where not seen."""
-    view, point = torch.nonzero(pixels.isfinite().all(dim=-1), as_tuple=True)
-    noise = 0.3 * torch.randn(len(view), 2, generator=generator, dtype=torch.float64)
-    return SparseModel(
-        names=tuple(f"{index}.png" for index in range(len(cam_from_world))),
-        lenses=(LENS,) * len(cam_from_world),
-        cam_from_world=cam_from_world,
-        points_world=points,
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point] + noise,
-    )
+def noisy(cameras, points, generator, seen=None):
+    """Give a model that explains its observations to 0.3 px."""
+    return observed(cameras, points, seen, noise_px=0.3, generator=generator)
 
 
 def of_a_ball(generator, count=12, span_deg=330.0):
     cameras = orbit(count, span_deg)
     points = torch.randn(400, 3, generator=generator.clone_state(), dtype=torch.float64)
     points = points / points.norm(dim=1, keepdim=True)  # those of seen_of_ball
-    pixels = seen_of_ball(generator, 400, cameras)
-    return model_of(points, cameras.cam_from_world, pixels, generator)
+    seen = seen_of_ball(generator, 400, cameras).isfinite().all(dim=-1).mT
+    return noisy(cameras, points, generator, seen)
 
 
 def of_a_room(generator, count=12):
@@ -51,8 +31,7 @@ def of_a_room(generator, count=12):
     poses[:, 2, 3] = 5.0
     points = 3 * torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1.5
     points[:, 2] *= 0.02
-    pixels, _ = project(points, poses, cameras.intrinsics)
-    return model_of(points, poses, pixels, generator)
+    return noisy(cameras.replace(cam_from_world=poses), points, generator)
 
 
 def test_points_that_follow_a_camera_in_its_place_make_a_consistent_model_that_is_doubtful(
@@ -77,8 +56,7 @@ def test_points_on_a_table_seen_from_round_it_are_believed(generator):
     cameras, up = orbit(12, 50.0), torch.tensor(UP, dtype=torch.float64)
     points = 2 * torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1
     points -= (points @ up)[:, None] * up
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    model = model_of(points, cameras.cam_from_world, pixels, generator)
+    model = noisy(cameras, points, generator)
     assert following_fraction(model) < 0.3
     assert doubt(model, 12) == ""
 
@@ -91,12 +69,7 @@ def test_a_model_of_less_than_half_of_the_photographs_is_doubtful(generator):
 
 def test_a_doubtful_model_says_so_in_the_scene_and_in_a_warning(generator, tmp_path):
     model = of_a_room(generator, 5)
-    views = Views(
-        images=torch.rand(5, 3, HEIGHT, WIDTH, generator=generator),
-        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * 5),
-        names=model.names,
-        focals_px=torch.full((5,), torch.nan),
-    )
+    views = views_of(torch.rand(5, 3, HEIGHT, WIDTH, generator=generator))
     write_model(assemble_scene(views, model), tmp_path)
     with pytest.warns(PimperWarning, match="cameras are doubtful"):
         scene = Reconstruct()(views, tmp_path)
@@ -106,8 +79,7 @@ def test_a_doubtful_model_says_so_in_the_scene_and_in_a_warning(generator, tmp_p
 def test_points_under_small_angles_are_doubtful_though_they_do_not_follow(generator):
     cameras = orbit(8, 3.9)
     points = 2 * torch.randn(400, 3, generator=generator, dtype=torch.float64)
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    model = model_of(points, cameras.cam_from_world, pixels, generator)
+    model = noisy(cameras, points, generator)
     assert following_fraction(model) < 0.5
     assert "0 of 8 photographs are registered and see most" in doubt(model, 8)
 

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sparse_models import views_of
 from torch.testing import assert_close
 
 from pimper_torch.method.sfm.lenses import (
@@ -11,7 +12,6 @@ from pimper_torch.method.sfm.lenses import (
 )
 from pimper_torch.method.sfm.reconstruct import structure_from_motion
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.records import Views
 from tests.sfm.ball import (
     HEIGHT,
     WIDTH,
@@ -42,18 +42,8 @@ def test_photographs_of_one_size_and_focal_length_are_of_one_lens(sizes, focals,
     assert group_lenses(sizes, focals) == groups
 
 
-def views_of(sizes):
-    wide, high = (max(sides) for sides in zip(*sizes, strict=True))
-    return Views(
-        images=torch.rand(len(sizes), 3, high, wide),
-        sizes_px=torch.tensor(sizes),
-        names=tuple(map(str, range(len(sizes)))),
-        focals_px=torch.full((len(sizes),), 10.0),
-    )
-
-
 def test_one_lens_and_one_each_are_what_was_asked_for():
-    views = views_of([(9, 6)] * 3).replace(focals_px=torch.tensor([10.0, 15.0, NAN]))
+    views = views_of(torch.rand(3, 3, 6, 9), focals_px=torch.tensor([10.0, 15.0, NAN]))
     assert choose_lenses(views) == [0, 1, 2]
     assert choose_lenses(views, shared=True) == [0, 0, 0]
     views = views.replace(focals_px=torch.full((3,), NAN))

@@ -8,14 +8,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from sparse_models import observed
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.colmap_library import loaded
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
-from pimper_torch.method.sfm.model import SparseModel, select_views
+from pimper_torch.method.sfm.model import select_views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 POINTS, VIEWS = 20, 4
@@ -27,19 +26,9 @@ def four_views():
     generator = torch.Generator().manual_seed(4)
     cameras = arc_cameras(VIEWS, width=64, height=48, focal_px=80.0, distance=5.0)
     points = torch.randn(POINTS, 3, generator=generator, dtype=torch.float64)
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    point = torch.arange(POINTS).repeat_interleave(3)
-    view = (point + torch.arange(3).repeat(POINTS)) % VIEWS
-    order = torch.argsort(point * VIEWS + view)
-    return SparseModel(
-        names=("a b.png", "c/d.png", "e.png", "f.png"),
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=cameras.cam_from_world.double(),
-        points_world=points,
-        observation_point=point[order],
-        observation_view=view[order],
-        observation_pixels=pixels[view[order], point[order]].double(),
-    )
+    seen = (torch.arange(POINTS)[:, None] + 3) % VIEWS != torch.arange(VIEWS)
+    model = observed(cameras.to(torch.float64), points, seen)
+    return model.replace(names=("a b.png", "c/d.png", "e.png", "f.png"))
 
 
 @pytest.fixture

@@ -2,18 +2,16 @@ from itertools import combinations
 
 import pytest
 import torch
+from sparse_models import observed
 
 from pimper_bench.scenes.whole_scene import upside_down
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.sfm.matching import VerifiedPair
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.moved_object import series_in, with_series
-from pimper_torch.records import Lens
+from pimper_torch.records import Cameras
 from pimper_torch.runtime.errors import PimperWarning
 from tests.sfm.moved import K, bodies, poses
-
-LENS = Lens(camera=1, model="PINHOLE", params=(400.0, 400.0, 160.0, 120.0), width=320, height=240)
 
 
 def model_of(counts, generator, *, moved=True):
@@ -30,18 +28,9 @@ def model_of(counts, generator, *, moved=True):
         facing = outward @ near.mT > 0.64
         placed.append(points)
         seen.append(facing & (series == number) if moved else facing)
-    points, observed = torch.cat(placed), torch.cat(seen)
-    point, view = observed.nonzero(as_tuple=True)
-    pixels = project(points, cameras, K.expand(len(cameras), 3, 3))[0]
-    return SparseModel(
-        names=tuple(f"{view:02d}.jpg" for view in range(len(cameras))),
-        lenses=(LENS,) * len(cameras),
-        cam_from_world=cameras,
-        points_world=points,
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point],
-    )
+    sizes = torch.tensor([[320, 240]] * len(cameras))
+    rig = Cameras(intrinsics=K.expand(len(cameras), 3, 3), cam_from_world=cameras, sizes_px=sizes)
+    return observed(rig, torch.cat(placed), torch.cat(seen))
 
 
 def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generator):
@@ -64,10 +53,12 @@ def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generato
 
 def test_series_are_noted_and_named_and_views_of_a_series_that_is_hardly_there_left_out(generator):
     model = model_of((12, 10), generator)
-    with pytest.warns(PimperWarning, match=r"between 2 series .*12 \(00.jpg.*10 \(12.jpg"):
+    with pytest.warns(PimperWarning, match=r"between 2 series .*12 \(0.png.*10 \(12.png"):
         noted = with_series(model, torch.tensor([0] * 12 + [1] * 10), model.names)
     assert noted.series.tolist() == [0] * 12 + [1] * 10
-    with pytest.warns(PimperWarning, match=r"2 of 22 photographs .* 20.jpg, 21.jpg\. "):
+    with pytest.warns(PimperWarning, match=r"2 of 22 photographs .* 20.png, 21.png\. "):
         alone = with_series(model, torch.tensor([0] * 20 + [1] * 2), model.names)
     assert alone.num_views == 20
     assert len(alone.series) == 0
+    with pytest.warns(PimperWarning, match="background shifts against the object.*--masks"):
+        assert with_series(model, torch.arange(22), model.names) is model

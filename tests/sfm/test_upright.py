@@ -2,13 +2,12 @@ import math
 
 import pytest
 import torch
+from sparse_models import observed
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
 from pimper_torch.method.sfm.lenses import turned_pose
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.upright import level_up, upright
 
 
@@ -42,16 +41,10 @@ def rolled(poses, angles):
 
 def model_of(cameras, points, world_from_true):
     """Put a model in a frame of its own; every view sees every point."""
-    pairs = torch.cartesian_prod(torch.arange(len(points)), torch.arange(cameras.num_views))
     placed = cameras.cam_from_world.double() @ invert_rigid(world_from_true)
-    return SparseModel(
-        names=tuple(f"{index}.png" for index in range(cameras.num_views)),
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=placed,
-        points_world=transform(world_from_true, points.double()),
-        observation_point=pairs[:, 0],
-        observation_view=pairs[:, 1],
-        observation_pixels=torch.zeros(len(pairs), 2).double(),
+    return observed(
+        cameras.to(torch.float64).replace(cam_from_world=placed),
+        transform(world_from_true, points.double()),
     )
 
 

@@ -1,0 +1,58 @@
+"""Photographs, and sparse models of points that cameras see."""
+
+import torch
+from torch import Tensor
+
+from pimper_torch.ground.geometry.lens_models import pinhole_lenses
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.records import Cameras, Lens, Views
+
+
+def views_of(images: Tensor, sizes: list[tuple[int, int]] | None = None, **more: object) -> Views:
+    """Make views without focal lengths, of the images' size unless sizes are given."""
+    count, _, height, width = images.shape
+    given: dict[str, object] = {
+        "images": images,
+        "sizes_px": torch.tensor(sizes or [(width, height)] * count),
+        "names": tuple(f"{index}.png" for index in range(count)),
+        "focals_px": torch.full((count,), torch.nan, dtype=images.dtype),
+    }
+    return Views(**(given | more))
+
+
+def observed(
+    cameras: Cameras,
+    points: Tensor,
+    seen: Tensor | None = None,
+    *,
+    lens: Lens | None = None,
+    noise_px: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> SparseModel:
+    """Make a model in which pinholes observe points with noise.
+
+    Args:
+        cameras: Their poses.
+        points: World frame.
+        seen: Which view sees a point, ``point view``; all by default.
+        lens: Of all views, in the place of the cameras' pinholes: without distortion.
+        noise_px: Standard deviation of the noise.
+        generator: Of the noise.
+    """
+    count = cameras.num_views
+    seen = torch.ones(len(points), count, dtype=torch.bool) if seen is None else seen
+    point, view = seen.nonzero(as_tuple=True)
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    pixels = pixels[view, point].double()
+    if noise_px:
+        pixels += noise_px * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    return SparseModel(
+        names=tuple(f"{index}.png" for index in range(count)),
+        lenses=pinhole_lenses(cameras) if lens is None else (lens,) * count,
+        cam_from_world=cameras.cam_from_world.double(),
+        points_world=points.double(),
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels,
+    )
