@@ -1,7 +1,6 @@
 """Whether a brought mesh is where points and masks show the object."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,7 +12,7 @@ from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.records import Mesh, Record, Silhouettes, SparseScene
+from pimper_torch.records import Mesh, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 
 # Rays: at most so many to points, and so many along a photograph's longer side.
@@ -22,19 +21,19 @@ _MAX_RAYS, _SIDE = 4000, 64
 _NEAR = 0.03
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Rays(Record):
-    """Rays of the cameras, and what is known of each.
+class _Rays(NamedTuple):
+    """Rays of the cameras, to points and then through pixels.
 
     Attributes:
         directions: To a point, with its distance for length; through a pixel.
         inside: Whether a pixel's mask has it; true for points.
+        count: Of those to points.
     """
 
     origins: Float[Tensor, "ray 3"]
     directions: Float[Tensor, "ray 3"]
     inside: Bool[Tensor, " ray"]
-    to_point: Bool[Tensor, " ray"]
+    count: int
 
 
 def compare_with_scene(
@@ -106,10 +105,10 @@ def refuse_other_axes(mesh: Mesh, scene: SparseScene) -> None:
 
 
 class _Fit(NamedTuple):
-    """Agreement of a mesh with photographs; NaN for what nothing tells.
+    """Agreement of a mesh with photographs; NaN for what nothing shows.
 
     Attributes:
-        hits: Of these, the ones that meet the mesh.
+        hits: Of the rays to points, the ones that meet the mesh.
         on_mesh: Fraction of the hits whose point is on it.
         overlap: Of its silhouettes with the masks, intersection over union.
         distance: Median of the hits' points, in diagonals.
@@ -130,40 +129,39 @@ class _Fit(NamedTuple):
 
     def told(self) -> str:
         """State how far off the mesh is, in a part of a sentence."""
-        told = f"rays to {self.hits} of {self.rays} observed points meet it"
+        parts = [f"rays to {self.hits} of {self.rays} observed points meet it"]
         if not math.isnan(self.on_mesh):
-            told = (
-                f"{self.on_mesh:.0%} of {self.hits} observed points whose rays meet it are within "
-                f"{_NEAR:.0%} of its diagonal of it, their median distance is "
-                f"{100 * self.distance:.2g}% of the diagonal ({self.distance * self.diagonal:.3g})"
-            )
-        if math.isnan(self.overlap):
-            return told
-        return f"{told}, and its silhouettes overlap with the masks by {self.overlap:.0%}"
+            parts = [
+                f"{self.on_mesh:.0%} of {self.hits} observed points whose rays meet it are on it, "
+                f"their median distance is {100 * self.distance:.2g}% of the diagonal "
+                f"({self.distance * self.diagonal:.3g})"
+            ]
+        if not math.isnan(self.overlap):
+            parts.append(f"its silhouettes overlap with the masks by {self.overlap:.0%}")
+        return ", and ".join(parts)
 
 
-def _fit(mesh: Mesh, rays: Rays) -> _Fit:
+def _fit(mesh: Mesh, rays: _Rays) -> _Fit:
     used = mesh.vertices_world[mesh.faces.flatten()].double()
     diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
     cast = RayCaster(mesh.vertices_world, mesh.faces).cast(rays.origins, rays.directions)
     met, length = cast.face >= 0, rays.directions.norm(dim=1)
     # Nothing is near in a mesh that the cameras are inside of.
     near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
-    reached = met & rays.to_point
-    hits, count = int(reached.sum()), int(rays.to_point.sum())
-    shown, inside = met[~rays.to_point], rays.inside[~rays.to_point]
+    reached, shown, inside = met[: rays.count], met[rays.count :], rays.inside[rays.count :]
+    hits = int(reached.sum())
     distance = on_mesh = overlap = math.nan
     if hits:
-        points = (rays.origins + rays.directions)[reached]
+        points = (rays.origins + rays.directions)[: rays.count][reached]
         distance = float(NearestSurface(mesh).query(points).distance.median()) / diagonal
-    if hits >= min(30, max(1, count // 4)):  # fewer tell nothing
-        on_mesh = int((near & reached).sum()) / hits
+    if hits >= min(30, max(1, rays.count // 4)):  # fewer tell nothing
+        on_mesh = int((near[: rays.count] & reached).sum()) / hits
     if len(inside):
         overlap = int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
-    return _Fit(count, hits, on_mesh, overlap, distance, diagonal)
+    return _Fit(rays.count, hits, on_mesh, overlap, distance, diagonal)
 
 
-def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
+def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:
     """Return rays to observed points, with masks to those on the object; then through pixels.
 
     Of every photograph that has a mask a raster of pixels is taken.
@@ -193,5 +191,4 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> Rays:
             rays = rays_through(pixels, pose, K)
             parts.append((centers[number].expand_as(rays), rays, mask))
     origins, directions, inside = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
-    to_point = torch.arange(len(origins)) < len(point)
-    return Rays(origins=origins, directions=directions, inside=inside, to_point=to_point)
+    return _Rays(origins, directions, inside, len(point))

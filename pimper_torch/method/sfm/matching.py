@@ -112,25 +112,20 @@ def strongest(
 def verified_pairs(space: Workspace) -> list[VerifiedPair]:
     """Read the matches that were verified, pair by pair."""
     with quiet(), loaded().Database.open(space.database) as stored:
-        number = {image: index for index, image in enumerate(image_ids(stored, space))}
-        pixels = {
-            image: torch.from_numpy(
-                np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
-            )
-            for image in number
-        }
-        found = []
-        for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True):
-            ends = loaded().pair_id_to_image_pair(pair_id)
-            rows = torch.from_numpy(np.array(geometry.inlier_matches).astype(np.int64))
-            rows = rows.reshape(-1, 2)
-            if len(rows):
-                first, second = (
-                    (number[image], pixels[image][rows[:, side]]) for side, image in enumerate(ends)
-                )
-                low, high = sorted((first, second), key=lambda end: end[0])
-                found.append(VerifiedPair(views=(low[0], high[0]), first=low[1], second=high[1]))
-        return found
+        images = image_ids(stored, space)
+        pixels = [read_pixels(stored, image) for image in images]
+        geometries = read_geometries(stored, images)
+    rows = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
+    return pairs_of(pixels, rows)
+
+
+def pairs_of(keypoints: Keypoints, matches: Matches) -> list[VerifiedPair]:
+    """Return matches as pixels, float64, of the pairs that have some."""
+    ends = {pair: pixels_of(keypoints, pair, rows) for pair, rows in matches.items() if len(rows)}
+    return [
+        VerifiedPair(views=pair, first=first.double(), second=second.double())
+        for pair, (first, second) in ends.items()
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -236,10 +231,9 @@ def _clearly_best(alike: Alike, max_ratio: float) -> Bool[Tensor, " feature"]:
 
 def read_features(stored: Any, image: int) -> Features:  # noqa: ANN401 - pycolmap is untyped
     """Read the features of an image of the database."""
-    pixels = np.array(stored.read_keypoints(image))[:, :2].astype(np.float64)
     descriptors = np.array(stored.read_descriptors(image).data).astype(np.float32)
     return Features(
-        pixels=torch.from_numpy(pixels), descriptors=torch.from_numpy(descriptors / 512)
+        pixels=read_pixels(stored, image).double(), descriptors=torch.from_numpy(descriptors / 512)
     )
 
 
@@ -267,10 +261,7 @@ def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no type
     return Matched(
         ids=tuple(image.image_id for image in images),
         cameras=tuple(cameras[image.camera_id] for image in images),
-        keypoints=[
-            torch.from_numpy(np.array(stored.read_keypoints(image.image_id))[:, :2].copy())
-            for image in images
-        ],
+        keypoints=[read_pixels(stored, image.image_id) for image in images],
         pairs=pairs,
     )
 
@@ -323,14 +314,19 @@ class Verifier:
         return {pair: indices(geometry.inlier_matches) for pair, geometry in found.items()}
 
 
-def read_geometries(stored: Any, matched: Matched) -> dict[PhotographPair, Any]:  # noqa: ANN401
-    """Read the geometries of verified pairs."""
-    number = {image: index for index, image in enumerate(matched.ids)}
+def read_geometries(stored: Any, images: Sequence[int]) -> dict[PhotographPair, Any]:  # noqa: ANN401
+    """Read the geometries of verified pairs, by positions among images."""
+    number = {image: index for index, image in enumerate(images)}
     found = {}
     for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True):
         first, second = loaded().pair_id_to_image_pair(pair_id)
         found[number[first], number[second]] = geometry
     return found
+
+
+def read_pixels(stored: Any, image: int) -> Float[Tensor, "feature 2"]:  # noqa: ANN401
+    """Read where an image's features are."""
+    return torch.from_numpy(np.array(stored.read_keypoints(image))[:, :2].copy())
 
 
 def pixels_of(

@@ -29,6 +29,7 @@ from pimper_torch.method.sfm.matching import (
     add_votes,
     among,
     indices,
+    pairs_of,
     pixels_of,
     read_geometries,
     read_matched,
@@ -228,7 +229,7 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPai
         matched = read_matched(stored)
         geometries = {
             pair: geometry
-            for pair, geometry in read_geometries(stored, matched).items()
+            for pair, geometry in read_geometries(stored, matched.ids).items()
             if len(geometry.inlier_matches) >= MIN_MATCHES
         }
         verified = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
@@ -253,12 +254,7 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPai
                 stored.update_two_view_geometry(*ids, verifier.geometries[pair])
         for pair in found.dropped:
             stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
-    pixels = [one.double() for one in matched.keypoints]
-    ends = {pair: pixels_of(pixels, pair, rows) for pair, rows in found.around.items() if len(rows)}
-    return tuple(
-        VerifiedPair(views=pair, first=first, second=second)
-        for pair, (first, second) in ends.items()
-    )
+    return tuple(pairs_of(matched.keypoints, found.around))
 
 
 def series_in(

@@ -108,7 +108,7 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
             fewest=MIN_MATCHES,
         )
         if rest.room:
-            geometries = read_geometries(stored, matched) | verifier.geometries
+            geometries = read_geometries(stored, matched.ids) | verifier.geometries
             _keep_moving(stored, matched, rest, geometries)
     return rest
 
