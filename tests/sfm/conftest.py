@@ -1,5 +1,6 @@
 import pytest
 import torch
+from sparse_models import views_of
 
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import rigid
@@ -55,12 +56,8 @@ def model(generator: torch.Generator, lens: Lens) -> SparseModel:
 
 @pytest.fixture
 def views(generator: torch.Generator, model: SparseModel) -> Views:
-    return Views(
-        images=torch.rand(5, 3, 60, 80, generator=generator, dtype=torch.float64),
-        sizes_px=torch.tensor([[80, 60]] * 5),
-        names=model.names,
-        focals_px=torch.full((5,), torch.nan, dtype=torch.float64),
-    )
+    images = torch.rand(5, 3, 60, 80, generator=generator, dtype=torch.float64)
+    return views_of(images, names=model.names)
 
 
 @pytest.fixture

@@ -8,54 +8,51 @@ from pimper_torch.runtime.errors import ReconstructionError
 NAMES = tuple(f"{index:02d}.jpg" for index in range(20))
 
 
-def test_the_largest_component_is_kept_when_it_is_a_clear_majority():
-    assert choose_component([NAMES[:4], NAMES[4:20]], [4, 16], NAMES, 0.6) == 1
+@pytest.mark.parametrize(
+    ("parts", "spread", "chosen"),
+    [
+        ([NAMES[:4], NAMES[4:20]], [4, 16], 1),  # a clear majority
+        ([NAMES[:5]], [5], 0),  # small, without a rival
+        ([NAMES[:8], NAMES[2:8]], [8, 6], 0),  # what is inside the largest is no rival
+        ([NAMES, NAMES[:13]], [0, 13], 1),  # the larger one sees no depth
+        ([NAMES, NAMES[:7]], [2, 7], 1),  # nor is it a rival to less than the majority
+    ],
+)
+def test_the_largest_component_that_sees_depth_is_kept(parts, spread, chosen):
+    assert choose_component(parts, spread, NAMES, 0.6) == chosen
 
 
-def test_a_small_model_without_a_rival_is_kept():
-    assert choose_component([NAMES[:5]], [5], NAMES, 0.6) == 0
+LOW = "sides from low down in every series"
+FEW = "registered {} of 6 photographs; at least 3 are needed.*05.jpg"
 
 
-def test_a_component_inside_the_largest_one_is_no_rival():
-    assert choose_component([NAMES[:8], NAMES[2:8]], [8, 6], NAMES, 0.6) == 0
-
-
-def test_a_split_in_halves_is_refused_with_sizes_names_and_advice():
-    with pytest.raises(ReconstructionError) as caught:
-        choose_component([NAMES[:9], NAMES[9:16]], [9, 7], NAMES, 0.6)
-    message = str(caught.value)
-    assert "split 20 photographs into 2 models" in message
-    assert "9 photographs (00.jpg" in message
-    assert "7 photographs (09.jpg" in message
-    assert "add photographs between" in message
-    assert "turned over" in message
-    assert "sides from low down in every series" in message
-
-
-@pytest.mark.parametrize("parts", [[], [NAMES[:2]], [NAMES[:2], NAMES[2:4]]])
-def test_fewer_than_three_views_are_refused_with_how_many_and_which(parts):
-    with pytest.raises(ReconstructionError, match="at least 3 are needed") as caught:
-        choose_component(parts, [len(part) for part in parts], NAMES[:6], 0.6)
-    message = str(caught.value)
-    assert f"registered {len(parts[0]) if parts else 0} of 6 photographs" in message
-    assert "05.jpg" in message
-    assert ("00.jpg" in message) == (not parts)
-
-
-def test_the_component_that_sees_depth_is_kept_before_a_larger_one_that_does_not():
-    assert choose_component([NAMES, NAMES[:13]], [0, 13], NAMES, 0.6) == 1
-    # What lies on the background is no rival, even to less than the majority.
-    assert choose_component([NAMES, NAMES[:7]], [2, 7], NAMES, 0.6) == 1
-
-
-def test_cameras_in_one_place_are_refused_with_what_happened_and_what_to_do():
-    with pytest.raises(ReconstructionError) as caught:
-        choose_component([NAMES], [0], NAMES, 0.6)
-    message = str(caught.value)
-    assert "registered 20 of 20 photographs, but only 0 of them see" in message
-    assert "background at rest" in message
-    for way in ("masks", "plain cloth", "move the camera"):
-        assert way in message
+@pytest.mark.parametrize(
+    ("parts", "spread", "names", "sentence"),
+    [
+        (
+            [NAMES[:9], NAMES[9:16]],
+            [9, 7],
+            NAMES,
+            r"split 20 photographs into 2 models.*9 photographs \(00.jpg.*7 photographs \(09.jpg.*"
+            f"add photographs between.*turned over.*{LOW}",
+        ),
+        ([], [], NAMES[:6], FEW.format(0)),
+        ([NAMES[:2]], [2], NAMES[:6], FEW.format(2)),
+        ([NAMES[:2], NAMES[2:4]], [2, 2], NAMES[:6], FEW.format(2)),
+        (
+            [NAMES],
+            [0],
+            NAMES,
+            "registered 20 of 20 photographs, but only 0 of them see.*background at rest.*masks"
+            ".*plain cloth.*move the camera",
+        ),
+    ],
+)
+def test_no_component_is_chosen_where_views_are_split_few_or_in_one_place(
+    parts, spread, names, sentence
+):
+    with pytest.raises(ReconstructionError, match=sentence):
+        choose_component(parts, spread, names, 0.6)
 
 
 def test_a_view_counts_if_enough_of_its_points_are_seen_from_aside(model):

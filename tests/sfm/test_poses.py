@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sparse_models import views_of
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -13,7 +14,7 @@ from pimper_torch.method.sfm.poses import (
     pictures_of_poses,
     with_poses,
 )
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import InputError
 
 POSES = (0, 1, 0, 2, 1, 0)
@@ -22,9 +23,8 @@ POSES = (0, 1, 0, 2, 1, 0)
 @pytest.fixture
 def views():
     generator = torch.Generator().manual_seed(5)
-    return Views(
-        images=torch.rand(6, 3, 8, 12, generator=generator),
-        sizes_px=torch.tensor([[12, 8]]).repeat(6, 1),
+    return views_of(
+        torch.rand(6, 3, 8, 12, generator=generator),
         names=tuple("abcdef"),
         masks=torch.rand(6, 8, 12, generator=generator) > 0.5,
         focals_px=torch.tensor([100.0, torch.nan, 102.0, 90.0, torch.nan, torch.nan]),
