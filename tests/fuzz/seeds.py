@@ -1,7 +1,6 @@
 """Small valid files of every kind that the package reads, and their readers."""
 
 import json
-import sys
 import warnings
 from base64 import b64decode
 from collections.abc import Callable
@@ -15,10 +14,6 @@ import tifffile
 import torch
 import trimesh
 from PIL import Image, ImageCms, PngImagePlugin
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "io"))
-from dng import write_dng
-from heic_files import UPRIGHT
 
 from pimper_bench.datasets import (
     read_camera_file,
@@ -57,6 +52,8 @@ from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.config import build, read_mapping, to_yaml
+from tests.io.dng import write_dng
+from tests.io.heic_files import UPRIGHT
 
 
 @dataclass(frozen=True)
@@ -69,10 +66,23 @@ class Seed:
     read: Callable[[Path], object]
 
 
+PIXELS = np.random.default_rng(7).integers(60, 200, (18, 24, 3), dtype=np.uint8)
+DEEP = PIXELS.astype(np.uint16) * 256
+MASK = np.pad(np.full((10, 14), 255, dtype=np.uint8), ((4, 4), (5, 5)))
+CAMERAS = arc_cameras(4, width=24, height=18, focal_px=30.0, distance=5.0)
+VIEWS = Views(
+    images=torch.full((4, 3, 18, 24), 0.5),
+    sizes_px=torch.tensor([[24, 18]] * 4),
+    names=("0.png", "1.png", "2.png", "3.png"),
+    focals_px=torch.full((4,), torch.nan),
+    masks=torch.from_numpy(MASK > 0).expand(4, -1, -1),
+)
+
+
 def make_seeds(root: Path) -> list[Seed]:
     """Write all folders below a root, and check that their readers take them."""
     seeds = [
-        *_images(root / "image"),
+        *(_alone(root / "image", name, write, decode) for name, write in _pictures().items()),
         *_photographs(root / "photographs"),
         *_meshes(root / "mesh"),
         *_models(root / "model"),
@@ -90,139 +100,125 @@ def make_seeds(root: Path) -> list[Seed]:
     return seeds
 
 
-def _pixels(width: int = 24, height: int = 18, low: int = 60) -> np.ndarray:
-    return np.random.default_rng(7).integers(low, 200, (height, width, 3), dtype=np.uint8)
+def _alone(
+    root: Path, name: str, write: Callable[[Path], object], read: Callable[[Path], object]
+) -> Seed:
+    """Write a file into a folder of its own."""
+    folder = root / name.replace(".", "_")
+    folder.mkdir(parents=True)
+    write(folder / name)
+    return Seed(f"{root.name} {name}", folder, (name,), lambda copy: read(copy / name))
 
 
 def _ball() -> Mesh:
     vertices, faces = icosphere(1)
-    bright = torch.linspace(0.2, 0.9, len(vertices))[:, None].expand(-1, 3)
-    error = torch.full((len(vertices),), 0.1)
+    grey = torch.full((len(vertices), 3), 0.5).double()
     return Mesh(
         vertices_world=vertices.double(),
         faces=faces,
-        albedo=bright.double(),
-        confidence=0.5 + 0 * error.double(),
-        expected_error=error.double(),
+        albedo=grey,
+        confidence=grey[:, 0],
+        expected_error=grey[:, 0],
     )
 
 
-def _images(root: Path) -> list[Seed]:
-    root.mkdir(parents=True)
-    pixels, deep = _pixels(), _pixels().astype(np.uint16) * 256
+def _pictures() -> dict[str, Callable[[Path], object]]:
     exif = Image.Exif()
     exif[274] = 6
     exif.get_ifd(0x8769)[0xA405] = 50
-    Image.fromarray(pixels).save(root / "a.jpg", exif=exif, quality=90)
-    Image.fromarray(pixels).save(root / "progressive.jpg", progressive=True)
-    Image.fromarray(pixels).save(root / "a.png")
-    Image.fromarray(pixels).quantize(16).save(root / "palette.png", transparency=bytes([0, 255]))
-    rgba = np.concatenate([pixels, pixels[..., :1] // 120 * 255], axis=2)
-    Image.fromarray(rgba).save(root / "rgba.png")
-    write_deep_png(deep, root / "deep.png")
-    Image.fromarray(deep[..., 0]).save(root / "deep_grey.png")
-    Image.fromarray(pixels).save(root / "a.tif", compression="tiff_lzw", exif=exif)
-    tifffile.imwrite(root / "deep.tif", deep, photometric="rgb")
-    tifffile.imwrite(root / "deep_deflate.tif", deep, photometric="rgb", compression="zlib")
-    planes = np.moveaxis(deep, -1, 0)
-    tifffile.imwrite(root / "planes.tif", planes, photometric="rgb", planarconfig="separate")
-    tifffile.imwrite(root / "tiled.tif", deep, photometric="rgb", tile=(16, 16))
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    for name in ("profile.jpg", "profile.png", "profile.tif"):
-        Image.fromarray(pixels).save(root / name, icc_profile=profile)
-    with tifffile.TiffWriter(root / "pages.tif") as file:
-        file.write(pixels[::2, ::2], photometric="rgb", subfiletype=1)
-        file.write(pixels, photometric="rgb", extratags=[(281, "H", 3, (255,) * 3, True)])
+    plain = Image.fromarray(PIXELS)
+    rgba = Image.fromarray(np.concatenate([PIXELS, PIXELS[..., :1] // 120 * 255], axis=2))
+
+    def saved(picture: Image.Image, **how: object) -> Callable[[Path], object]:
+        return lambda path: picture.save(path, **how)
+
+    def tiff(values: np.ndarray, **how: object) -> Callable[[Path], object]:
+        return lambda path: tifffile.imwrite(path, values, photometric="rgb", **how)
+
+    def pages(path: Path) -> None:
+        with tifffile.TiffWriter(path) as file:
+            file.write(PIXELS[::2, ::2], photometric="rgb", subfiletype=1)
+            file.write(PIXELS, photometric="rgb", extratags=[(281, "H", 3, (255,) * 3, True)])
+
+    pictures = {
+        "a.jpg": saved(plain, exif=exif, quality=90),
+        "progressive.jpg": saved(plain, progressive=True),
+        "a.png": saved(plain),
+        "palette.png": saved(plain.quantize(16), transparency=bytes([0, 255])),
+        "rgba.png": saved(rgba),
+        "deep.png": lambda path: write_deep_png(DEEP, path),
+        "deep_grey.png": saved(Image.fromarray(DEEP[..., 0])),
+        "a.tif": saved(plain, compression="tiff_lzw", exif=exif),
+        "deep.tif": tiff(DEEP),
+        "deep_deflate.tif": tiff(DEEP, compression="zlib"),
+        "planes.tif": tiff(np.moveaxis(DEEP, -1, 0), planarconfig="separate"),
+        "tiled.tif": tiff(DEEP, tile=(16, 16)),
+        "pages.tif": pages,
+        "profile.jpg": saved(plain, icc_profile=profile),
+        "profile.png": saved(plain, icc_profile=profile),
+        "profile.tif": saved(plain, icc_profile=profile),
+        "a.bmp": saved(plain),
+        "a.ppm": saved(plain),
+    }
     if find_spec("rawpy"):
-        write_dng(root / "a.dng", np.tile(deep[..., 1] // 16, (2, 2)), equivalent=50)
+        raw = np.tile(DEEP[..., 1] // 16, (2, 2))
+        pictures["a.dng"] = lambda path: write_dng(path, raw, equivalent=50)
     if find_spec("pi_heif") or find_spec("pillow_heif"):
-        (root / "a.heic").write_bytes(b64decode(UPRIGHT))
-    Image.fromarray(pixels).save(root / "a.bmp")
-    Image.fromarray(pixels).save(root / "a.ppm")
-    names = sorted(path.name for path in root.iterdir())
-    return [Seed(f"image {name}", _alone(root, name), (name,), _decoder(name)) for name in names]
-
-
-def _alone(root: Path, name: str) -> Path:
-    folder = root / "of" / name.replace(".", "_")
-    folder.mkdir(parents=True)
-    (folder / name).write_bytes((root / name).read_bytes())
-    return folder
-
-
-def _decoder(name: str) -> Callable[[Path], object]:
-    return lambda folder: decode(folder / name)
+        pictures["a.heic"] = lambda path: path.write_bytes(b64decode(UPRIGHT))
+    return pictures
 
 
 def _photographs(root: Path) -> list[Seed]:
+    for folder in ("photos", "masks"):
+        (root / folder).mkdir(parents=True)
     for name in ("1", "2", "3"):
-        for folder in ("photos", "masks"):
-            (root / folder).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(_pixels()).save(root / "photos" / f"{name}.jpg")
-        mask = np.zeros((18, 24), dtype=np.uint8)
-        mask[4:14, 5:19] = 255
-        Image.fromarray(mask).save(root / "masks" / f"{name}.png")
+        Image.fromarray(PIXELS).save(root / "photos" / f"{name}.jpg")
+        Image.fromarray(MASK).save(root / "masks" / f"{name}.png")
     files = ("photos/1.jpg", "photos/2.jpg", "masks/1.png", "masks/2.png")
+
+    def masked(folder: Path) -> object:
+        return load_views(folder / "photos", masks=folder / "masks")
+
     return [
         Seed("photographs", root, files, lambda folder: load_views(folder / "photos")),
-        Seed(
-            "masks",
-            root,
-            files,
-            lambda folder: load_views(folder / "photos", masks=folder / "masks"),
-        ),
+        Seed("masks", root, files, masked),
     ]
 
 
 def _meshes(root: Path) -> list[Seed]:
-    root.mkdir(parents=True)
     mesh = _ball()
-    write_ply(mesh, root / "a.ply")
-    write_glb(mesh, root / "a.glb")
     plain = trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False)
-    for name, options in {
-        "text.ply": {"encoding": "ascii"},
-        "a.obj": {},
-        "a.stl": {},
-        "text.stl": {"file_type": "stl_ascii"},
-        "a.off": {},
-    }.items():
-        plain.export(root / name, **options)
-    names = sorted(path.name for path in root.iterdir())
 
-    def reader(name: str) -> Callable[[Path], object]:
-        return lambda folder: read_mesh(folder / name)
+    def exported(**how: object) -> Callable[[Path], object]:
+        return lambda path: plain.export(path, **how)
 
-    return [Seed(f"mesh {name}", _alone(root, name), (name,), reader(name)) for name in names]
+    writers: dict[str, Callable[[Path], object]] = {
+        "a.ply": lambda path: write_ply(mesh, path),
+        "a.glb": lambda path: write_glb(mesh, path),
+        "text.ply": exported(encoding="ascii"),
+        "a.obj": exported(),
+        "a.stl": exported(),
+        "text.stl": exported(file_type="stl_ascii"),
+        "a.off": exported(),
+    }
+    return [_alone(root, name, write, read_mesh) for name, write in writers.items()]
 
 
-def _model() -> tuple[SparseModel, Views]:
-    cameras = arc_cameras(4, width=24, height=18, focal_px=30.0, distance=5.0)
+def _models(root: Path) -> list[Seed]:
     generator = torch.Generator().manual_seed(1)
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64) * 0.5
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    pixels, _ = project(points, CAMERAS.cam_from_world, CAMERAS.intrinsics)
     point, view = torch.arange(30).repeat_interleave(4), torch.arange(4).repeat(30)
-    names = tuple(f"{index}.png" for index in range(4))
     model = SparseModel(
-        names=names,
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=cameras.cam_from_world.double(),
+        names=VIEWS.names,
+        lenses=pinhole_lenses(CAMERAS),
+        cam_from_world=CAMERAS.cam_from_world.double(),
         points_world=points,
         observation_point=point,
         observation_view=view,
         observation_pixels=pixels[view, point].double(),
     )
-    views = Views(
-        images=torch.full((4, 3, 18, 24), 0.5),
-        sizes_px=torch.tensor([[24, 18]] * 4),
-        names=names,
-        focals_px=torch.full((4,), torch.nan),
-    )
-    return model, views
-
-
-def _models(root: Path) -> list[Seed]:
-    model, views = _model()
     colors = torch.zeros(30, 3, dtype=torch.uint8)
     write_binary(model, colors, root / "bin")
     (root / "txt").mkdir()
@@ -232,86 +228,66 @@ def _models(root: Path) -> list[Seed]:
         files = tuple(sorted(path.name for path in (root / kind).iterdir()))
         seeds += [
             Seed(f"model {kind}", root / kind, files, read_model),
-            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_model(views, at)),
+            Seed(f"sparse {kind}", root / kind, files, lambda at: existing_model(VIEWS, at)),
         ]
     return seeds
 
 
 def _tables(root: Path) -> list[Seed]:
-    root.mkdir(parents=True)
-    curve = [(level / 255) ** 2.2 for level in range(256)]
-    (root / "curve.csv").write_text(
-        "level,radiance\n" + "".join(f"{level},{value:.6f}\n" for level, value in enumerate(curve))
-    )
-    np.save(root / "curve.npy", np.array(curve))
-    (root / "settings.yaml").write_text(to_yaml(CoarseToFineConfig()))
-    save_record(_ball(), root / "mesh.safetensors")
+    curve = np.linspace(0, 1, 256) ** 2.2
+    text = "level,radiance\n" + "".join(f"{i},{value:.6f}\n" for i, value in enumerate(curve))
     arrays = {"fc": np.array([30.0, 30]), "cc": np.array([12.0, 9])}
-    cameras = arc_cameras(2, width=24, height=18, focal_px=30.0, distance=5.0)
     for view in (1, 2):
-        arrays[f"Rc_{view}"] = cameras.cam_from_world[view - 1, :3, :3].numpy()
-        arrays[f"Tc_{view}"] = cameras.cam_from_world[view - 1, :3, 3:].numpy()
-    scipy.io.savemat(root / "calibration.mat", arrays)
-    scipy.io.savemat(root / "packed.mat", arrays, do_compression=True)
+        arrays[f"Rc_{view}"] = CAMERAS.cam_from_world[view - 1, :3, :3].numpy()
+        arrays[f"Tc_{view}"] = CAMERAS.cam_from_world[view - 1, :3, 3:].numpy()
 
-    def curves(name: str) -> Callable[[Path], object]:
-        return lambda folder: read_curve(folder / name)
-
-    def matlab(folder: Path) -> object:
-        name = next(folder.iterdir()).name
-        file = DataSetPath(folder / name, "a test")
+    def matlab(path: Path) -> object:
+        file = DataSetPath(path, "a test")
         read_matlab(file, ("fc",))
         return read_toolbox_projections(file, (1, 2))
 
-    def settings(folder: Path) -> object:
-        path = folder / "settings.yaml"
+    def config(path: Path) -> object:
         return build(CoarseToFineConfig, read_mapping(path), str(path))
 
-    readers: dict[str, Callable[[Path], object]] = {
-        **{name: curves(name) for name in ("curve.csv", "curve.npy")},
-        "settings.yaml": settings,
-        # Values are checked by the stages that take a record.
-        "mesh.safetensors": lambda folder: load_record(Mesh, folder / "mesh.safetensors") and None,
-        "calibration.mat": matlab,
-        "packed.mat": matlab,
+    def record(path: Path) -> object:
+        return load_record(Mesh, path) and None  # stages that take a record check its values
+
+    files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
+        "curve.csv": (lambda path: path.write_text(text), read_curve),
+        "curve.npy": (lambda path: np.save(path, curve), read_curve),
+        "settings.yaml": (lambda path: path.write_text(to_yaml(CoarseToFineConfig())), config),
+        "mesh.safetensors": (lambda path: save_record(_ball(), path), record),
+        "calibration.mat": (lambda path: scipy.io.savemat(path, arrays), matlab),
+        "packed.mat": (lambda path: scipy.io.savemat(path, arrays, do_compression=True), matlab),
     }
-    return [Seed(name, _alone(root, name), (name,), reader) for name, reader in readers.items()]
+    return [_alone(root, name, write, read) for name, (write, read) in files.items()]
 
 
 def _maps(root: Path) -> list[Seed]:
-    root.mkdir(parents=True)
-    depth = _pixels()[..., 0].astype(np.float32)
+    depth = PIXELS[..., 0].astype(np.float32)
     normals = depth[..., None] / 300 - np.ones(3, np.float32)
-    np.save(root / "a.npy", normals)
-    np.savez(root / "a.npz", normals=normals, variance=depth)
-    write_exr(normals, root / "a.exr")
-    text = PngImagePlugin.PngInfo()
-    text.add_text("near", "0.5")
-    text.add_text("far", "9")
-    Image.fromarray(depth.astype(np.uint16)).save(root / "a.png", pnginfo=text)
-    views = Views(
-        images=torch.zeros(1, 1, 18, 24),
-        sizes_px=torch.tensor([[24, 18]]),
-        names=("a.jpg",),
-        focals_px=torch.ones(1),
-    )
+    limits = PngImagePlugin.PngInfo()
+    limits.add_text("near", "0.5")
+    limits.add_text("far", "9")
+    views = VIEWS.take([0]).replace(names=("a.jpg",))
+    picture = Image.fromarray(depth.astype(np.uint16))
+    writers: dict[str, Callable[[Path], object]] = {
+        "a.npy": lambda path: np.save(path, normals),
+        "a.npz": lambda path: np.savez(path, normals=normals, variance=depth),
+        "a.exr": lambda path: write_exr(normals, path),
+        "a.png": lambda path: picture.save(path, pnginfo=limits),
+    }
 
-    def read(folder: Path) -> object:
-        if (folder / "a.png").exists():
-            return read_depth(folder, views).depth
-        return read_normals(folder, views).normals
+    def read(path: Path) -> object:
+        if path.suffix == ".png":
+            return read_depth(path.parent, views).depth
+        return read_normals(path.parent, views).normals
 
-    names = ("a.npy", "a.npz", "a.exr", "a.png")
-    return [Seed(f"map {name}", _alone(root, name), (name,), read) for name in names]
+    return [_alone(root, name, write, read) for name, write in writers.items()]
 
 
 def _datasets(root: Path) -> list[Seed]:
-    _, views = _model()
-    masks = torch.zeros(4, 18, 24, dtype=torch.bool)
-    masks[:, 4:14, 5:19] = True
-    views = views.replace(masks=masks)
-    cameras = arc_cameras(4, width=24, height=18, focal_px=30.0, distance=5.0)
-    points = _ball().vertices_world
+    views, cameras, points = VIEWS, CAMERAS, _ball().vertices_world
     write_transforms(views, cameras, root / "transforms", points_world=points)
     write_idr(views, cameras, root / "idr", points_world=points)
     write_colmap(views, cameras, root / "colmap", points_world=points)
@@ -319,7 +295,7 @@ def _datasets(root: Path) -> list[Seed]:
     for kind in ("llff/images", "meshroom", "metashape/images", "diligent"):
         (root / kind).mkdir(parents=True)
         for name in views.names:
-            Image.fromarray(_pixels()).save(root / kind / name)
+            Image.fromarray(PIXELS).save(root / kind / name)
     rows, placed = [], []
     for index, name in enumerate(views.names):
         pose = world_from_cam[index]
@@ -347,9 +323,8 @@ def _datasets(root: Path) -> list[Seed]:
     (root / "diligent" / "light_directions.txt").write_text(lights)
     (root / "diligent" / "light_intensities.txt").write_text("1 1 1\n" * 4)
     (root / "diligent" / "filenames.txt").write_text("\n".join(views.names))
-    Image.fromarray(255 * masks[0].numpy().astype(np.uint8)).save(root / "diligent" / "mask.png")
-    normals = np.zeros((18, 24, 3))
-    normals[..., 2] = 1
+    Image.fromarray(MASK).save(root / "diligent" / "mask.png")
+    normals = np.broadcast_to([0.0, 0, 1], (18, 24, 3))
     scipy.io.savemat(root / "diligent" / "Normal_gt.mat", {"Normal_gt": normals})
     readers: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
         "transforms": (read_transforms, ("transforms.json",)),
@@ -373,23 +348,16 @@ def _datasets(root: Path) -> list[Seed]:
 
 def _camera_files(root: Path) -> list[Seed]:
     """Write cameras that come with photographs of other folders, as `--sparse FILE` reads them."""
-    root.mkdir(parents=True)
-    _, views = _model()
-    cameras = arc_cameras(len(views.names), width=24, height=18, focal_px=30.0, distance=5.0)
-    K, poses = cameras.intrinsics.numpy(), cameras.cam_from_world.numpy()
-    np.savez(root / "turned.npz", K=K, cam_from_world=poses)
-    np.savez_compressed(root / "projections.npz", P=K @ poses[:, :3])
-    return [
-        Seed(
-            f"cameras {name}",
-            _alone(root, name),
-            (name,),
-            lambda at, name=name: read_cameras(
-                at / name, views.names, lambda names: [(24, 18)] * len(names)
-            ),
-        )
-        for name in ("turned.npz", "projections.npz")
-    ]
+    K, poses = CAMERAS.intrinsics.numpy(), CAMERAS.cam_from_world.numpy()
+    writers: dict[str, Callable[[Path], object]] = {
+        "turned.npz": lambda path: np.savez(path, K=K, cam_from_world=poses),
+        "projections.npz": lambda path: np.savez_compressed(path, P=K @ poses[:, :3]),
+    }
+
+    def read(path: Path) -> object:
+        return read_cameras(path, VIEWS.names, lambda names: [(24, 18)] * len(names))
+
+    return [_alone(root, name, write, read) for name, write in writers.items()]
 
 
 def _videos(root: Path) -> list[Seed]:
@@ -397,26 +365,20 @@ def _videos(root: Path) -> list[Seed]:
         return []
     import av
 
-    root.mkdir(parents=True)
-    seeds = []
-    for name in ("a.mp4", "a.mkv"):
-        with av.open(str(root / name), "w") as container:
+    def write(path: Path) -> None:
+        with av.open(str(path), "w") as container:
             stream = container.add_stream("mpeg4", rate=30)
             stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
             for shift in range(8):
-                picture = np.roll(np.tile(_pixels(), (2, 2, 1))[:32, :48], shift, axis=1)
+                picture = np.roll(np.tile(PIXELS, (2, 2, 1))[:32, :48], shift, axis=1)
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
-        seeds.append(
-            Seed(
-                f"video {name}",
-                _alone(root, name),
-                (name,),
-                lambda at, name=name: [*luma_frames(at / name)] and None,
-            )
-        )
-    return seeds
+
+    return [
+        _alone(root, name, write, lambda path: [*luma_frames(path)] and None)
+        for name in ("a.mp4", "a.mkv")
+    ]
 
 
 def _rendered(root: Path) -> Seed:
@@ -427,6 +389,6 @@ def _rendered(root: Path) -> Seed:
     files = tuple(
         str(path.relative_to(root))
         for path in sorted((root / "truth").rglob("*"))
-        if path.is_file() and path.suffix in (".json", ".npz", ".ply", ".bin")
+        if path.suffix in (".json", ".npz", ".ply", ".bin")
     )
-    return Seed("rendered", root, (*files, "truth/scene.json", "truth/lights.json"), read_rendered)
+    return Seed("rendered", root, files, read_rendered)

@@ -73,7 +73,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
 def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
     """Return a frame's width and height, where the file says them."""
     sides = frame.get("w"), frame.get("h")
-    if not all(isinstance(side, int | float) and 0 < side < math.inf for side in sides):
+    if not all(type(side) in (int, float) and 0 < float(str(side)) < math.inf for side in sides):
         return None
     return round(float(str(sides[0]))), round(float(str(sides[1])))
 
