@@ -10,7 +10,7 @@ from torch import nn
 from pimper_torch.method.chains.presets import load_chain
 from pimper_torch.method.meshing.repair import Repair
 from pimper_torch.records import Silhouettes
-from pimper_torch.runtime.errors import PimperWarning, caution, held
+from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.stage import Given, Then
 
 
@@ -45,21 +45,6 @@ def iterations(messages):
 
 def test_the_last_rounds_figures_are_said_once():
     assert iterations([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]]) == ["3 of 10"]
-
-
-def test_what_the_last_round_has_mended_is_not_said():
-    assert iterations([["9 of 10"], [], []]) == []
-
-
-def broken_round():
-    with held():
-        caution("3 of 10")
-        raise ValueError("broken")
-
-
-def test_a_round_that_fails_says_what_it_held_back():
-    with pytest.warns(PimperWarning, match="3 of 10"), pytest.raises(ValueError, match="broken"):
-        broken_round()
 
 
 def test_outside_of_rounds_a_caution_comes_at_once(pytestconfig):

@@ -2,12 +2,12 @@
 
 import logging
 import warnings
-from dataclasses import replace
 
 import pytest
 import torch
 from comparison import compare_in_view
 from photographs import save_masks, save_photographs
+from probes import small_scene
 from torch import nn
 from torch.nn.functional import normalize
 
@@ -148,18 +148,20 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
     assert fine < 1.5 * coarse
 
 
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_held_out_photographs_leave_the_surface_to_the_others():
-    scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
-    sparse = sparse_scene(scene, 150, torch.Generator().manual_seed(17))
-    used, held = held_apart(sparse, 4)
-    pimper = small_chain("default", sparse)
-    pimper.config = replace(pimper.config, hold_out=4, scales=(1.0,))
-    result = pimper(scene.views)
+    scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=48))
+    used, held = held_apart(scene, 3)
+
+    def of(some, hold_out):
+        stages = {"silhouettes": Given(pt.Silhouettes.everything(used.views))}
+        stages |= {"reconstruct": Given(some), "coarse_surface": Given(coarse)}
+        settings = {"scales": [1.0], "hold_out": hold_out}
+        return pt.load_chain("default", settings, **stages)(some.views)
+
+    result, alone = of(scene, 3), of(used, 0)
     assert result.held_out.views.names == held.views.names
     assert result.scene.views.names == used.views.names
-    chain = small_chain("default", used)
-    chain.config = replace(chain.config, scales=(1.0,))
-    alone = chain(used.views)
     assert torch.equal(result.mesh.vertices_world, alone.mesh.vertices_world)
     assert alone.held_out is None
 
@@ -230,9 +232,7 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene):
     )
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pimper_torch.runtime.errors.PimperWarning"
-)  # lit in too few views
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")  # few views
 @pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     """With the coarse surface's own details for small photographs."""
@@ -256,9 +256,7 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     assert extracted.figures["openings"] == 0
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pimper_torch.runtime.errors.PimperWarning"
-)  # lit in too few views
+@pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")  # few views
 def test_fast_is_closed_all_round_in_one_pass():
     scene = ball.photographed(ball.all_round())
     views = scene.views.replace(masks=ball.silhouettes_of(scene.cameras).masks)

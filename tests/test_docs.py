@@ -40,8 +40,8 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
 BLOCKS = BLOCK.findall(README)
-COMMAND = re.compile(r"^    (?:.*&& )?pimper (.+)$", flags=re.MULTILINE)
-COMMANDS = COMMAND.findall(README)
+
+
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
     for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
@@ -278,12 +278,6 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
 }
 
 
-def run_block(page: str, number: int, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
-    names = GIVEN_TO[page, number](monkeypatch)
-    exec(compile(BLOCK.findall(PAGES[page])[number], f"{page}, {number}", "exec"), names)
-    return names
-
-
 @pytest.mark.parametrize(("page", "number"), GIVEN_TO)
 @pytest.mark.usefixtures("small_pictures")
 @pytest.mark.filterwarnings("default::pimper_torch.runtime.errors.PimperWarning")
@@ -326,12 +320,3 @@ def test_every_block_of_python_in_the_pages_is_run():
         (page, number) for page, text in PAGES.items() for number in range(len(BLOCK.findall(text)))
     }
     assert found == set(GIVEN_TO)
-
-
-def test_newcomers_are_shown_the_default():
-    example = next(block for block in BLOCKS if "load_views" in block)
-    for shown in (example, pimper_torch.__doc__):
-        assert re.findall(r"load_chain\((.*?)\)", shown) == ['"default"']
-    mine = [line for line in COMMANDS if line.startswith("reconstruct photos/")]
-    assert mine
-    assert not any("--preset" in line for line in mine)

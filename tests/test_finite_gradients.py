@@ -4,7 +4,7 @@ import pytest
 import torch
 from gradient_cost import STAGES, pulled_back, tracked
 from priors import prior_of
-from probes import calls, stage_of
+from probes import calls, small_scene, stage_of
 
 import pimper_torch as pt
 from pimper_bench.datasets.rendered import read_rendered
@@ -68,8 +68,14 @@ def assert_stages_finite(chain, scene):
     return given
 
 
-def test_gradients_of_a_pass_are_finite(rendered):
-    assert_stages_finite(pt.load_chain("default", {"scales": [0.25]}), rendered("potatoes"))
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_gradients_of_a_pass_are_finite_though_a_photograph_is_black_or_saturated(level):
+    scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=5, width=40))
+    scene.views.images[2] = level
+    everything = pt.Given(pt.Silhouettes.everything(scene.views))
+    given = {"silhouettes": everything, "coarse_surface": pt.Given(coarse)}
+    chain = pt.load_chain("default", {"scales": [1.0]}, **given)
+    assert_stages_finite(chain, scene)
 
 
 @pytest.mark.slow

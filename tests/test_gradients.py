@@ -52,7 +52,7 @@ def iterations(tiny):
 
 @pytest.fixture(scope="module")
 def published():
-    return probes(chain_of("paper"), *small_scene())
+    return probes(chain_of("paper"), *small_scene(num_views=4, width=32, num_points=12))
 
 
 @pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "repair", "remesh"])

@@ -118,12 +118,6 @@ def test_a_copy_of_a_chain_gives_the_same_bits(copied):
     assert torch.equal(found.albedo, mesh().albedo)
 
 
-def test_a_copy_of_a_chain_keeps_a_store(tmp_path):
-    chain = pt.load_chain("default", cache=tmp_path / "kept")
-    for again in (copy.deepcopy(chain), pickle.loads(pickle.dumps(chain))):
-        assert again.store.folder == chain.store.folder
-
-
 # Inductor takes minutes for dozens of graphs of a few operations; Dynamo cuts them out.
 COMPILED = pytest.param(
     functools.partial(torch.compile, backend="eager"), marks=pytest.mark.slow, id="compile"

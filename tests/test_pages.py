@@ -8,6 +8,7 @@ from inspect import ismodule
 from pathlib import Path
 
 import pytest
+from shown import strings
 
 import pimper_bench
 import pimper_torch
@@ -55,25 +56,6 @@ def test_links_lead_to_files_and_headings(page):
             assert anchor in anchors(target), link
 
 
-def test_the_walk_finds_links():
-    assert sum(len(links(page)) for page in PAGES) > 80
-
-
-def messages() -> list[str]:
-    """List the packages' texts, with an ellipsis where a message has numbers and names."""
-    found = []
-    for path in (path for package in PACKAGES for path in package.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.JoinedStr):
-                parts = [
-                    part.value if isinstance(part, ast.Constant) else "…" for part in node.values
-                ]
-                found.append("".join(map(str, parts)))
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.append(node.value)
-    return [bare(text) for text in found]
-
-
 def bare(text: str) -> str:
     return " ".join(text.replace("`", "").split())
 
@@ -81,7 +63,8 @@ def bare(text: str) -> str:
 def test_messages_of_the_page_on_failures_are_the_programs():
     quoted = re.findall(r"^\| `(.+?)` \| ", text_of(DOCS / "failures.md"), flags=re.MULTILINE)
     assert len(quoted) > 25
-    told = messages()
+    files = (path for package in PACKAGES for path in package.rglob("*.py"))
+    told = [bare(one) for path in files for _, one in strings(ast.parse(path.read_text("utf-8")))]
     assert [quote for quote in quoted if not any(bare(quote) in text for text in told)] == []
 
 
@@ -119,25 +102,3 @@ def test_scripts_of_the_benchmarks_have_the_options_that_the_page_gives_them():
     assert len(commands) > 20
     for script, rest in commands:
         assert set(OPTION.findall(rest)) <= options_of(script), (script, rest)
-
-
-def test_pictures_are_small_and_shown():
-    shown = {
-        (page.parent / link).resolve()
-        for page in PAGES
-        for link in links(page)
-        if link.endswith((".jpg", ".png"))
-    }
-    pictures = sorted((DOCS / "images").iterdir())
-    assert pictures
-    for picture in pictures:
-        assert picture in shown
-        assert picture.stat().st_size < 80_000
-
-
-def test_every_capture_has_its_picture():
-    page = text_of(DOCS / "photographs.md")
-    captures = re.findall(r"^    pimper render .+ -o ([\w-]+)$", page, flags=re.MULTILINE)
-    assert captures
-    for name in captures:
-        assert f"(images/{name}.jpg)" in page

@@ -37,8 +37,3 @@ def test_parts_of_a_stage_share_one_bar_and_nest():
                 report(1, 4)
             report(3, 4)
     assert heard == [0.25, 0.5, 0.5, 0.5625, 0.75, 0.875, 1.0]
-
-
-def test_a_part_that_nobody_listens_to_is_silent():
-    with part(0, 2):
-        report(1, 2)

@@ -57,17 +57,6 @@ def test_a_few_buckets_at_a_time_give_what_all_patches_give_at_once(given):
         assert_close(one, other, rtol=0, atol=0 if other.dtype == torch.bool else 1e-4 * size)
 
 
-def test_the_number_of_threads_changes_no_bit(given):
-    before = torch.get_num_threads()
-    found = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        found.append(list(values(streamed(given))))
-    torch.set_num_threads(before)
-    for one, other in zip(*found, strict=True):
-        assert torch.equal(one, other)
-
-
 class Listener(Silent):
     def __init__(self) -> None:
         self.heard: list[str] = []

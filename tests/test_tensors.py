@@ -176,15 +176,6 @@ def test_a_chain_triangulates_points_for_poses_that_come_without():
     assert torch.equal(found.cameras.intrinsics, made.cameras.intrinsics)
 
 
-def test_a_chain_refuses_poses_of_another_convention():
-    cameras = cameras_on_an_arc()
-    views = photographs(cameras, lit=False)
-    poses = cameras.cam_from_world.inverse()
-    made = pt.scene_of(views.images.float(), cameras.intrinsics, poses)
-    with pytest.raises(pt.InputError, match=r"The scene: these cameras.*not its inverse"):
-        placed(made)
-
-
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_an_unknown_reference_is_refused_before_structure_from_motion(preset, monkeypatch):
     views = photographs(cameras_on_an_arc(), lit=False)
