@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import pytest
 import torch
 from solved import solved
-from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
 
 from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
 from pimper_torch.method.photometry.bilinear import residual_deviation
-from pimper_torch.method.photometry.factorize import LOSSES, Factorize, FactorizeConfig
+from pimper_torch.method.photometry.factorize import LOSSES, Factorize
 from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.photometry.lights import fit_light_field, thinned
+from pimper_torch.method.photometry.lights import thinned
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.runtime.errors import PimperWarning
 
@@ -93,13 +93,6 @@ def test_factorize_finds_the_optimum_of_the_loss_that_it_is_given(scene, monkeyp
     assert (found - normals("numba", "cauchy")).abs().max() > 0.1
 
 
-def test_light_without_pull_keeps_its_size(problem):
-    given, _, _ = problem(patches=1, missing=0.3)
-    given = given.to(torch.float32)
-    found = solve(given, "numba")
-    assert_close(found.lights.norm(), given.lights.norm())
-
-
 @pytest.mark.parametrize("subset", [{"stride": 3}, {"curvature_samples": 40}])
 def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, subset):
     given = noisy(problem, generator, patches=2, views=12, samples=128, missing=0.3)
@@ -156,29 +149,6 @@ def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
     at = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[0.0, 0.0, -1.0]]).double()
     # Exact data: both are the truth.
     assert_close(few.field.lights_at(*at), every.field.lights_at(*at), rtol=0, atol=5e-3)
-
-
-@pytest.mark.parametrize("model", ["point_light", "room"])
-def test_lights_fitted_to_known_normals_resist_outliers(generator, model):
-    def normal(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    n = normalize(normal(700, 3), dim=1)
-    x = n + 0.1 * normal(700, 3)
-    albedo = 0.3 + torch.rand(700, generator=generator, dtype=torch.float64)
-    point_light = 4 * normalize(normal(9, 3), dim=1)
-    away = point_light - x[:, None]
-    facing = (n[:, None] * away).sum(dim=2).clamp_min(0) / away.norm(dim=2) ** 3
-    radiance = albedo[:, None] * (0.02 + 10 * facing) + 0.003 * normal(700, 9)
-    gross = torch.rand(radiance.shape, generator=generator) < 0.05
-    radiance = torch.where(gross, radiance + 0.5, radiance)
-    seen = torch.rand(radiance.shape, generator=generator) < 0.7
-    seen[:, 4] = False  # a view without data
-    found = fit_light_field(radiance, seen, n, x, model=model, iterations=100)
-    told = torch.arange(9) != 4
-    off = torch.cosine_similarity(found.point_light_at(x)[:, told], away[:, told], dim=2)
-    assert torch.rad2deg(torch.acos(off.clamp(-1, 1))).median() < 1
-    assert (found.point_light[4] == 0).all()
 
 
 def test_views_and_samples_without_data_make_no_difference(problem, generator):

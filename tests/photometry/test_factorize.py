@@ -13,9 +13,9 @@ from pimper_torch.method.photometry import factorize
 from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.method.photometry.light_field import LightField, harmonics
-from pimper_torch.method.photometry.photometry_config import FactorizeConfig, FitLightConfig
+from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.records import PatchStatus, PatchViews
-from pimper_torch.runtime.errors import ConfigError, PimperWarning
+from pimper_torch.runtime.errors import PimperWarning
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
@@ -309,71 +309,3 @@ def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
         square.append(angles_deg(bucket.normals_patch, normals, bucket.valid).deg2rad().square())
     ratio = torch.cat(variance).mean() / torch.cat(square).mean()
     assert ratio == pytest.approx(1, abs=0.1)
-
-
-@pytest.mark.slow
-def test_gradients_reach_the_radiance_of_lit_samples_only(scene, generator):
-    true = scene()
-    first = true.seen.buckets[0]
-
-    def total(radiance):
-        seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
-        found = solved(Factorize(), seen).buckets[0]
-        return found.normals_patch[..., 0].sum() + found.albedo.sum()
-
-    radiance = first.radiance.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(total(radiance), radiance)
-    assert (slope.movedim(2, -1)[~first.valid] == 0).all()
-    way = torch.randn(slope.shape, generator=generator, dtype=torch.float64)
-    way = way * first.valid[:, :, None]
-    step = 1e-6
-    # With gradients asked for, Newton's method takes both to rest.
-    ahead, behind = (total((first.radiance + s * way).requires_grad_()) for s in (step, -step))
-    assert_close((slope * way).sum(), (ahead - behind).detach() / (2 * step), rtol=1e-3, atol=0)
-
-
-def test_what_is_handed_in_is_left_alone(scene):
-    true = scene()
-    before = [each.radiance.clone() for each in true.seen.buckets]
-    solved(Factorize(), true.seen)
-    for each, copy in zip(true.seen.buckets, before, strict=True):
-        assert_close(each.radiance, copy, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("config", "field"),
-    [
-        (FactorizeConfig(), "factorize.solver"),
-        (FactorizeConfig(), "factorize.loss"),
-        (FitLightConfig(), "light.model"),
-    ],
-)
-def test_unknown_ways_are_refused(config, field):
-    object.__setattr__(config, field.split(".")[1], "random")  # past the type checker of the tests
-    with pytest.raises(ConfigError, match=field):
-        config.__post_init__()
-
-
-def test_a_patch_that_few_views_see_is_told_from_one_that_none_sees(scene):
-    true = scene()
-    first = true.seen.buckets[0]
-    valid = first.valid.clone()
-    valid[1, 3:] = False
-    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
-    with pytest.warns(PimperWarning, match="1 have no sample lit in 4 views"):
-        found = solved(Factorize(), seen).buckets[0]
-    assert found.status.tolist() == [0, PatchStatus.FEW_VIEWS, 0, 0, 0]
-    assert (found.lights_patch[1, 3:] == 0).all()
-    assert found.convergence.residual.isfinite().all()
-
-
-def test_a_view_that_sees_nothing_has_no_light(scene):
-    true = scene()
-    buckets = tuple(
-        each.replace(valid=each.valid & (torch.arange(12) != 4)[:, None, None])
-        for each in true.seen.buckets
-    )
-    found = solved(Factorize(), true.seen.replace(buckets=buckets))
-    assert (found.buckets[0].lights_patch[:, 4] == 0).all()
-    assert (found.buckets[0].lights_patch[:, 5] != 0).any()
-    assert found.buckets[0].valid.any()

@@ -81,21 +81,3 @@ def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(sam
     soft = LightModel(basis=harmonics(normals))
     assert_close(soft.clamp(outside[:, :4].double()), expected[:, :4])
     assert (soft.inside_bounds(inside[:, :4]) == free[:, :4]).all()
-
-
-def test_the_initial_soft_light_has_the_brightness_of_every_view(samples, generator):
-    from pimper_torch.method.photometry.light_models import ImageSamples
-
-    normals = normalize(samples[0] + torch.tensor([0.0, 0, -3]).double(), dim=1)
-    gain = torch.tensor([0.5, 1.0, 3.0]).double()
-    albedo = 0.2 + torch.rand(50, generator=generator, dtype=torch.float64)
-    radiance = albedo[:, None] * gain
-    model = LightModel(basis=harmonics(normals))
-    found, start = model.initialize(
-        ImageSamples(radiance=radiance, seen=torch.ones(50, 3, dtype=torch.bool))
-    )
-    # Every view is the same but for its gain: so are its light, and the product with albedo.
-    assert_close(found / found[1], (gain[:, None] / gain[1]).expand(-1, 4))
-    assert_close(start / start.median(), albedo / albedo.median())
-    mean = model.basis.mean(dim=0)
-    assert_close(found @ mean * start.median(), gain * albedo.median())

@@ -48,25 +48,6 @@ def test_factors_are_recovered_up_to_lorentz_with_60_percent_missing(problem, so
     assert (found.shading - given.shading).abs().max() > 0.05
 
 
-def test_balm_and_variable_projection_agree_on_clean_data(problem):
-    given, _, _ = problem(missing=0.3)
-    regularization = torch.full_like(
-        given.regularization, 3.0
-    )  # a hold on the gauge, so that factors compare
-    _, normals = given.manifold.split(given.shading.mT)
-    given = given.replace(
-        regularization=regularization, prior=0.1 * given.manifold.normal_prior(normals.mT)
-    )
-    balm, projection = solve_balm(given, 800, 1e-8), solve_projection(given, 800, 1e-8)
-    assert_close(balm.shading, projection.shading, rtol=0, atol=2e-4)
-    assert_close(balm.lights, projection.lights, rtol=0, atol=2e-4)
-    costs = [
-        objective(given, each.lights, each.shading, given.weight) for each in (balm, projection)
-    ]
-    assert_close(*costs, rtol=1e-4, atol=1e-8)
-    assert (costs[0] < objective(given, given.lights, given.shading, given.weight)).all()
-
-
 def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
     given, _, _ = problem(patches=2, samples=40, missing=0.3)
     _, normals = given.manifold.split(given.shading.mT)
