@@ -14,6 +14,7 @@ import torch
 from photographs import save_photographs
 from stand_ins import CHILD
 from torch.nn.functional import normalize
+from torch.testing import assert_close
 
 import pimper_bench
 import pimper_torch

@@ -1,6 +1,5 @@
 import pytest
 import torch
-from derivatives import check_derivatives
 from torch.testing import assert_close
 from twins import using
 
@@ -160,39 +159,3 @@ def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
     square = 9.0 * drawn(generator, 1.0, 20000).square()
     square[:outliers] = 1e6
     assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)
-
-
-def test_gradients_go_through_the_noise_that_is_estimated(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.02)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.1)
-
-    def answer(x):
-        kinds = [
-            noisy.replace(coefficients=x["coefficients"]),
-            kind.replace(targets=x["targets"], information=x["information"]),
-        ]
-        return {"heights": fused(kinds, 3).heights}
-
-    inputs = {
-        "coefficients": noisy.coefficients,
-        "targets": kind.targets,
-        "information": kind.information,
-    }
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3
-
-
-def test_gradients_go_through_the_weights_of_the_other_solve(generator):
-    noisy = steps(drawn(generator, 0.05, 3 * (COUNT - 1)), 0.1)
-    kind = places(smooth() + drawn(generator, 0.1, COUNT), 0.2)
-
-    def answer(x):
-        kinds = [noisy, kind.replace(targets=x["targets"], information=x["information"])]
-        common = [with_common_errors(noisy, 8.0), kinds[1]]
-        return {"heights": fuse_like(fused(kinds, 3), common, torch.zeros(COUNT).double()).heights}
-
-    inputs = {"targets": kind.targets, "information": kind.information}
-    for check in check_derivatives(answer, inputs, generator).values():
-        assert check.smooth.any()
-        assert check.spread < 1e-3

@@ -30,13 +30,3 @@ def test_samples_of_several_levels_do_not_mix(generator):
     level = 2 * torch.rand(70, generator=generator)
     pixels = 8 * torch.rand(70, 2, generator=generator)
     assert_close(look_up(pyramid, pixels, level)[:, 0], level)
-
-
-def test_looking_up_can_be_differentiated(generator):
-    image = torch.rand(2, 6, 6, generator=generator, dtype=torch.float64, requires_grad=True)
-    rough = torch.rand(2, 3, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    pixels = torch.tensor([[2.2, 3.1], [4.3, 1.7]], dtype=torch.float64, requires_grad=True)
-    level = torch.tensor([0.3, 0.8], dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda *given: look_up([given[0], given[1]], given[2], level), (image, rough, pixels)
-    )

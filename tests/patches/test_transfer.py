@@ -113,26 +113,3 @@ def test_views_are_registered_on_what_is_transferred(plane_scene, flat):
         )
         > 0.006
     )
-
-
-def test_depth_has_the_slope_of_its_differences_as_vertices_move(flat):
-    whole = surface(30)
-    generator = torch.Generator().manual_seed(101)
-    vertices = whole.vertices_world.clone().requires_grad_()
-    along = torch.randn(vertices.shape, generator=generator, dtype=torch.float64)
-    along, step = along * torch.ones(3, dtype=torch.float64), 1e-6
-
-    def depths(places):
-        transferred = transfer(flat, whole.replace(vertices_world=places))
-        return torch.cat([bucket.depth.flatten() for bucket in transferred.buckets])
-
-    here = depths(vertices)
-    weight = torch.randn(here.shape, generator=generator, dtype=torch.float64)
-    (weight * here).sum().backward()
-    ahead, behind = (
-        depths(vertices.detach() + step * along),
-        depths(vertices.detach() - step * along),
-    )
-    slope = (weight * (ahead - behind)).sum() / (2 * step)
-    # Measured 3e-5: samples on an edge have the slopes of both faces.
-    assert_close((vertices.grad * along).sum(), slope, rtol=1e-4, atol=0)

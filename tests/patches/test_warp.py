@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.ground.geometry.pyramids import look_up, pyramid_level
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig, WarpConfig
+from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.warp import Warp
 from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.runtime.errors import ConfigError
@@ -149,35 +149,3 @@ def test_pixels_that_are_no_numbers_are_missing_and_spoil_no_others(plane_scene,
         off = (found.radiance - wanted.radiance).abs().amax(dim=2)[same]
         assert off.max() < 0.1  # of a pixel's share that may be missing in a sample
     assert 0 < lost < 60
-
-
-def test_radiance_is_differentiable_in_the_images_and_the_height_field(plane_scene, plane_mesh):
-    # Samples further apart than pixels: where they are as far apart, the pyramid's level bends.
-    sparse = DecomposeConfig(samples_per_pixel=0.7)
-    patches = Decompose(sparse)(plane_mesh, plane_scene.cameras)
-    bucket = patches.buckets[0]
-    generator = torch.Generator().manual_seed(116)
-    depth = bucket.depth.clone().requires_grad_()
-    images = plane_scene.views.images.double().requires_grad_()
-
-    def warped(images, depth):
-        lifted = patches.replace(buckets=(bucket.replace(depth=depth), *patches.buckets[1:]))
-        views = plane_scene.views.replace(images=images)
-        return Warp()(views, plane_scene.cameras, lifted).buckets[0]
-
-    seen = warped(images, depth)
-    weight = torch.randn(seen.radiance.shape, generator=generator, dtype=torch.float64)
-    weight = weight * seen.valid[:, :, None]
-    (weight * seen.radiance).sum().backward()
-    step = 1e-6
-    for leaf, moved in (
-        (images, lambda by: warped(images + by, depth)),
-        (depth, lambda by: warped(images, depth + by)),
-    ):
-        along = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
-        ahead, behind = moved(step * along), moved(-step * along)
-        assert torch.equal(ahead.valid, seen.valid)
-        assert torch.equal(behind.valid, seen.valid)
-        slope = (weight * (ahead.radiance - behind.radiance)).sum() / (2 * step)
-        # Measured 2e-10; rounding leaves 1e-16 / step of a sum of thousands.
-        assert_close((leaf.grad * along).sum(), slope, rtol=1e-7, atol=0)
