@@ -6,7 +6,7 @@ from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.poisson import poisson_surface, reduced
+from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.topology import connected_to
 from pimper_torch.method.coarse.densify import (
@@ -31,7 +31,7 @@ from pimper_torch.method.coarse.trim import (
     without_small_holes,
 )
 from pimper_torch.method.coarse.window_matching import Matcher, Windows, level_of, pair
-from pimper_torch.records import Mesh, Support
+from pimper_torch.records import Support
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 
@@ -111,17 +111,6 @@ def test_noisy_points_share_larger_cells_and_sides_stay_apart():
     assert count(noisy, up) < 0.2 * count(exact, up)
     both = torch.where(torch.arange(4000)[:, None] % 2 == 0, up, -up)
     assert 1.8 * count(exact, up) < count(exact, both) <= 2 * count(exact, up)
-
-
-def test_poisson_puts_a_ball_through_points_of_a_ball_and_simplification_keeps_it():
-    vertices, _ = icosphere(4)
-    found, faces = poisson_surface(vertices, vertices, depth=6, point_weight=1.0)
-    assert (found.norm(dim=1) - 1).abs().max() < 0.02
-    few = reduced(Mesh(vertices_world=found, faces=faces), num_faces=200)
-    assert 150 <= len(few.faces) <= 200
-    assert (few.vertices_world.norm(dim=1) - 1).abs().max() < 0.06
-    a, b, c = few.vertices_world[few.faces].unbind(dim=1)
-    assert (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(dim=-1).min() > 0
 
 
 def test_small_holes_are_closed_and_large_ones_and_small_components_are_not():

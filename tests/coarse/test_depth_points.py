@@ -58,12 +58,3 @@ def test_cameras_of_other_photographs_give_none(scene):
     wrong = scene.replace(cameras=cameras)
     with pytest.warns(PimperWarning, match="No points: features do not match"):
         assert depth_points(wrong) is wrong
-
-
-def test_cameras_that_see_nothing_in_common_give_none(scene):
-    poses = scene.cameras.cam_from_world.clone()
-    poses[:, :2] *= torch.where(torch.arange(len(poses)) % 2 == 0, 1.0, -1.0)[:, None, None]
-    poses[:, 0, 3] += 1e4 * torch.arange(len(poses)) ** 2
-    apart = scene.replace(cameras=scene.cameras.replace(cam_from_world=poses))
-    with pytest.warns(PimperWarning, match="No points"):
-        assert depth_points(apart) is apart

@@ -120,19 +120,6 @@ def test_a_mesh_whose_faces_share_no_vertex_gives_the_surface_of_the_welded_one(
     assert_close(*surface, rtol=0, atol=1e-6)
 
 
-def test_a_texture_seam_is_welded(scene, unknown, tmp_path):
-    """As OBJ has it: positions are shared, texture coordinates are not."""
-    vertices, faces = icosphere(2)
-    lines = [f"v {x} {y} {z}" for x, y, z in (vertices + PLACE).tolist()]
-    lines += [f"vt {index / 999:.4f} 0.5" for index in range(3 * len(faces))]
-    for face, row in enumerate((faces + 1).tolist()):
-        lines.append("f " + " ".join(f"{v}/{3 * face + c + 1}" for c, v in enumerate(row)))
-    (tmp_path / "seams.obj").write_text("\n".join(lines) + "\n")
-    read = read_mesh(tmp_path / "seams.obj")
-    found, _ = prepared(read, scene, unknown)
-    assert len(found.vertices_world) == len(vertices)
-
-
 def test_faces_that_are_none_are_dropped_and_counted(scene, unknown, true_mesh):
     faces = true_mesh.faces
     middle = true_mesh.vertices_world[faces[0, :2]].mean(dim=0, keepdim=True)

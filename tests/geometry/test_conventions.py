@@ -2,7 +2,6 @@
 
 import pycolmap
 import torch
-from slopes import normals_from_slopes
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
@@ -14,8 +13,7 @@ from pimper_torch.ground.geometry.pixels import (
     pixels_from_indices,
     scale_intrinsics,
 )
-from pimper_torch.ground.geometry.projection import project, rays_through
-from pimper_torch.ground.geometry.surfaces import slopes_from_normals
+from pimper_torch.ground.geometry.projection import project
 
 WIDTH, HEIGHT = 7, 5
 
@@ -44,14 +42,6 @@ def test_grid_sample_at_pixel_centers_gives_the_image_back():
     grid = grid_from_pixels(pixel_centers(WIDTH, HEIGHT, like=image), WIDTH, HEIGHT)
     found = grid_sample(image, grid[None], mode="bilinear", align_corners=False)
     assert_close(found, image)
-
-
-def test_grid_sample_half_way_between_centers_gives_the_mean():
-    image = noise_image(102)
-    between = torch.tensor([[[3.0, 2.5]]], dtype=torch.float64)  # between columns 2 and 3, row 2
-    grid = grid_from_pixels(between, WIDTH, HEIGHT)
-    found = grid_sample(image, grid[None], mode="bilinear", align_corners=False)
-    assert_close(found[0, 0, 0, 0], image[0, 0, 2, 2:4].mean())
 
 
 def test_the_corners_of_the_image_are_the_ends_of_the_grid():
@@ -113,24 +103,3 @@ def test_camera_axes_are_right_down_and_forward():
     pixels, depth = project(points, torch.eye(4, dtype=torch.float64), K)
     assert pixels[:3].tolist() == [[50.0, 40.0], [75.0, 40.0], [50.0, 65.0]]
     assert depth.tolist() == [2.0, 2.0, 2.0, -2.0]
-
-
-def test_rays_reach_the_depth_along_z_at_their_own_length():
-    K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]], dtype=torch.float64)
-    rays = rays_through(
-        torch.tensor([[50.0, 40.0], [150.0, 40.0]]).double(), torch.eye(4, dtype=torch.float64), K
-    )
-    assert rays.tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]
-
-
-def test_a_depth_that_grows_to_the_right_has_a_normal_that_leans_to_the_right():
-    # z = 0.5 x + 0.25 y: the surface recedes towards +x, so its outside faces +x and -z.
-    slopes = torch.tensor([0.5, 0.25], dtype=torch.float64)
-    normal = normals_from_slopes(slopes)
-    assert normal[2] < 0
-    assert normal[0] > 0
-    assert normal[1] > 0
-    assert_close(normal.norm(), torch.tensor(1.0, dtype=torch.float64))
-    tangents = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.25]], dtype=torch.float64)
-    assert_close(tangents @ normal, torch.zeros(2, dtype=torch.float64), atol=1e-15, rtol=0)
-    assert_close(slopes_from_normals(normal), -normal[:2] / normal[2])

@@ -65,15 +65,6 @@ def test_distances_to_tiny_and_huge_triangles_are_those_of_brute_force(generator
     assert_close((points - found.points).norm(dim=1), found.distance)
 
 
-def test_a_smooth_surface_of_many_triangles_is_searched_without_a_miss(generator):
-    vertices, faces = icosphere(2)
-    bumps = 1 + 0.15 * torch.sin(3 * vertices[:, :1] + 1) * torch.cos(2 * vertices[:, 1:2])
-    mesh = Mesh(vertices_world=bumps * vertices * vertices.new_tensor([1.3, 1, 0.8]), faces=faces)
-    points = 1.5 * torch.randn(60, 3, generator=generator, dtype=torch.float64)
-    expected = brute_force(points, mesh)
-    assert_close(NearestSurface(mesh).query(points).distance, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_points_on_the_surface_far_from_the_origin_are_found_on_it():
     vertices, faces = icosphere(3)
     far = Mesh(vertices_world=vertices + 1e6, faces=faces)

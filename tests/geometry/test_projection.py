@@ -26,13 +26,6 @@ def test_a_ray_at_its_depth_comes_back_to_the_point(cameras, points):
     assert_close(found, points.expand(3, -1, -1))
 
 
-def test_a_camera_projects_alone_as_it_does_in_company(cameras, points):
-    together, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
-    alone, depth_alone = project(points, cameras.cam_from_world[1], cameras.intrinsics[1])
-    assert_close(together[1], alone)
-    assert_close(depth[1], depth_alone)
-
-
 def test_skewed_intrinsics_keep_the_round_trip(points):
     K = torch.tensor([[90.0, 2.0, 30], [0, 85, 20], [0, 0, 1]], dtype=torch.float64)
     cam_from_world = torch.eye(4, dtype=torch.float64)

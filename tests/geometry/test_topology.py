@@ -18,12 +18,6 @@ from pimper_torch.ground.geometry.topology import (
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
-def test_neighbouring_faces_are_found_with_their_edge():
-    pairs, edges = face_pairs(FACES)
-    assert [sorted(pair) for pair in pairs.tolist()] == [[0, 1]]
-    assert edges.tolist() == [[0, 2]]
-
-
 def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     pairs, edges = face_pairs(torch.tensor(mesh.faces))

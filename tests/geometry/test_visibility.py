@@ -42,22 +42,6 @@ def test_first_hits_agree_with_brute_force(generator):
     assert (rebuilt[~hit] == 0).all()
 
 
-def test_distance_is_counted_in_lengths_of_the_direction():
-    vertices, faces = table(1.0).vertices_world, table(1.0).faces
-    caster = RayCaster(vertices, faces)
-    origin = torch.tensor([0.1, 0.2, 6.0], dtype=torch.float64)
-    directions = torch.tensor([[0.0, 0, -1], [0, 0, -3]], dtype=torch.float64)
-    assert_close(caster.cast(origin, directions).distance, torch.tensor([6.0, 2.0]).double())
-
-
-def test_a_miss_is_infinite_and_belongs_to_no_face():
-    caster = RayCaster(table(1.0).vertices_world, table(1.0).faces)
-    hits = caster.cast(torch.zeros(3) + 2.0, torch.tensor([[0.0, 0.0, 1.0]]))
-    assert hits.face.tolist() == [-1]
-    assert hits.distance.isinf().all()
-    assert (hits.barycentric == 0).all()
-
-
 def test_points_behind_the_ball_are_hidden_and_the_surface_does_not_hide_itself():
     vertices, faces = icosphere(5)
     caster = RayCaster(vertices, faces)

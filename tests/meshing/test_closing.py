@@ -85,14 +85,6 @@ def test_a_closed_mesh_comes_back():
     assert torch.equal(found.mesh.faces, faces)
 
 
-@pytest.mark.parametrize("missing", [1, 7])
-def test_holes_of_few_faces_are_closed(missing):
-    vertices, faces = icosphere(2)
-    found = closed(Mesh(vertices_world=vertices, faces=faces[missing:]))
-    assert solid(found.mesh).is_watertight
-    assert solid(found.mesh).is_winding_consistent
-
-
 def test_holes_that_meet_in_a_vertex_and_pieces_are_closed_one_by_one():
     vertices, faces = icosphere(2)
     fan = (faces == 20).any(dim=1).nonzero()[:, 0].tolist()

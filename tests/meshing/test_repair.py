@@ -268,19 +268,3 @@ def test_a_closed_piece_does_not_shrink_to_its_only_sound_vertex():
     after, moved = repair(vertices, faces, broken, torch.tensor(torch.inf))
     assert not moved.any()
     assert torch.equal(after, vertices)
-
-
-def test_a_regular_subdivided_mesh_in_a_plane_is_found_again(generator):
-    row, column = torch.meshgrid(torch.arange(9), torch.arange(9), indexing="ij")
-    here = (row[:-1, :-1] * 9 + column[:-1, :-1]).flatten()
-    faces = torch.cat(
-        [
-            torch.stack([here, here + 9, here + 10], dim=1),
-            torch.stack([here, here + 10, here + 1], dim=1),
-        ]
-    )
-    plane = torch.randn(3, 3, generator=generator).double()
-    flat = column.reshape(-1, 1) * plane[0] + row.reshape(-1, 1) * plane[1] + plane[2]
-    free = ((row - 4).abs().maximum((column - 4).abs()) <= 1).flatten()
-    stirred = flat + free[:, None] * torch.randn(flat.shape, generator=generator).double()
-    assert_close(least_bent(stirred, faces, free), flat)

@@ -7,12 +7,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.linalg.robust import robust_variance
-from pimper_torch.ground.linalg.sums import total
 from pimper_torch.method.meshing.closing import closed
 from pimper_torch.method.meshing.simplify import simplify
-from pimper_torch.method.photometry.cone import project_to_cone
 from pimper_torch.records import Mesh
 
 SEEDS = st.integers(0, 2**31 - 1)
@@ -20,22 +17,6 @@ SEEDS = st.integers(0, 2**31 - 1)
 
 def drawn(seed: int, *shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-@settings(max_examples=50, deadline=None)
-@given(seed=SEEDS)
-def test_normals_do_not_depend_on_the_order_of_facets(seed):
-    vertices, faces = icosphere(2)
-    vertices = vertices.double() + 0.05 * drawn(seed, *vertices.shape)
-    order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(seed))
-    assert_close(vertex_normals(vertices, faces[order]), vertex_normals(vertices, faces))
-
-
-@settings(max_examples=50, deadline=None)
-@given(seed=SEEDS, gain=st.floats(1e-6, 1e6))
-def test_the_scale_of_radiance_goes_through_the_cone(seed, gain):
-    shading = drawn(seed, 40, 4)
-    assert_close(project_to_cone(gain * shading), gain * project_to_cone(shading))
 
 
 @settings(max_examples=50, deadline=None)
@@ -47,14 +28,6 @@ def test_a_robust_variance_follows_the_scale_and_no_order(seed, gain, size):
     order = torch.randperm(size, generator=torch.Generator().manual_seed(seed))
     assert_close(robust_variance(square[order], seen), usual)
     assert_close(robust_variance(gain * square, seen), gain * usual)
-
-
-@settings(max_examples=50, deadline=None)
-@given(seed=SEEDS, size=st.integers(0, 30_000))
-def test_a_total_is_within_rounding_of_any_other_order(seed, size):
-    values = drawn(seed, size)
-    order = torch.randperm(size, generator=torch.Generator().manual_seed(seed))
-    assert_close(total(values[order]), total(values), rtol=0, atol=1e-15 * (1 + size))
 
 
 @settings(max_examples=40, deadline=None)
