@@ -14,11 +14,7 @@ from torch.nn.functional import normalize
 import pimper_torch as pt
 from pimper_bench.metrics import pair_views, similarity_between_cameras
 from pimper_bench.metrics.in_view import angles_deg
-from pimper_bench.scenes import (
-    RenderedScene,
-    potato_on_table,
-    render_shape,
-)
+from pimper_bench.scenes import RenderedScene, potato_on_table, render_shape
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.render_in_memory import EndlessPlane, Shape, Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras

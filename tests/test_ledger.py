@@ -10,13 +10,7 @@ import pimper_torch
 from pimper_torch.records import Failure, LeftOut
 from pimper_torch.runtime.failures import collecting, distinct, skipped
 from pimper_torch.runtime.journal import noted
-from pimper_torch.runtime.ledger import (
-    GUARDS,
-    closing_line,
-    leave_out,
-    left_out_of,
-    listening,
-)
+from pimper_torch.runtime.ledger import GUARDS, closing_line, leave_out, left_out_of, listening
 from pimper_torch.runtime.parallel import side_by_side
 
 FAILED = Failure(stage="warp", what="patch", name="3", reason="numbers", done="Left out")

@@ -3,11 +3,7 @@ import torch
 from scipy.spatial import Delaunay
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.finite_elements import (
-    cotangent_laplacian,
-    elements,
-    lumped_mass,
-)
+from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.ground.geometry.topology import boundary_vertices
 from pimper_torch.ground.linalg.multigrid import Multigrid
 from pimper_torch.ground.linalg.sparse import SparseCholesky

@@ -41,8 +41,7 @@ def test_points_that_are_no_number_are_clamped_into_the_image():
 
 
 @pytest.mark.parametrize(
-    ("area", "expected"),
-    [(0.2, (0, 0.0)), (2.0, (0, 0.5)), (4.0, (1, 0.0)), (1e9, (3, 0.0))],
+    ("area", "expected"), [(0.2, (0, 0.0)), (2.0, (0, 0.5)), (4.0, (1, 0.0)), (1e9, (3, 0.0))]
 )
 def test_a_footprint_of_four_times_the_area_is_a_level_coarser(area, expected):
     level, blend = blended_level(area, 4)

@@ -123,10 +123,7 @@ def test_a_genuine_opening_stays_as_it_is():
     mesh = Mesh(vertices_world=repaired.vertices_world, faces=repaired.faces)
     contours = [
         {tuple(row) for row in points[boundary_loops(faces)[0]].flatten(1).tolist()}
-        for points, faces in (
-            (mesh.vertices_world, mesh.faces),
-            (bowl.vertices_world, bowl.faces),
-        )
+        for points, faces in ((mesh.vertices_world, mesh.faces), (bowl.vertices_world, bowl.faces))
     ]
     assert len(contours[0]) > 20
     assert contours[0] == contours[1]

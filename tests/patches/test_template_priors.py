@@ -29,11 +29,7 @@ def normal_prior(scene, frame="camera", variance=0.01) -> NormalPrior:
         normals = torch.einsum("vij,vhwj->vhwi", cameras.cam_from_world[:, :3, :3], normals)
     variances = torch.full_like(views.images[:, 0], variance)
     return NormalPrior(
-        names=views.names,
-        sizes_px=views.sizes_px,
-        normals=normals,
-        variance=variances,
-        frame=frame,
+        names=views.names, sizes_px=views.sizes_px, normals=normals, variance=variances, frame=frame
     )
 
 

@@ -51,8 +51,7 @@ def test_flat_shading_shows_edges_that_smooth_shading_hides(front):
         [[-1.0, -1, 0], [0, -1, 0.5], [0, 1, 0.5], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]
     )
     roof = Mesh(
-        vertices_world=corners,
-        faces=torch.tensor([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]]),
+        vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]])
     )
     flat, smooth = (shade(roof, front, flat=flat)[12, 8:24, 0] for flat in (True, False))
     assert flat.diff().abs().max() > 3 * smooth.diff().abs().max()
