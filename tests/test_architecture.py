@@ -5,7 +5,6 @@ import sys
 import tomllib
 from collections.abc import Iterator, Sequence
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -181,17 +180,6 @@ def test_one_version_stands_in_both_distributions_the_changelog_and_the_citation
 
 def test_commands_found_without_being_installed_are_those_that_are_installed():
     assert project(ROOT / "bench")["entry-points"]["pimper.commands"] == OF_BENCH
-
-
-@pytest.mark.parametrize(
-    "path",
-    [path for path in files_of_both() if path.name == "__init__.py"],
-    ids=lambda path: path.parent.name,
-)
-def test_whatever_a_room_exports_is_there(path):
-    home = PACKAGE.parent if path.is_relative_to(PACKAGE) else BENCH.parent
-    module = import_module(".".join(path.parent.relative_to(home).parts))
-    assert set(getattr(module, "__all__", ())) <= set(dir(module))
 
 
 def loaded_by(statement: str) -> set[str]:

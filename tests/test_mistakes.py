@@ -90,20 +90,8 @@ def test_poses_of_another_direction_or_other_axes_are_told_by_the_mesh(preset, m
     ("call", "told"),
     [
         (
-            lambda: pt.load_chain("default", {"factorise": {"prior": "flat"}}),
-            "changes: the top level has no setting `factorise`. Did you mean `factorize`?",
-        ),
-        (
             lambda: pt.load_chain("default", {"sweep": {"step": 7}}),
             "changes: section `sweep` has no setting `step`. Did you mean `steps`?",
-        ),
-        (
-            lambda: pt.load_config("paper", {"scales": [1.0]}),
-            "changes: the top level has no setting `scales`",
-        ),
-        (
-            lambda: pt.load_config("paper", {"chain": "publisht"}),
-            "changes: chain is 'publisht'; needed: coarse-to-fine or published",
         ),
         (
             lambda: pt.CoarseToFine(factorise=pt.Factorize()),

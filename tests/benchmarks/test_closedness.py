@@ -85,13 +85,6 @@ def test_three_faces_at_an_edge_or_two_that_disagree_are_told():
     assert (rotated.twisted, rotated.closed, len(rotated.loops)) == (3, False, 0)
 
 
-def test_vertices_without_faces_do_not_count(sphere):
-    far = torch.cat([sphere.vertices_world, torch.full((1, 3), 9.0).double()])
-    found = closedness(sphere.replace(vertices_world=far))
-    assert found.euler == 2
-    assert_close(found.diagonal, 2 * math.sqrt(3))
-
-
 def test_a_cloud_is_refused():
     with pytest.raises(InputError, match="3 vertices without faces"):
         closedness(mesh_of(torch.eye(3), torch.zeros(0, 3, dtype=torch.long)))

@@ -2,22 +2,17 @@ import math
 
 import pytest
 import torch
-from derivatives import check_derivatives
 from solved import solved
 from torch import nn
-from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.method.photometry.factor_priors import (
-    FactorPrior,
     FieldLights,
     Guesses,
-    Known,
     SurfaceNormals,
     views_worth,
 )
 from pimper_torch.method.photometry.factorize import Factorize
-from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.records import PatchPriors
 from pimper_torch.runtime.errors import ConfigError
@@ -116,51 +111,6 @@ def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
         for one, given in zip(found.buckets, wrong, strict=True):
             cosine = torch.cosine_similarity(one.lights_patch, given, dim=2)
             assert bool((cosine > 0.9999).all()) == pulled
-
-
-class Leaning(FactorPrior):
-    """Normals of the surface, leaning by parameters."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lean = nn.Parameter(torch.tensor([0.02, -0.03, 0.0], dtype=torch.float64))
-        self.trust = nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
-
-    def forward(self, samples):
-        normals = normalize(samples.normals + self.lean, dim=-1)
-        weight = self.trust * torch.ones_like(samples.albedo)
-        inlier = torch.sigmoid(2 + self.trust * samples.radiance)
-        return Known(normals=normals, normal_weight=weight, inlier=inlier)
-
-
-def test_gradients_reach_a_prior_from_elsewhere(scene):
-    seen = scene(bumps=0.1).seen
-    part = seen.replace(
-        patches=seen.patches.replace(buckets=seen.patches.buckets[:1]), buckets=seen.buckets[:1]
-    )
-
-    light = FitLight()(part)
-
-    def factorized(inputs):
-        prior = Leaning()
-        stage = Factorize(priors=[FieldLights(), prior])
-        found = torch.func.functional_call(
-            stage,
-            {"priors.1.lean": inputs["lean"], "priors.1.trust": inputs["trust"]},
-            (part, light),
-        )
-        return {"normals": found.buckets[0].normals_patch, "lights": found.buckets[0].lights_patch}
-
-    prior = Leaning()
-    checks = check_derivatives(
-        factorized,
-        {"lean": prior.lean.detach(), "trust": prior.trust.detach()[None][0]},
-        torch.Generator().manual_seed(3),
-        directions=1,
-        steps=(1e-4, 1e-5),
-    )
-    for one in checks.values():
-        assert abs(one.ratio - 1) < 1e-3
 
 
 def test_variances_are_worth_views():

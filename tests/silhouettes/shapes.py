@@ -1,6 +1,7 @@
 """Shapes given by their distance functions, and their silhouettes."""
 
 from collections.abc import Callable
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ def all_round() -> Cameras:
     return pinholes(look_at(eyes, torch.zeros(3).double(), up), FOCAL, WIDTH, HEIGHT)
 
 
+@cache
 def silhouettes_of(
     distance: Callable[[Tensor], Tensor], cameras: Cameras, reach: float = 1.5
 ) -> Silhouettes:

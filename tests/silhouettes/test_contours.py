@@ -1,13 +1,22 @@
 import math
+from functools import partial
 
 import pytest
 import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.method.silhouettes import trace
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.runtime.errors import PimperWarning
 from tests.silhouettes.shapes import PIXEL, ball, silhouettes_of, two_balls
+
+
+@pytest.fixture(autouse=True)
+def coarse_voxels(monkeypatch):
+    """Build hulls of voxels of 0.04, two thirds of a pixel: the usual ones take a second each."""
+    few = partial(trace.visual_hull, num_voxels=300_000)
+    monkeypatch.setattr(trace, "visual_hull", few)
 
 
 @pytest.mark.parametrize("shape", [ball, two_balls])

@@ -2,49 +2,25 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.records import Cameras, Silhouettes
+from tests.silhouettes import shapes
+from tests.silhouettes.shapes import HEIGHT, WIDTH, silhouettes_of
 
 BOX = torch.tensor([[-2.0, -2, -2], [2, 2, 2]])
 
 
-def all_round(num_views: int = 24, width: int = 160, height: int = 120) -> Cameras:
-    """Look at the origin from 5 units away, from everywhere (Fibonacci's sphere)."""
-    index = torch.arange(num_views) + 0.5
-    z = 1 - 2 * index / num_views
-    angle = torch.pi * (1 + 5**0.5) * index
-    flat = (1 - z**2).sqrt()
-    eyes = 5 * torch.stack([flat * angle.cos(), flat * angle.sin(), z], dim=1)
-    up = torch.tensor([0.1, 0.2, 1.0])
-    return pinholes(look_at(eyes, torch.zeros(3), up), 200.0, width, height)
-
-
-def ball_silhouettes(cameras: Cameras, radius: float = 1.0) -> Silhouettes:
-    """Draw the silhouettes of a ball about the origin: the rays that pass it within its radius."""
-    from pimper_torch.ground.geometry.pixels import pixel_centers
-    from pimper_torch.ground.geometry.projection import rays_through
-
-    width, height = cameras.sizes_px[0].tolist()
-    pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
-    rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
-    rays = rays / rays.norm(dim=-1, keepdim=True)
-    eyes = cameras.centers_world[:, None]
-    passing = torch.linalg.cross(rays, eyes.expand_as(rays)).norm(dim=-1)
-    inside = (passing < radius).float().reshape(-1, height, width)
-    return Silhouettes(
-        inside=inside, reliable=torch.ones(len(inside), dtype=torch.bool), source="masks"
-    )
-
-
 @pytest.fixture(scope="module")
-def cameras() -> Cameras:
-    return all_round()
+def cameras():
+    return shapes.all_round().to(torch.float32)
+
+
+def of_ball(cameras):
+    return silhouettes_of(shapes.ball, cameras)
 
 
 @pytest.fixture(scope="module")
 def ball(cameras):
-    hull = visual_hull(ball_silhouettes(cameras), cameras, BOX, num_voxels=64**3, disagreeing=0.0)
+    hull = visual_hull(of_ball(cameras), cameras, BOX, num_voxels=64**3, disagreeing=0.0)
     assert hull is not None
     return hull
 
@@ -52,7 +28,7 @@ def ball(cameras):
 def test_the_hull_of_a_ball_contains_it_and_little_more(ball):
     steps = ball.occupied.nonzero()
     radius = (ball.origin_world + ball.spacing * steps).norm(dim=1)
-    # The tangent cones of 24 views leave corners: at most 1 / cos of half the angle between
+    # The tangent cones of 20 views leave corners: at most 1 / cos of half the angle between
     # neighbouring views (some 41 degrees) off the ball.
     assert radius.max() < 1 / torch.deg2rad(torch.tensor(22.0)).cos() + ball.spacing
     volume = float(ball.occupied.sum() * ball.spacing**3)
@@ -77,16 +53,16 @@ def test_off_the_grid_depth_falls_with_distance(ball):
 
 
 def test_projections_are_the_silhouettes_that_the_hull_was_built_from(ball, cameras):
-    drawn = ball_silhouettes(cameras).masks
+    drawn = of_ball(cameras).masks
     for view in (0, 7, 15):
         camera = cameras.intrinsics[view], cameras.cam_from_world[view]
-        found = margins(ball, *camera, (160, 120)) > 0
+        found = margins(ball, *camera, (WIDTH, HEIGHT)) > 0
         union = (found | drawn[view]).sum()
         assert (found & drawn[view]).sum() / union > 0.985  # half a pixel all round is 2.5 %
 
 
 def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
-    silhouettes = ball_silhouettes(cameras)
+    silhouettes = of_ball(cameras)
     wrong = silhouettes.inside.clone()
     wrong[3] = 0
     believed = visual_hull(
@@ -109,11 +85,11 @@ def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
 
 def test_views_abstain_outside_their_photographs(cameras):
     """Photographs that show half of the ball do not cut the other half off."""
-    silhouettes = ball_silhouettes(cameras)
-    left = torch.tensor([[80, 120]]).repeat(12, 1)
-    sizes = torch.cat([left, cameras.sizes_px[12:]])
+    silhouettes = of_ball(cameras)
+    left = torch.tensor([[WIDTH // 2, HEIGHT]]).repeat(10, 1)
+    sizes = torch.cat([left, cameras.sizes_px[10:]])
     inside = silhouettes.inside.clone()
-    inside[:12, :, 80:] = 0  # the padding
+    inside[:10, :, WIDTH // 2 :] = 0  # the padding
     cut = cameras.replace(sizes_px=sizes)
     hull = visual_hull(
         silhouettes.replace(inside=inside),
@@ -128,9 +104,9 @@ def test_views_abstain_outside_their_photographs(cameras):
 
 
 def test_what_too_few_views_look_at_is_outside(cameras):
-    near = visual_hull(ball_silhouettes(cameras), cameras, BOX + 4.0, num_voxels=32**3)
+    near = visual_hull(of_ball(cameras), cameras, BOX + 4.0, num_voxels=32**3)
     assert near is None  # the box stands beside the ball
-    everything = ball_silhouettes(cameras, radius=100.0)
+    everything = silhouettes_of(lambda points: points.norm(dim=-1) - 100.0, cameras)
     hull = visual_hull(everything, cameras, 4 * BOX, num_voxels=32**3, min_seen=0.9)
     assert hull is not None
     radius = (hull.origin_world + hull.spacing * hull.occupied.nonzero()).norm(dim=1)
