@@ -1,4 +1,5 @@
 import torch
+from scenes import observing
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -32,14 +33,9 @@ from pimper_torch.method.coarse.trim import (
 )
 from pimper_torch.method.coarse.window_matching import Matcher, Windows, level_of, pair
 from pimper_torch.records import Support
+from tests.coarse.ball import mottled
 
 WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
-
-
-def mottled(points):
-    waves = 12 * torch.randn(20, 3, generator=torch.Generator().manual_seed(1)).to(points)
-    tone = torch.sin(points @ waves.T + torch.arange(20).to(points)).mean(dim=-1, keepdim=True)
-    return (0.5 + tone).clamp(0.05, 1).expand_as(points)
 
 
 def ball(num_views=5):
@@ -213,12 +209,7 @@ def test_sources_are_the_views_at_angles_that_match_well():
     # Without shared points no view is a source.
     seen_by_4 = scene.observed[:, 4]
     alone = (scene.observation_view == 4) | ~seen_by_4[scene.observation_point]
-    lonely = scene.replace(
-        observation_point=scene.observation_point[alone],
-        observation_view=scene.observation_view[alone],
-        observation_pixels=scene.observation_pixels[alone],
-    )
-    assert len(choose_sources(lonely, everyone, 4, 4)) == 0
+    assert len(choose_sources(observing(scene, alone), everyone, 4, 4)) == 0
 
 
 def test_a_step_of_inverse_depth_moves_points_by_a_pixel():

@@ -16,7 +16,7 @@ from pimper_torch.method.coarse.trim import ViewCounts, seen_surface
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.records import Support
 from pimper_torch.runtime.errors import ReconstructionError
-from tests.coarse.ball import SETTINGS, photographed, silhouettes_of
+from tests.coarse.ball import SETTINGS, mottled, photographed, silhouettes_of
 
 SMALL_HOLES = FineSurfaceConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1
 
@@ -27,11 +27,7 @@ def white(points):
 
 def half_mottled(points):
     """Waves above the equator, one colour below."""
-    generator = torch.Generator().manual_seed(3)
-    waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
-    tone = torch.sin(points @ waves.T + torch.arange(24).to(points)).mean(dim=-1, keepdim=True)
-    tone = torch.where(points[..., 2:] > 0, (0.5 + 1.2 * tone).clamp(0.05, 1), 0.7)
-    return tone.expand_as(points)
+    return torch.where(points[..., 2:] > 0, mottled(points), 0.7)
 
 
 def built(scene, some=lambda points: points[:, 2] > -2):

@@ -1,6 +1,7 @@
 import pytest
 import torch
 import trimesh
+from scenes import without_points
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
@@ -162,13 +163,7 @@ def test_a_mesh_in_another_frame_is_refused_or_where_no_ray_meets_it_warned_of(
 
 
 def test_masks_alone_warn_of_another_frame_where_there_are_no_points(scene, masks, true_mesh):
-    bare = scene.replace(
-        points_world=scene.points_world[:0],
-        reprojection_errors_px=scene.reprojection_errors_px[:0],
-        observation_point=scene.observation_point[:0],
-        observation_view=scene.observation_view[:0],
-        observation_pixels=scene.observation_pixels[:0],
-    )
+    bare = without_points(scene)
     _, figures = prepared(true_mesh, bare, masks)
     assert set(figures) == {"faces", "overlap", "observations"}
     with pytest.warns(PimperWarning, match=r"is off .*overlap with the masks by 38%"):

@@ -1,4 +1,5 @@
 import torch
+from scenes import CORNERS, FACETS
 from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -11,12 +12,10 @@ from pimper_torch.records import Mesh
 
 def square():
     """Two facets, and the same with all edges halved."""
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    edges, _ = face_edges(faces)
-    split = split_edges(vertices, faces, torch.ones(len(edges), dtype=torch.bool))
-    fine = torch.cat([vertices, vertices[edges[split.halved]].mean(dim=1)])
-    return vertices, faces, split, fine
+    edges, _ = face_edges(FACETS)
+    split = split_edges(CORNERS, FACETS, torch.ones(len(edges), dtype=torch.bool))
+    fine = torch.cat([CORNERS, CORNERS[edges[split.halved]].mean(dim=1)])
+    return CORNERS, FACETS, split, fine
 
 
 def on_facets(vertices, faces, count, generator, normal):

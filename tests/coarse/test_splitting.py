@@ -1,20 +1,16 @@
 import pytest
 import torch
+from scenes import edge_counts
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import face_edges, half_edges
+from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.method.coarse.splitting import mark_edges, split_edges
 
 
 def areas(vertices, faces):
     return face_normals(vertices, faces).norm(dim=1) / 2
-
-
-def faces_per_edge(faces):
-    edges = half_edges(faces).sort(dim=1).values
-    return torch.unique(edges, dim=0, return_counts=True)[1]
 
 
 def smallest_angle(vertices, faces):
@@ -37,7 +33,7 @@ def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(gen
     edges, _ = face_edges(faces)
     marked = torch.rand(len(edges), generator=generator) < fraction
     split, places = halved(vertices, faces, marked)
-    assert (faces_per_edge(split.faces) == 2).all()
+    assert (edge_counts(split.faces)[1] == 2).all()
     assert len(split.faces) == len(faces) + 2 * int(marked.sum())
     assert len(places) == len(vertices) + int(marked.sum())
     ours, theirs = face_normals(places, split.faces), face_normals(vertices, faces)
@@ -93,4 +89,4 @@ def test_forbidden_faces_keep_their_edges():
     counts = torch.bincount(split.parent, minlength=len(faces))
     assert (counts[forbidden] == 1).all()
     assert (counts[wanted] > 1).any()
-    assert (faces_per_edge(split.faces) == 2).all()
+    assert (edge_counts(split.faces)[1] == 2).all()

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import without_points
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -185,12 +186,6 @@ def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attac
     assert found.reference == expected.reference
     assert_close(found.points.points_world, expected.points.points_world)
     assert_close(found.points.covariance_world, expected.points.covariance_world)
-    bare = round_about.replace(
-        points_world=round_about.points_world[:0],
-        reprojection_errors_px=round_about.reprojection_errors_px[:0],
-        observation_point=round_about.observation_point[:0],
-        observation_view=round_about.observation_view[:0],
-        observation_pixels=round_about.observation_pixels[:0],
-    )
+    bare = without_points(round_about)
     assert len(facets_of(mesh, bare, round_about.views.names[3]).points.facet) == 0
     assert facets_of(mesh, bare, round_about.views.names[3]).reference == 3

@@ -1,17 +1,14 @@
 import pytest
 import torch
+from scenes import FACETS, subdivided_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.method.fusion.normal_bias import CoarsePart
-
-FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
 @pytest.fixture
 def subdivision():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    return subdivide(corners, FACETS, torch.full((2,), 0.02, dtype=torch.float64))
+    return subdivided_square(0.02)
 
 
 def test_what_is_linear_on_every_facet_is_coarse_whole(subdivision):

@@ -1,19 +1,16 @@
 import pytest
 import torch
+from scenes import subdivided_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.continuation import about_mean, continued, enclosed
-
-WORLD = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
 
 
 @pytest.fixture(scope="module")
 def square():
     """Vertices and faces of a fine square."""
-    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    subdivision = subdivide(WORLD, facets, torch.full((2,), 0.05).double())
+    subdivision = subdivided_square(0.05)
     return subdivision.points, subdivision.faces
 
 

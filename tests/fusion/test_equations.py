@@ -1,10 +1,10 @@
 import pytest
 import torch
 from derivatives import check_derivatives
+from scenes import subdivided_square
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.method.fusion.equations import (
@@ -45,9 +45,7 @@ def equations_of(contacts, known, surface):
 
 @pytest.fixture
 def subdivision():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    return subdivide(corners, facets, torch.full((2,), 0.1, dtype=torch.float64))
+    return subdivided_square(0.1)
 
 
 def paraboloid(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

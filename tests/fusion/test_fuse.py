@@ -246,17 +246,10 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
 
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
-    nothing = tuple(
-        found.replace(
-            valid=torch.zeros_like(found.valid), information=torch.zeros_like(found.information)
-        )
-        for found in given.photometric.buckets
-    )
     blind = tuple(
         found.replace(information=torch.zeros_like(found.information)) for found in given.buckets
     )
-    photometric = given.photometric.replace(buckets=nothing)
-    surface = Fuse()(given.replace(photometric=photometric, buckets=blind), FREE)
+    surface = Fuse()(unlit(given).replace(buckets=blind), FREE)
     off = off_plane(lifted, surface)
     assert off.std() < 1e-4  # as flat as the facets, and where they were
     assert abs(float(off.mean()) - lifted.height) < 0.02

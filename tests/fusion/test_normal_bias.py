@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import FACETS, subdivided_square
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -7,13 +8,10 @@ from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.method.fusion.equations import swept_heights
 from pimper_torch.method.fusion.normal_bias import common, common_variance, normal_bias
 
-FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
-
 
 @pytest.fixture
 def subdivision():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    return subdivide(corners, FACETS, torch.full((2,), 0.1, dtype=torch.float64))
+    return subdivided_square(0.1)
 
 
 def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(subdivision):

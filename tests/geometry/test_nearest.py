@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import CORNERS, FACETS
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
@@ -10,8 +11,7 @@ from pimper_torch.runtime.errors import InputError
 
 @pytest.fixture
 def square():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
-    return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    return Mesh(vertices_world=CORNERS, faces=FACETS)
 
 
 def brute_force(points, mesh):

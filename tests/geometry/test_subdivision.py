@@ -1,16 +1,11 @@
 import pytest
 import torch
-import trimesh
+from scenes import CORNERS, FACETS, edge_counts, subdivided_square
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide, transferred
 from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import half_edges
-
-
-def icosphere(subdivisions=1):
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return torch.tensor(sphere.vertices, dtype=torch.float64), torch.tensor(sphere.faces)
 
 
 def ragged_fan(seed=41):
@@ -26,11 +21,6 @@ def ragged_fan(seed=41):
     return vertices, torch.stack([torch.zeros_like(one), 1 + one, 1 + (one + 1) % count], dim=1)
 
 
-def edge_counts(faces):
-    edges = half_edges(faces).sort(dim=1).values
-    return torch.unique(edges, dim=0, return_counts=True)
-
-
 def euler(num_vertices, faces):
     return num_vertices - len(edge_counts(faces)[0]) + len(faces)
 
@@ -40,7 +30,7 @@ def all_spacings(facets, length):
 
 
 SCENES = {
-    "closed": (*icosphere(), 0.08),
+    "closed": (*icosphere(1), 0.08),
     "ragged": (*ragged_fan(), 0.05),
     "ragged, coarse": (*ragged_fan(seed=42), 0.7),
     "one piece an edge": (*icosphere(0), 5.0),
@@ -86,7 +76,7 @@ def test_no_face_is_turned_and_areas_add_up(scene):
 
 
 def test_edges_are_about_one_spacing_long_where_facets_are_well_shaped():
-    vertices, facets = icosphere()
+    vertices, facets = icosphere(1)
     subdivision = subdivide(vertices, facets, all_spacings(facets, 0.05))
     edges, _ = edge_counts(subdivision.faces)
     lengths = subdivision.points[edges].diff(dim=1).norm(dim=-1)
@@ -104,9 +94,7 @@ def test_a_narrow_facet_has_no_more_points_than_its_area_asks_for():
 
 
 def test_an_edge_follows_the_finer_of_its_facets():
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    subdivision = subdivide(vertices, facets, torch.tensor([0.05, 0.5], dtype=torch.float64))
+    subdivision = subdivide(CORNERS, FACETS, torch.tensor([0.05, 0.5], dtype=torch.float64))
     coordinate = subdivision.points[:, 0]
     on_diagonal = (subdivision.points[:, 0] - subdivision.points[:, 1]).abs() < 1e-9
     on_top = subdivision.points[:, 1] > 1 - 1e-9
@@ -145,11 +133,7 @@ def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
 
 
 def test_what_is_smooth_is_transferred_from_a_coarser_subdivided_mesh_over_the_same_facets():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    facets = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    fine, rough = (
-        subdivide(corners, facets, torch.full((2,), side).double()) for side in (0.02, 0.04)
-    )
+    fine, rough = map(subdivided_square, (0.02, 0.04))
 
     def wave(subdivision):
         return 1 + torch.sin(3 * subdivision.points[:, 0]) * subdivision.points[:, 1]

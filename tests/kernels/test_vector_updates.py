@@ -6,6 +6,7 @@ from torch.testing import assert_close
 from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
 from pimper_torch.ground.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles
+from tests.threads import on_threads
 
 CPU = torch.device("cpu")
 
@@ -41,13 +42,13 @@ def test_steps_are_those_of_torchs_vectors_and_of_any_number_of_threads():
     start = torch.from_numpy(matrix.diagonal()).rsqrt()[:, None] * random(25600, 2)
     options = {"start": start, "tolerance": 1e-30, "max_iterations": 5}
     expected, _, _ = conjugate_gradients(times, hierarchy.precondition, rhs, dims=(0,), **options)
-    before, answers = torch.get_num_threads(), []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        answers.append(compressed_gradients(matrix, hierarchy.cycle, rhs, **options)[0])
-    torch.set_num_threads(before)
-    assert_close(answers[0], expected, rtol=1e-8, atol=1e-8 * float(expected.abs().max()))
-    assert_close(answers[1], answers[0], rtol=0, atol=0)
+
+    def found():
+        return compressed_gradients(matrix, hierarchy.cycle, rhs, **options)[0]
+
+    one, two = on_threads(found, 1, 2)
+    assert_close(one, expected, rtol=1e-8, atol=1e-8 * float(expected.abs().max()))
+    assert_close(two, one, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("wrong", ["nan", "limit"])

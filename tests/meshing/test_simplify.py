@@ -8,6 +8,7 @@ from pimper_torch.ground.geometry.nearest import NearestSurface, closest_on_tria
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.method.meshing.simplify import Bounds, simplify
 from pimper_torch.records import Mesh
+from tests.threads import on_threads
 
 
 def square(side, height):
@@ -125,15 +126,8 @@ def test_a_closed_surface_stays_closed_and_oriented():
 
 
 def test_the_number_of_threads_changes_nothing():
-    mesh, before = square(50, waves), torch.get_num_threads()
-    faces = []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            faces.append(simplify(mesh).mesh.faces)
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(*faces)
+    mesh = square(50, waves)
+    assert torch.equal(*on_threads(lambda: simplify(mesh).mesh.faces, 1, 3))
 
 
 def test_the_values_of_what_is_kept_carry_gradients():

@@ -14,6 +14,7 @@ from pimper_torch.method.patches.decompose import Decompose, views_facing
 from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.view_choice import best_views, view_blocks, view_weights
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
+from tests.threads import on_threads
 
 FOCAL, DISTANCE, SPACING = 100.0, 4.0, 0.02
 
@@ -140,11 +141,7 @@ def test_blocks_hold_every_facet_once_and_show_each_in_most_views_that_it_may_ha
 
 
 def test_the_number_of_threads_changes_no_block(ball):
-    before, found = torch.get_num_threads(), []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        found.append(view_blocks(*ball, torch.tensor(SPACING).double(), 12))
-    torch.set_num_threads(before)
+    found = on_threads(lambda: view_blocks(*ball, torch.tensor(SPACING).double(), 12), 1, 2)
     for one, other in zip(*found, strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])

@@ -3,13 +3,14 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.pyramids import look_up, pyramid_level
-from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.patches.decompose import Decompose
 from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.warp import Warp
 from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.runtime.reporting import figures
+from tests.patches.test_transfer import places
 
 
 @pytest.fixture
@@ -18,14 +19,9 @@ def registered(plane_scene, plane_mesh):
     return Warp()(plane_scene.views, plane_scene.cameras, patches)
 
 
-def _points_world(templates):
-    flat = templates.points_patch.flatten(1, 2)
-    return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
-
-
 def test_every_view_gives_the_albedo_at_each_samples_own_point(registered):
     for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
-        points = _points_world(templates)
+        points = places(templates)
         x, y = points[..., 0], points[..., 1]
         truth = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.1 * x + 0.1 * y], dim=1)
         error = (seen.radiance - truth[:, None]).abs() * seen.valid[:, :, None]
@@ -86,7 +82,7 @@ def test_a_facet_in_front_hides_the_one_behind(plane_scene, plane_mesh):
     seen = Warp()(plane_scene.views, plane_scene.cameras, patches)
     center = plane_scene.cameras.centers_world[2]
     for templates, bucket in zip(patches.buckets, seen.buckets, strict=True):
-        points = _points_world(templates)
+        points = places(templates)
         # Where the ray to the centre of view 2 passes the cover's plane, in the cover's corners.
         normal = torch.linalg.cross(cover[1] - cover[0], cover[2] - cover[0])
         ray = center - points

@@ -240,32 +240,6 @@ def test_names_that_match_nothing_are_refused_with_the_nearest(views, normals, t
     assert read_normals(tmp_path, alone).names == ("cup_1.png",)
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "what"),
-    [
-        ("a b.npy", np.ones((24, 32), np.float32), "has one value a pixel; .* Is it depth"),
-        ("a b.npy", np.ones((32, 24, 3), np.float32), "is 24 x 32, .* the file stores; turn them"),
-        ("a b.npy", np.ones((24, 24, 3), np.float32), "is 24 x 24, .* of its shape, at any size"),
-        ("a b.npy", np.ones((2, 24, 32, 5), np.float32), "has shape .*; needed: height width"),
-        ("a b.npy", np.full((24, 32, 3), "x"), "holds <U1; needed: real numbers"),
-        ("a b.npy", np.full((24, 32, 3), None), "cannot be read, it is no array .*Python objects"),
-    ],
-)
-def test_maps_that_are_none_are_refused(name, values, what, views, tmp_path):
-    np.save(tmp_path / name, values, allow_pickle=values.dtype == object)
-    with pytest.raises(InputError, match=what):
-        read_normals(tmp_path, views)
-
-
-def test_maps_without_a_value_are_refused(views, normals, tmp_path):
-    save(tmp_path / "a b.npy", 200 * normals)
-    with pytest.raises(InputError, match=r"hold nothing .* lengths from 0 to 200; needed: unit"):
-        read_normals(tmp_path, views)
-    np.save(tmp_path / "a b.npy", np.zeros((24, 32)), allow_pickle=False)
-    with pytest.raises(InputError, match=r"maps of a b.jpg hold nothing that can be used"):
-        read_depth(tmp_path, views)
-
-
 def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
     coded = np.rint(65535 * (normals + 1) / 2).astype(np.uint16)
     np.savez(tmp_path / "a b.npz", **{"View.Normals": coded, "x": coded}, allow_pickle=False)
@@ -273,29 +247,45 @@ def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
     assert_close(found.normals[0, :23], torch.from_numpy(normals[:23]), rtol=0, atol=3e-5)
 
 
-def test_a_picture_of_depth_in_colours_is_refused(views, normals, tmp_path):
-    save(tmp_path / "a b.png", normals)
-    with pytest.raises(InputError, match="has colours; needed: one value a pixel"):
-        read_depth(tmp_path, views)
+ONES = np.ones((24, 32, 3), np.float32)
 
 
-def test_folders_and_archives_without_maps_are_refused(views, tmp_path):
+@pytest.mark.parametrize(
+    ("read", "name", "values", "told"),
+    [
+        (read_normals, "a b.npy", ONES[..., 0], "has one value a pixel; .* Is it depth"),
+        (read_normals, "a b.npy", ONES.swapaxes(0, 1), "is 24 x 32, .* file stores; turn them"),
+        (read_normals, "a b.npy", ONES[:, :24], "is 24 x 24, .* of its shape, at any size"),
+        (read_normals, "a b.npy", np.ones((2, 24, 32, 5)), "has shape .*; needed: height width"),
+        (read_normals, "a b.npy", np.full((24, 32, 3), "x"), "holds <U1; needed: real numbers"),
+        (read_normals, "a b.npy", np.full((24, 32, 3), None), "no array .*Python objects"),
+        (read_normals, "a b.npy", 200 * ONES / 3**0.5, "lengths from 200 to 200; needed: unit"),
+        (read_normals, "a b.txt", ONES, r"holds no maps; needed: files ending in .npz"),
+        (read_depth, "a b.npy", 0 * ONES[..., 0], "a b.jpg hold nothing that can be used"),
+        (read_depth, "a b.png", ONES * [1, 0, -1], "has colours; needed: one value a pixel"),
+        (read_depth, "a b.npz", ONES[0, 0], "holds normals, albedo; .* one array .* called depth"),
+    ],
+)
+def test_what_is_no_map_of_these_photographs_is_refused(read, name, values, told, views, tmp_path):
+    if values.dtype.kind in "UO" or name.endswith(".txt"):
+        with (tmp_path / name).open("wb") as file:
+            np.save(file, values)
+    else:
+        save(tmp_path / name, values)
+    with pytest.raises(InputError, match=told):
+        read(tmp_path, views)
+
+
+def test_no_folder_no_archive_and_no_standard_error_are_refused(views, normals, tmp_path):
     with pytest.raises(InputError, match="found nothing; needed: a folder of maps"):
         read_normals(tmp_path / "none", views)
-    with pytest.raises(InputError, match=r"holds no maps; needed: files ending in .npz"):
-        read_normals(tmp_path, views)
-    np.savez(tmp_path / "a b.npz", x=np.ones(3), y=np.ones(3), allow_pickle=False)
-    with pytest.raises(InputError, match="holds x, y; needed: one array or channel called depth"):
-        read_depth(tmp_path, views)
     (tmp_path / "a b.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match=r"a b.npz: cannot be read, it is no archive"):
         read_depth(tmp_path, views)
-
-
-def test_standard_errors_are_above_zero(views, normals, tmp_path):
-    save(tmp_path / "a b.npy", normals)
+    save(tmp_path / "a b.npz", normals)
     with pytest.raises(ConfigError, match="error_deg is 0"):
         read_normals(tmp_path, views, error_deg=0)
-    np.save(tmp_path / "a b.npy", normals[..., 0], allow_pickle=False)
+    (tmp_path / "a b.npz").unlink()
+    save(tmp_path / "a b.npy", normals[..., 0])
     with pytest.raises(ConfigError, match="error is -1"):
         read_depth(tmp_path, views, error=-1)

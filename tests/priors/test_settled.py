@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import observing, without_points
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
@@ -105,13 +106,7 @@ def test_stated_axes_that_fit_are_believed_without_a_word(rendered):
 
 def test_where_nothing_tells_axes_are_to_be_stated(rendered):
     scene = rendered.scene
-    bare = scene.replace(
-        points_world=scene.points_world[:0],
-        reprojection_errors_px=scene.reprojection_errors_px[:0],
-        observation_point=scene.observation_point[:0],
-        observation_view=scene.observation_view[:0],
-        observation_pixels=scene.observation_pixels[:0],
-    )
+    bare = without_points(scene)
     upside_down = of_normals(bare, -rendered.camera)
     assert torch.equal(settle(bare, upside_down).normals, upside_down.normals)
     with pytest.raises(InputError, match=r"nothing tells whether they are .* State `axes`"):
@@ -216,11 +211,7 @@ def test_maps_of_photographs_that_were_left_out_since_are_not_looked_at(rendered
 def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
     scene = rendered.scene
     there = scene.observation_view != 4
-    scene = scene.replace(
-        observation_point=scene.observation_point[there],
-        observation_view=scene.observation_view[there],
-        observation_pixels=scene.observation_pixels[there],
-    )
+    scene = observing(scene, there)
     depth = (3 * rendered.depth).requires_grad_()
     found = settle(scene, of_depth(scene, depth, gauge="scale"))
     assert found.variance[4].isinf().all()
@@ -265,12 +256,7 @@ def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
     cam = points @ pose[:3, :3].mT + pose[:3, 3]
     flat = torch.cat([cam[:, :2] / cam[:, 2:], torch.ones_like(cam[:, 2:])], dim=1) * 7.0
     here = scene.observation_view == 5
-    wall = scene.replace(
-        points_world=(flat - pose[:3, 3]) @ pose[:3, :3],
-        observation_point=scene.observation_point[here],
-        observation_view=scene.observation_view[here],
-        observation_pixels=scene.observation_pixels[here],
-    )
+    wall = observing(scene, here).replace(points_world=(flat - pose[:3, 3]) @ pose[:3, :3])
     generator = torch.Generator().manual_seed(8)
     given = 1 + torch.rand(12, 120, 160, generator=generator)
     prior = of_depth(wall, given, inverse=True)

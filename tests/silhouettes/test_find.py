@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import observing
 
 from pimper_torch.ground.geometry.opencv import signed_distance
 from pimper_torch.ground.geometry.pixels import pixel_centers
@@ -40,12 +41,7 @@ def test_a_ball_on_a_table_is_found_in_every_view(staged):
 
 def without_points_of_the_ball(scene):
     on_ball = scene.points_world[:, 2] > 0.01
-    kept = ~on_ball[scene.observation_point]
-    return scene.replace(
-        observation_point=scene.observation_point[kept],
-        observation_view=scene.observation_view[kept],
-        observation_pixels=scene.observation_pixels[kept],
-    )
+    return observing(scene, ~on_ball[scene.observation_point])
 
 
 def test_an_object_without_a_point_is_found_by_parallax(staged):

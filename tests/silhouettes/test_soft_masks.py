@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import observing
 from torch.nn.functional import interpolate
 
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
@@ -37,11 +38,7 @@ def soft(truth, size=(180, 240)):
 def without_any_hint(scene):
     """One colour, no point: nothing but masks tells of the object."""
     images = torch.full_like(scene.views.images, 0.3)
-    none = scene.observation_point[:0]
-    scene = scene.replace(
-        observation_point=none, observation_view=none, observation_pixels=torch.zeros(0, 2)
-    )
-    return scene.replace(views=scene.views.replace(images=images))
+    return observing(scene, slice(0)).replace(views=scene.views.replace(images=images))
 
 
 def test_masks_of_half_the_size_are_followed(staged):

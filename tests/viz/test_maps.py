@@ -1,8 +1,8 @@
 import pytest
 import torch
+from scenes import from_above, tilted_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh
 from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 
@@ -10,14 +10,12 @@ from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 @pytest.fixture
 def plane():
     """A tilted plane: x from -1 to 1 to the right, y up, leaning back to the right."""
-    corners = torch.tensor([[-1.0, -1, 0.3], [1, -1, -0.3], [1, 1, -0.3], [-1, 1, 0.3]])
-    return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    return tilted_square(x=-0.3)
 
 
 @pytest.fixture
 def front():
-    eye, up = torch.tensor([[0.0, 0, 5]]), torch.tensor([0.0, 1, 0])
-    return pinholes(look_at(eye, torch.zeros(3), up), 20.0, 16, 12)
+    return from_above(20.0, 16, 12)
 
 
 def test_depth_and_normals_of_a_plane_are_those_of_the_formula(plane, front):

@@ -1,8 +1,8 @@
 import pytest
 import torch
+from scenes import from_above, tilted_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.records import Mesh
 from pimper_torch.result.viz.render import bounding_box, frame, rotation, shade
@@ -10,17 +10,7 @@ from pimper_torch.result.viz.render import bounding_box, frame, rotation, shade
 
 @pytest.fixture
 def front():
-    eye, up = torch.tensor([[0.0, 0, 5]]), torch.tensor([0.0, 1, 0])
-    return pinholes(look_at(eye, torch.zeros(3), up), 40.0, 32, 24)
-
-
-def square(tilt_x=0.0, tilt_y=0.0):
-    corners = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
-    depth = tilt_x * corners[:, 0] + tilt_y * corners[:, 1]
-    return Mesh(
-        vertices_world=torch.cat([corners, depth[:, None]], dim=1),
-        faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
-    )
+    return from_above(40.0, 32, 24)
 
 
 def test_the_point_light_is_up_on_the_left(front):
@@ -28,22 +18,22 @@ def test_the_point_light_is_up_on_the_left(front):
         return shade(mesh, front)[12, 16, 0]
 
     # z towards the viewer growing to the right: the face looks to the left.
-    assert tone(square(tilt_x=0.4)) > tone(square()) > tone(square(tilt_x=-0.4))
-    assert tone(square(tilt_y=-0.4)) > tone(square()) > tone(square(tilt_y=0.4))
+    assert tone(tilted_square(x=0.4)) > tone(tilted_square()) > tone(tilted_square(x=-0.4))
+    assert tone(tilted_square(y=-0.4)) > tone(tilted_square()) > tone(tilted_square(y=0.4))
 
 
 def test_transferred_normals_do_not_pretend_height_field(front):
-    flat = square()
+    flat = tilted_square()
     bumpy = flat.replace(normals_world=torch.eye(4, 3) + 0.1)
     assert torch.equal(shade(bumpy, front), shade(flat, front))
 
 
 def test_a_face_seen_from_behind_is_bluish_and_emptiness_white(front):
-    behind = square().replace(faces=square().faces.flip(1))
+    behind = tilted_square().replace(faces=tilted_square().faces.flip(1))
     red, _, blue = shade(behind, front)[12, 16]
     assert blue > red + 0.1
     assert (shade(behind, front)[0, 0] == 1).all()
-    assert_close(shade(square(), front)[12, 16, 0], shade(square(), front)[12, 16, 2])
+    assert_close(shade(tilted_square(), front)[12, 16, 0], shade(tilted_square(), front)[12, 16, 2])
 
 
 def test_flat_shading_shows_edges_that_smooth_shading_hides(front):

@@ -5,6 +5,7 @@ import pytest
 import torch
 from matplotlib import colormaps
 from PIL import Image
+from scenes import from_above, tilted_square
 
 from pimper_bench.bench.heatmap import (
     MISSED,
@@ -19,8 +20,6 @@ from pimper_bench.bench.heatmap import (
     shading_in_view,
     surface_picture,
 )
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 
 SCALE = ErrorScale(clip=2.0, unit="% of the diagonal")
@@ -28,14 +27,12 @@ SCALE = ErrorScale(clip=2.0, unit="% of the diagonal")
 
 @pytest.fixture
 def plane():
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    return tilted_square()
 
 
 @pytest.fixture
 def front():
-    eye, up = torch.tensor([[0.0, 0, 5]]), torch.tensor([0.0, 1, 0])
-    return pinholes(look_at(eye, torch.zeros(3), up), 60.0, 48, 36)
+    return from_above(60.0, 48, 36)
 
 
 def has_color(path, color):

@@ -1,0 +1,51 @@
+"""Parts of scenes that tests in several rooms change."""
+
+import torch
+
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.records import Mesh
+
+# A square of side 1 and its two facets.
+CORNERS = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
+FACETS = torch.tensor([[0, 1, 2], [0, 2, 3]])
+
+
+def subdivided_square(spacing):
+    """Subdivide the square."""
+    return subdivide(CORNERS, FACETS, torch.full((2,), spacing, dtype=torch.float64))
+
+
+def tilted_square(x=0.0, y=0.0):
+    """A square of side 2 about the origin, in single precision; z rises by so much along axes."""
+    vertices = 2 * CORNERS - torch.tensor([1.0, 1, 0])
+    vertices[:, 2] = vertices[:, :2] @ torch.tensor([x, y], dtype=torch.float64)
+    return Mesh(vertices_world=vertices.float(), faces=FACETS)
+
+
+def from_above(focal_px, width, height):
+    """A camera that looks at the origin from 5 along z, y up."""
+    pose = look_at(torch.tensor([[0.0, 0, 5]]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
+    return pinholes(pose, focal_px, width, height)
+
+
+def observing(scene, kept):
+    """Keep some of a scene's observations."""
+    return scene.replace(
+        observation_point=scene.observation_point[kept],
+        observation_view=scene.observation_view[kept],
+        observation_pixels=scene.observation_pixels[kept],
+    )
+
+
+def without_points(scene):
+    """Leave out the cloud."""
+    return observing(scene, slice(0)).replace(
+        points_world=scene.points_world[:0], reprojection_errors_px=scene.reprojection_errors_px[:0]
+    )
+
+
+def edge_counts(faces):
+    """List edges, and how many faces each has."""
+    return torch.unique(half_edges(faces).sort(dim=1).values, dim=0, return_counts=True)
