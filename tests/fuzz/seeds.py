@@ -138,8 +138,8 @@ def _pictures() -> dict[str, Callable[[Path], object]]:
 
     def pages(path: Path) -> None:
         with tifffile.TiffWriter(path) as file:
-            file.write(PIXELS[::2, ::2], photometric="rgb", subfiletype=1)
             file.write(PIXELS, photometric="rgb", extratags=[(281, "H", 3, (255,) * 3, True)])
+            file.write(PIXELS[::2, ::2], photometric="rgb", subfiletype=1)
 
     pictures = {
         "a.jpg": saved(plain, exif=exif, quality=90),

@@ -1,3 +1,4 @@
+import io
 import struct
 import warnings
 import zlib
@@ -6,26 +7,44 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header
+from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.profiles import colour_of_codes
-from pimper_torch.ground.radiometry import Encoding, Gamma, Linear, Srgb, linear_from_srgb
-from pimper_torch.ground.radiometry.primaries import ADOBE_RGB, DISPLAY_P3, REC_709, primaries_of
-from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.doors.io.profiles import colour_of_codes, read_profile
+from pimper_torch.ground.radiometry import Curve, Encoding, Gamma, Linear, Srgb, linear_from_srgb
+from pimper_torch.ground.radiometry.primaries import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    REC_709,
+    in_srgb_primaries,
+    primaries_of,
+)
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
-LINEAR_CURVE = b"curv" + bytes(8)
+SRGB = tuple(primaries_of(REC_709).T.tolist())
+P3 = tuple(primaries_of(DISPLAY_P3).T.tolist())
+IDENTITY = b"curv" + bytes(8)
 
 
 def power(exponent):
     return b"curv" + bytes(4) + struct.pack(">IH", 1, round(256 * exponent))
 
 
-@pytest.fixture
-def columns():
-    return tuple(primaries_of(REC_709).T.tolist())
+def sampled(values):
+    levels = np.round(65535 * np.asarray(values)).astype(">u2")
+    return b"curv" + bytes(4) + struct.pack(">I", len(levels)) + levels.tobytes()
+
+
+def parametric(kind, *values):
+    numbers = b"".join(struct.pack(">i", round(65536 * value)) for value in values)
+    return b"para" + bytes(4) + struct.pack(">HH", kind, 0) + numbers
+
+
+SRGB_PIECES = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+SRGB_CURVE = parametric(3, *SRGB_PIECES)
+ADOBE = Gamma(exponent=563 / 256)
 
 
 @pytest.fixture
@@ -47,11 +66,125 @@ def three(tmp_path):
     return read
 
 
-@pytest.mark.parametrize(("suffix", "tolerance"), [("png", 1e-6), ("tif", 1e-6), ("jpg", 0.03)])
-def test_a_profile_of_gamma_1_8_is_followed_in_every_format(
-    three, make_profile, columns, suffix, tolerance
+@pytest.mark.parametrize(
+    ("curve", "response"),
+    [
+        (IDENTITY, Linear()),
+        (parametric(0, 1.0), Linear()),
+        (sampled([0, 1]), Linear()),
+        (power(1.8), Gamma(exponent=461 / 256)),
+        (parametric(0, 2.5), Gamma(exponent=2.5)),
+        (sampled(linear_from_srgb(torch.linspace(0, 1, 1024, dtype=torch.float64))), Srgb()),
+        (SRGB_CURVE, Srgb()),
+        (parametric(4, *SRGB_PIECES, 0, 0), Srgb()),
+    ],
+)
+@pytest.mark.parametrize("space", [b"RGB ", b"GRAY"])
+def test_standard_responses_are_known_however_they_are_written(
+    make_profile, curve, response, space
 ):
-    profile = make_profile(power(1.8), columns)
+    colour = read_profile(make_profile(curve, SRGB, space=space))
+    assert (colour.response, colour.srgb_from_file, colour.trouble) == (response, None, "")
+
+
+def test_littlecms_and_its_srgb_are_understood(make_profile, pixels):
+    colour = read_profile(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    assert (colour.response, colour.srgb_from_file, colour.trouble) == (Srgb(), None, "")
+    profile = make_profile(SRGB_CURVE, P3, name="Display P3")
+    colour = read_profile(profile)
+    assert (colour.response, colour.source) == (Srgb(), 'the ICC profile "Display P3"')
+    dull = pixels // 4 + 96  # inside sRGB, and not saturated
+    given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    wanted = ImageCms.profileToProfile(
+        Image.fromarray(dull), given, ImageCms.createProfile("sRGB"), renderingIntent=1
+    )
+    oracle = linear_from_srgb(torch.from_numpy(np.array(wanted) / 255).movedim(-1, 0))
+    encoded = torch.from_numpy(dull / 255).movedim(-1, 0)
+    found = in_srgb_primaries(linear_from_srgb(encoded), colour.srgb_from_file)
+    scale = (oracle / found).median()
+    assert_close(scale * found, oracle, rtol=0, atol=0.006)  # half a level of 255 each way
+    assert float((linear_from_srgb(encoded) - oracle).abs().max()) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("curve", "wanted"),
+    [
+        (parametric(1, 2.0, 0.8, 0.2), lambda x: (0.8 * x + 0.2) ** 2),
+        (parametric(1, 2.0, 1.25, -0.25), lambda x: (1.25 * x - 0.25).clamp_min(0) ** 2),
+        (parametric(2, 2.0, 0.8, 0.1, 0.19), lambda x: (0.8 * x + 0.1) ** 2 + 0.19),
+        (parametric(3, 2.0, 1.0, 0.0, 0.5, 0.5), lambda x: torch.where(x < 0.5, x / 2, x**2)),
+        (
+            parametric(4, 2.0, 0.8, 0.1, 0.25, 0.3, 0.19, 0.2306),
+            lambda x: torch.where(x < 0.3, x / 4 + 0.2306, (0.8 * x + 0.1) ** 2 + 0.19),
+        ),
+        (sampled(np.linspace(0, 1, 300) ** 1.7), lambda x: x**1.7),
+        (
+            (power(1.5), IDENTITY, sampled(np.linspace(0, 1, 500) ** 2)),
+            lambda x: torch.stack([x**1.5, x, x**2]),
+        ),
+        (
+            tuple(sampled(np.linspace(0, 1, 500) ** power) for power in (1.2, 1.6, 2)),
+            lambda x: torch.stack([x**1.2, x**1.6, x**2]),
+        ),
+    ],
+)
+def test_curves_are_what_the_standard_says(make_profile, curve, wanted):
+    levels = torch.linspace(0, 1, 256, dtype=torch.float64)
+    response = read_profile(make_profile(curve, SRGB)).response
+    found = response.linear_from_encoded(levels.expand(3, 1, -1))[:, 0]
+    # Rounded to 1/65536; 300 entries of a power of 1.7 are off by 1e-5 between them.
+    assert_close(found, wanted(levels).expand(3, -1), rtol=0, atol=1e-4)
+
+
+def test_the_name_is_told_without_what_a_terminal_obeys(make_profile):
+    assert read_profile(make_profile(IDENTITY, SRGB, name='a\x1b[31m"b')).source == (
+        'the ICC profile "a[31mb"'
+    )
+    text = "Größe".encode("utf-16-be")
+    name = b"mluc" + bytes(4) + struct.pack(">IIHHII", 1, 12, 0, 0, len(text), 28) + text
+    assert "Größe" in read_profile(make_profile(IDENTITY, SRGB, more={b"desc": name})).source
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"space": b"CMYK", "curve": (IDENTITY,)}, "is of CMYK, not of RGB or gray"),
+        ({"space": b"GRAY", "more": {b"kTRC": b""}}, "has tone curves of an unknown type"),
+        ({"connection": b"Lab "}, "has tone curves in CIELab"),
+        ({"curve": sampled(np.linspace(1, 0, 20))}, "does not rise"),
+        ({"curve": sampled([0.2, 0.2])}, "does not rise"),
+        ({"curve": b"curv" + bytes(4) + struct.pack(">I", 2**31)}, "cut short"),
+        ({"curve": power(0.0)}, "has a gamma of 0"),
+        ({"curve": parametric(9, 1.0)}, "unknown function"),
+        ({"curve": parametric(1, 2.0, 0.0, 0.5)}, "flat"),
+        ({"curve": b"text" + bytes(20)}, "unknown type"),
+        ({"columns": ((0, 0, 0),) * 3}, "primaries that span no colours"),
+        ({"columns": ()}, "has no primaries"),
+    ],
+)
+def test_what_cannot_be_followed_is_named(make_profile, settings, why):
+    given = {"curve": IDENTITY, "columns": SRGB} | settings
+    assert why in read_profile(make_profile(**given)).trouble
+
+
+def test_no_damage_raises(make_profile):
+    profile = make_profile(sampled(np.linspace(0, 1, 64) ** 2), P3)
+    generator = np.random.default_rng(5)
+    for size in range(0, len(profile), 7):
+        read_profile(profile[:size])
+    for _ in range(400):
+        data = bytearray(profile)
+        for at in generator.integers(0, len(data), 4):
+            data[at] = generator.integers(0, 256)
+        colour = read_profile(bytes(data))
+        assert colour.response is None or isinstance(colour.response, Linear | Srgb | Gamma | Curve)
+    assert read_profile(b"").trouble == "is damaged"
+    assert read_profile(bytes(2**23)).trouble == "is damaged"
+
+
+@pytest.mark.parametrize(("suffix", "tolerance"), [("png", 1e-6), ("tif", 1e-6), ("jpg", 0.03)])
+def test_a_profile_of_gamma_1_8_is_followed_in_every_format(three, make_profile, suffix, tolerance):
+    profile = make_profile(power(1.8), SRGB)
     ramp = np.repeat(np.linspace(0, 255, 64).round().astype(np.uint8)[None, :, None], 3, axis=2)
     array = np.repeat(ramp, 16, axis=0)
     options = {"quality": 100} if suffix == "jpg" else {}
@@ -69,19 +202,19 @@ def gamma(number):
 
 WIDE = {"cHRM": struct.pack(">8I", 31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)}
 SAME = {"cHRM": struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)}
+NOT_SRGB = "has gAMA .* and cHRM that are not sRGB's"
 
 
 @pytest.mark.parametrize(
     ("chunks", "response", "wide"),
     [
-        (gamma(100_000), Linear(), False),
         (gamma(45_455), Srgb(), False),  # what programs without a chunk for sRGB write for it
         (gamma(45_455) | SAME, Srgb(), False),
-        (gamma(50_000) | WIDE, Gamma(exponent=2.0), True),
-        (gamma(100_000) | {"sRGB": b"\0"}, Srgb(), False),
+        (SAME, None, False),
+        (gamma(100_000) | WIDE | {"sRGB": b"\0"}, Srgb(), False),
         ({"cICP": bytes([1, 8, 0, 1])}, Linear(), False),
         ({"cICP": bytes([12, 13, 0, 1])} | gamma(100_000), Srgb(), True),
-        ({"cICP": bytes([2, 4, 0, 1])}, Gamma(exponent=2.2), False),
+        ({"cICP": bytes([2, 13, 0, 1])}, Srgb(), False),
         ({}, None, False),
     ],
 )
@@ -90,25 +223,6 @@ def test_chunks_of_png_are_followed(tmp_path, pixels, png_with, chunks, response
     colour = read_header(tmp_path / "a.png").colour
     assert (colour.response, colour.srgb_from_file is not None) == (response, wide)
     assert colour.trouble == ""
-
-
-def test_a_profile_goes_before_gamma_and_a_damaged_one_is_named(
-    tmp_path, pixels, png_with, make_profile, columns
-):
-    profile = b"x\0\0" + zlib.compress(make_profile(LINEAR_CURVE, columns))
-    png_with(tmp_path / "a.png", pixels, **gamma(45_455), iCCP=profile)
-    assert read_header(tmp_path / "a.png").colour.response == Linear()
-    png_with(tmp_path / "b.png", pixels, iCCP=b"x\0\0" + zlib.compress(bytes(2**19)))
-    assert read_header(tmp_path / "b.png").colour.trouble == "is damaged"
-    png_with(tmp_path / "c.png", pixels, cICP=b"\1")
-    assert "damaged chunk" in read_header(tmp_path / "c.png").colour.trouble
-
-
-def test_the_curve_of_bt_709_is_inverted():
-    response = colour_of_codes(1, 1, "cICP").response
-    light = torch.linspace(0, 1, 200, dtype=torch.float64)
-    encoded = torch.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
-    assert_close(response.linear_from_encoded(encoded), light, rtol=0, atol=1e-4)
 
 
 def exif_of(colour_space=None, index=None, exponent=None, orientation=None):
@@ -126,54 +240,87 @@ def exif_of(colour_space=None, index=None, exponent=None, orientation=None):
     return exif
 
 
-def test_a_camera_that_says_adobe_rgb_in_exif_alone_is_believed(tmp_path, pixels):
-    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif_of(65535, "R03"))
+@pytest.mark.parametrize(
+    ("exif", "response"),
+    [
+        (exif_of(65535, "R03"), ADOBE),
+        (exif_of(65535, "R03", exponent=2.2), ADOBE),
+        (exif_of(1, "R98"), None),
+        (exif_of(65535), None),
+    ],
+)
+def test_a_camera_that_says_adobe_rgb_in_exif_alone_is_believed(tmp_path, pixels, exif, response):
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
     colour = read_header(tmp_path / "a.jpg").colour
-    assert colour.response == Gamma(exponent=563 / 256)
-    assert colour.srgb_from_file is not None
-    # Adobe RGB shares red and blue with sRGB: of its green, red holds nothing positive.
-    assert float(colour.srgb_from_file[0, 1]) < -0.3
-    Image.fromarray(pixels).save(tmp_path / "b.jpg", exif=exif_of(1, "R98"))
-    assert read_header(tmp_path / "b.jpg").colour.response is None
-    Image.fromarray(pixels).save(tmp_path / "c.jpg", exif=exif_of(65535))
-    assert read_header(tmp_path / "c.jpg").colour.response is None
-    Image.fromarray(pixels).save(tmp_path / "d.jpg", exif=exif_of(exponent=1.0))
-    assert read_header(tmp_path / "d.jpg").colour.response == Linear()
+    assert colour.response == response
+    assert (colour.srgb_from_file is not None) == (response == ADOBE)
+    if response == ADOBE:  # it shares red and blue with sRGB: of its green, red holds nothing
+        assert float(colour.srgb_from_file[0, 1]) < -0.3
 
 
-def test_the_transfer_function_of_a_tiff_is_followed(tmp_path, pixels):
-    curve = tuple(int(65535 * (level / 255) ** 1.5) for level in range(256))
-    for count in (1, 3):
-        tifffile.imwrite(
-            tmp_path / "a.tif",
-            pixels,
-            photometric="rgb",
-            extratags=[(301, "H", 256 * count, curve * count, True)],
-        )
-        response = read_header(tmp_path / "a.tif").colour.response
-        level = torch.linspace(0, 1, 100, dtype=torch.float64)
-        assert_close(response.linear_from_encoded(level), level**1.5, rtol=0, atol=1e-4)
-    tifffile.imwrite(
-        tmp_path / "b.tif", pixels, photometric="rgb", extratags=[(301, "H", 20, curve[:20], True)]
-    )
-    assert "no table" in read_header(tmp_path / "b.tif").colour.trouble
+@pytest.mark.parametrize(
+    ("write", "why"),
+    [
+        ({"chunks": gamma(100_000)}, f"PNG {NOT_SRGB}"),
+        ({"chunks": gamma(50_000) | SAME}, f"PNG {NOT_SRGB}"),
+        ({"chunks": gamma(0)}, f"PNG {NOT_SRGB}"),
+        ({"chunks": WIDE}, f"PNG {NOT_SRGB}"),
+        ({"chunks": {"cICP": b"\1"}}, "PNG's cICP tells of samples that are no RGB"),
+        ({"chunks": {"cICP": bytes([9, 16, 0, 1])}}, "names transfer 16, as of HDR or film"),
+        ({"chunks": {"cICP": bytes([5, 13, 0, 1])}}, "names primaries 5"),
+        ({"chunks": {"iCCP": b"x\0\0" + zlib.compress(bytes(2**19))}}, "an ICC profile is damaged"),
+        ({"chunks": {"iCCP": b"x\0\0damaged"}}, "an ICC profile is damaged"),
+        ({"exif": exif_of(exponent=1.0, orientation=1)}, "EXIF has a gamma that is not sRGB's"),
+        ({"table": tuple(range(0, 65536, 257))}, "TIFF has a TransferFunction"),
+        ({"profile": True}, 'the ICC profile "print" is a table of colours without tone curves'),
+    ],
+)
+def test_colours_that_cannot_be_followed_are_refused_unless_a_response_is_given(
+    tmp_path, pixels, stored, png_with, make_profile, write, why
+):
+    for index in range(3):
+        path = tmp_path / f"{index}.{'tif' if 'table' in write else 'png'}"
+        if "table" in write:
+            tags = [(301, "H", 256, write["table"], True)]
+            tifffile.imwrite(path, pixels, photometric="rgb", extratags=tags)
+        elif "profile" in write:
+            broken = make_profile(IDENTITY, SRGB, name="print").replace(b"rTRC", b"xTRC")
+            Image.fromarray(pixels).save(path, icc_profile=broken)
+        elif "exif" in write:
+            Image.fromarray(pixels).save(path, exif=write["exif"])
+        else:
+            png_with(path, pixels, **write["chunks"])
+    told = rf"0\.(png|tif): .*{why}.*, and cannot be followed; needed: sRGB.*photographs\.response"
+    with pytest.raises(InputError, match=told):
+        load_views(tmp_path)
+    told = rf"3 of 3 .*{why}.*, and is not followed; what is given is taken"
+    with pytest.warns(PimperWarning, match=told):
+        found = load_views(tmp_path, encoding=Encoding(response="srgb")).images[0]
+    assert_close(found.double(), linear_from_srgb(stored), rtol=0, atol=1e-6)
 
 
-def test_photographs_of_one_set_have_a_curve_each(tmp_path, pixels, stored, make_profile, columns):
+def test_the_curve_of_bt_709_is_inverted():
+    response = colour_of_codes(1, 1, "cICP").response
+    light = torch.linspace(0, 1, 200, dtype=torch.float64)
+    encoded = torch.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
+    assert_close(response.linear_from_encoded(encoded), light, rtol=0, atol=1e-4)
+
+
+def test_photographs_of_one_set_have_a_curve_each(tmp_path, pixels, stored, make_profile):
     for index, exponent in enumerate((1.0, 1.8, None)):
-        profile = None if exponent is None else make_profile(power(exponent), columns)
+        profile = None if exponent is None else make_profile(power(exponent), SRGB)
         Image.fromarray(pixels).save(tmp_path / f"{index}.png", icc_profile=profile)
     images = load_views(tmp_path).images.double()
     wanted = torch.stack([stored, stored ** (461 / 256), linear_from_srgb(stored)])
     assert_close(images, wanted, rtol=0, atol=1e-6)
 
 
-def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_profile, columns):
+def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_profile):
     generator = np.random.default_rng(6)
     for index in range(6):
         exponent, top = ((1.0, 180), (2.0, 220))[index % 2]
         levels = (330 * generator.random((60, 90, 3)) ** 3).clip(max=top).astype(np.uint8)
-        profile = make_profile(power(exponent), columns)
+        profile = make_profile(power(exponent), SRGB)
         Image.fromarray(levels).save(tmp_path / f"{index}.png", icc_profile=profile)
     with pytest.warns(PimperWarning) as told:
         images = load_views(tmp_path).images
@@ -184,9 +331,9 @@ def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_p
 
 
 def test_what_is_given_wins_and_a_contradiction_is_named(
-    three, pixels, stored, make_profile, columns, tmp_path
+    three, pixels, stored, make_profile, tmp_path
 ):
-    profile = make_profile(LINEAR_CURVE, columns, name="mine")
+    profile = make_profile(IDENTITY, SRGB, name="mine")
 
     def write(path):
         Image.fromarray(pixels).save(path, icc_profile=profile)
@@ -207,26 +354,8 @@ def test_what_is_given_wins_and_a_contradiction_is_named(
     assert_close(found, stored**2, rtol=0, atol=1e-6)
 
 
-def test_a_profile_that_cannot_be_followed_is_named_with_what_to_give(
-    three, pixels, stored, make_profile, columns
-):
-    broken = make_profile(LINEAR_CURVE, columns, name="print").replace(b"rTRC", b"xTRC")
-
-    def write(path):
-        Image.fromarray(pixels).save(path, icc_profile=broken)
-
-    told = (
-        r'3 of 3 .*"print" is a table of colours without tone curves, and cannot be followed; '
-        r"taken is the response srgb\. Give the true one by `photographs\.response`"
-    )
-    with pytest.warns(PimperWarning, match=told):
-        found = three(write, "png")
-    assert_close(found, linear_from_srgb(stored), rtol=0, atol=1e-6)
-    three(write, "png", encoding=Encoding(response="srgb"))  # given: nothing to say
-
-
 def test_colours_come_in_the_primaries_of_srgb_and_saturation_stays(three, pixels, make_profile):
-    profile = make_profile(LINEAR_CURVE, tuple(primaries_of(DISPLAY_P3).T.tolist()))
+    profile = make_profile(IDENTITY, P3)
     array = (pixels // 2 + 50).astype(np.uint8)
     array[2, 3] = (255, 120, 120)
 
@@ -269,20 +398,3 @@ def test_an_orientation_that_exif_does_not_know_is_named_and_taken_as_upright(
     with pytest.warns(PimperWarning, match=told):
         found = three(write, "png")
     assert_close(found, linear_from_srgb(stored), rtol=0, atol=1e-6)
-
-
-def test_the_first_picture_of_a_jpeg_of_several_is_read(tmp_path, pixels):
-    small = Image.fromarray(pixels[:4, :6])
-    Image.fromarray(pixels).save(
-        tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[small], quality=95
-    )
-    Image.fromarray(pixels).save(tmp_path / "b.jpg", quality=95)
-    assert torch.equal(decode(tmp_path / "a.jpg").samples, decode(tmp_path / "b.jpg").samples)
-
-
-def test_cmyk_is_read_with_a_word(three, pixels):
-    def write(path):
-        Image.fromarray(pixels).convert("CMYK").save(path, quality=95)
-
-    with pytest.warns(PimperWarning, match="is CMYK, made for printing"):
-        three(write, "jpg")

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import kornia_rs.io
+import cv2
 import numpy as np
+import tifffile
 import torch
 from jaxtyping import Float
-from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from pimper_torch.doors.io import profiles, tiff
@@ -30,7 +31,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published 
 # more than 32 million has less than a bit in 25 samples: pictures made to exhaust memory do.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
-_FULL_SCALE = {np.dtype(kind): int(np.iinfo(kind).max) for kind in (np.uint8, np.uint16)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -56,7 +56,7 @@ class Decoded(Record):
     @property
     def bits(self) -> int:
         """Of the file's samples: 8 or 16."""
-        return 8 if self.full == _FULL_SCALE[np.dtype(np.uint8)] else 16
+        return 8 if self.full == 255 else 16
 
 
 def read_header(path: Path | str) -> Header:
@@ -64,54 +64,80 @@ def read_header(path: Path | str) -> Header:
 
     Raises:
         InputError: Names a file that is no JPEG, PNG or TIFF, HEIC or camera raw, is damaged,
-            is too large to be a photograph, or needs a package that is not installed.
+            is too large to be a photograph, holds inks or several pages, or needs a package that
+            is not installed.
     """
     path = Path(path)
-    extra = extra_of(path)
-    if extra:
-        header = _guarded(path, lambda: _header_of_extra(path, extra))
-        _refuse_huge(path, header.width, header.height, header.channels)
-        return header
-
-    def read(image: Image.Image) -> Header:
-        layout = None
-        if isinstance(image, TiffImagePlugin.TiffImageFile):
-            layout = tiff.layout_of(path, image)
-        png = profiles.png_head(path) if image.format == "PNG" else None
-        width, height = image.size
-        grey = image.mode in ("1", "L", "LA", "La") or image.mode.startswith("I;16")
-        _refuse_huge(path, width, height, 1 if grey else 3)
-        # Pillow decodes all of a PNG to find out that it has no EXIF.
-        exif = Image.Exif() if png is not None and png.bare else image.getexif()
-        orientation, cautions = _orientation(exif)
-        if orientation >= 5 and layout is None:  # Pillow has turned a TIFF's size
-            width, height = height, width
-        deep = layout.deep if layout else png is not None and _is_deep_png(path)
-        cmyk = image.mode == "CMYK" and layout is None
-        sixteen = deep or image.mode.startswith("I;16")
-        return Header(
-            width=width,
-            height=height,
-            orientation=orientation,
-            focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
-            channels=1 if grey else 3,
-            deep=deep,
-            full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
-            colour=_colour(image, exif, png),
-            cautions=(*cautions, *[tiff.CMYK_CAUTION] * cmyk, *(layout.cautions if layout else ())),
-            layout=layout,
-        )
-
-    return _with_image(path, read, whole=False)
+    return _guarded(path, lambda: _header_of(path))
 
 
-def _header_of_extra(path: Path, extra: str) -> Header:
+def _header_of(path: Path) -> Header:
     if path.stat().st_size > _MAX_BYTES:  # before a library reads it into memory
         raise InputError(
             f"{path}: has {path.stat().st_size} bytes; needed: at most {_MAX_BYTES // 2**30} GB. "
             "Scale it down."
         )
-    return read_heic_header(path) if extra == "heic" else read_raw_header(path)
+    extra, name = extra_of(path), format_of(path)
+    if extra:
+        header = read_heic_header(path) if extra == "heic" else read_raw_header(path)
+        _refuse_huge(path, header.width, header.height, header.channels)
+        return header
+    layout = tiff.layout_of(path) if name == "TIFF" else None
+    chunks = _png_chunks(path) if name == "PNG" else {}
+    with Image.open(path, formats=_FORMATS) as image:
+        if image.mode == "CMYK":
+            raise InputError(f"{path}: is CMYK, inks of a printer; needed: RGB. {tiff.CONVERT}")
+        width, height = image.size
+        channels = 1 if image.mode[:4] in ("1", "L", "LA", "I;16") else 3
+        _refuse_huge(path, width, height, channels)
+        # Pillow decodes all of a PNG to find out that it has no EXIF.
+        bare = name == "PNG" and not chunks.keys() & {b"eXIf", b"tEXt", b"zTXt", b"iTXt"}
+        exif = Image.Exif() if bare else image.getexif()
+        colour = profiles.colour_of_info(image.info, chunks.get(b"cICP", b""))
+        if colour is SILENT and layout and layout.transfer:
+            colour = Colour(source="TIFF", trouble="has a TransferFunction, a table of levels")
+        orientation = exif.get(ExifTags.Base.Orientation, 1)
+        cautions = []
+        if orientation not in range(1, 9):
+            cautions.append(
+                f"has an EXIF orientation of {orientation!r:.20}, not of 1 to 8; it is taken as "
+                "upright"
+            )
+            orientation = 1
+        if layout and layout.unknown:
+            cautions.append(
+                "has samples besides its colours whose meaning it does not tell; they are left out"
+            )
+        if orientation >= 5 and layout is None:  # Pillow has turned a TIFF's size
+            width, height = height, width
+        # Bit depth, and RGB, gray with opacity (which OpenCV spreads over four channels), or RGBA.
+        deep_png = chunks.get(b"IHDR", b"")[8:] in (b"\x10\x02", b"\x10\x04", b"\x10\x06")
+        sixteen = deep_png or image.mode.startswith("I;16")
+        return Header(
+            width=width,
+            height=height,
+            orientation=orientation,
+            focal_px=focal_from_exif(exif.get_ifd(ExifTags.IFD.Exif), width, height),
+            channels=channels,
+            deep=layout.deep if layout else deep_png,
+            full=layout.full if layout else 2 ** (16 if sixteen else 8) - 1,
+            colour=profiles.colour_of_exif(exif) if colour is SILENT else colour,
+            cautions=tuple(cautions),
+            layout=layout,
+        )
+
+
+def _png_chunks(path: Path) -> dict[bytes, bytes]:
+    """Return how each kind of chunk of a PNG begins."""
+    chunks: dict[bytes, bytes] = {}
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8:
+            length = int.from_bytes(head[:4], "big")
+            start = file.read(min(length, 10))
+            chunks.setdefault(head[4:], start)
+            file.seek(length - len(start) + 4, 1)
+    return chunks
 
 
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
@@ -128,7 +154,12 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
             "Scale it down."
         ) from error
     except UnidentifiedImageError as error:
-        raise _unidentified(path) from error
+        name = format_of(path)
+        content = f", but {name}" if name and name not in _FORMATS else ""
+        raise InputError(
+            f"{path}: holds no JPEG, PNG or TIFF image that can be read{content}. Convert it, or "
+            "take it out of the folder."
+        ) from error
     except OSError as error:
         if error.errno is not None:  # of the system, not of a decoder
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
@@ -147,21 +178,15 @@ def decode(path: Path | str) -> Decoded:
     """
     path = Path(path)
     header = read_header(path)
-    extra = extra_of(path)
-    if extra == "heic":
-        array = _guarded(path, lambda: read_heic(path))
-    elif extra == "raw":
-        array = rotated(_guarded(path, lambda: read_raw(path)), header.orientation)
-    elif header.deep:
-        array = rotated(_read_deep(path, header.layout), header.orientation)
-    else:
-        array = _with_image(path, lambda image: _read_shallow(image, header.layout))
+    array = _guarded(path, lambda: _upright(path, header))
     if array.dtype not in (np.uint8, np.uint16):
-        raise _unfit(path, str(array.dtype))
-    full = _full_scale(array, header)
+        raise tiff.unfit(path, str(array.dtype))
     array = array[..., None] if array.ndim == 2 else array
     if array.shape[:2] != (header.height, header.width):
         raise _damaged(path)
+    # As the file says, unless its samples contradict it.
+    sixteen = array.dtype == np.uint16
+    full = header.full if sixteen and int(array.max()) <= header.full else np.iinfo(array.dtype).max
     # Plane by plane, so that no more memory is taken than is returned.
     planes = torch.empty(array.shape[2], *array.shape[:2])
     for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
@@ -171,15 +196,39 @@ def decode(path: Path | str) -> Decoded:
         samples=planes[:-1] if has_alpha else planes,
         alpha=planes[-1] if has_alpha else None,
         lossy=format_of(path) in ("JPEG", "HEIC"),
-        full=full,
+        full=int(full),
         full_told=header.full_told,
         colour=header.colour,
     )
 
 
+def _upright(path: Path, header: Header) -> np.ndarray:
+    """Read samples, ``height width`` or ``height width channel``; opacity comes last."""
+    extra, layout = extra_of(path), header.layout
+    if extra == "heic":
+        return read_heic(path)
+    if extra == "raw":
+        return rotated(read_raw(path), header.orientation)
+    if header.deep:
+        return _read_deep(path, header)
+    # From memory: Pillow 13 misreads an uncompressed, turned TIFF that it maps.
+    with Image.open(io.BytesIO(path.read_bytes()), formats=_FORMATS) as image:
+        upright = ImageOps.exif_transpose(image)
+        if upright.mode.startswith("I;16"):
+            array = np.asarray(upright).astype(np.uint16)
+            inverted = layout is not None and layout.inverted
+            return header.full - np.minimum(array, header.full) if inverted else array
+        if upright.mode in ("I", "F"):
+            return np.asarray(upright)  # 32 bits: the caller refuses them
+        if upright.has_transparency_data:
+            return np.asarray(upright.convert("LA" if upright.mode in ("L", "LA") else "RGBA"))
+        return np.asarray(upright.convert("L" if upright.mode in ("1", "L") else "RGB"))
+
+
 def write_deep_png(samples: np.ndarray, path: Path | str) -> None:
     """Write 16-bit colour, ``height width 3``, which Pillow would cut to 8 bits."""
-    kornia_rs.io.write_image_png_u16(str(path), samples, mode="rgb")
+    _, data = cv2.imencode(".png", np.ascontiguousarray(samples[..., ::-1]))
+    Path(path).write_bytes(data.tobytes())
 
 
 def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
@@ -193,42 +242,13 @@ def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(array)
 
 
-def _orientation(exif: Image.Exif) -> tuple[int, list[str]]:
-    found = exif.get(ExifTags.Base.Orientation)
-    if isinstance(found, int) and 1 <= found <= 8:
-        return found, []
-    if found is None:
-        return 1, []
-    return 1, [f"has an EXIF orientation of {found!r:.20}, not of 1 to 8; it is taken as upright"]
-
-
-def _full_scale(array: np.ndarray, header: Header) -> int:
-    """Return the level of full scale, as the file says unless its samples contradict it."""
-    most = _FULL_SCALE[array.dtype]
-    return header.full if array.dtype == np.uint16 and int(array.max()) <= header.full else most
-
-
-def _colour(image: Image.Image, exif: Image.Exif, png: profiles.PngHead | None) -> Colour:
-    """Return what an image says of its samples: by its format's own means, or else by EXIF."""
-    if image.mode in ("CMYK", "LAB"):  # turned into sRGB by Pillow
-        return SILENT
-    if isinstance(image, TiffImagePlugin.TiffImageFile):
-        said = profiles.colour_of_tiff(image.tag_v2)
-    elif png is not None:
-        said = profiles.colour_of_png(png.chunks)
-    else:
-        profile = image.info.get("icc_profile")
-        said = profiles.read_profile(profile) if isinstance(profile, bytes) else SILENT
-    return profiles.colour_of_exif(exif) if said is SILENT else said
-
-
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
     """Refuse, by its header, an image that memory should not be taken for."""
     pixels, held = width * height, path.stat().st_size
-    if pixels > MAX_PIXELS or held > _MAX_BYTES:
+    if pixels > MAX_PIXELS:
         raise InputError(
-            f"{path}: has {width} x {height} pixels in {held} bytes; needed: at most "
-            f"{MAX_PIXELS // 10**6} million pixels, {_MAX_BYTES // 2**30} GB. Scale it down."
+            f"{path}: has {width} x {height} pixels; needed: at most "
+            f"{MAX_PIXELS // 10**6} million. Scale it down."
         )
     if channels > 1 and pixels > _MANY_PIXELS and pixels * channels > _MAX_SAMPLES_PER_BYTE * held:
         raise InputError(
@@ -237,90 +257,27 @@ def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
         )
 
 
-def _with_image(path: Path, use: Callable[[Image.Image], Result], *, whole: bool = True) -> Result:
-    """Open a file with Pillow.
-
-    Args:
-        whole: Read all of it at once; not needed for its header.
-    """
-
-    def read() -> Result:
-        with path.open("rb") as file:
-            # From memory: Pillow 13 misreads an uncompressed, turned TIFF that it maps.
-            source = io.BytesIO(file.read()) if whole else file
-            with Image.open(source, formats=_FORMATS) as image:
-                return use(image)
-
-    return _guarded(path, read)
-
-
 def _damaged(path: Path) -> InputError:
     return InputError(
-        f"{path}: cannot be read, it seems cut short or damaged. Copy it again, or take it out of "
-        "the folder."
+        f"{path}: cannot be read, it seems cut short, damaged or packed in an unusual way. Copy it "
+        "again, save it anew as PNG, or take it out of the folder."
     )
 
 
-def _unfit(path: Path, kind: str) -> InputError:
-    return InputError(
-        f"{path}: its samples are {kind}; needed: 8 or 16 bits, whole numbers. Save it anew, as "
-        "16-bit TIFF for instance, with the level of saturation at full scale."
-    )
-
-
-def _unidentified(path: Path) -> InputError:
-    """Return the refusal of a file unknown to Pillow: a TIFF of other samples, or no image."""
-    found = tiff.unread_tiff(path)
-    if found.startswith(("float", "int", "uint", "complex")):
-        return _unfit(path, found)
-    if found:
-        return InputError(f"{path}: {found}")
-    name = format_of(path)
-    content = f", but {name}" if name and name not in _FORMATS else ""
-    return InputError(
-        f"{path}: holds no JPEG, PNG or TIFF image that can be read{content}. Convert it, or take "
-        "it out of the folder."
-    )
-
-
-def _read_shallow(image: Image.Image, layout: tiff.Layout | None) -> np.ndarray:
-    if layout is not None:
-        image.seek(layout.page)
-    upright = ImageOps.exif_transpose(image)
-    if upright.mode.startswith("I;16"):
-        return tiff.read_gray_tiff(upright, layout)
-    if upright.mode in ("I", "F"):
-        return np.asarray(upright)  # 32 bits: the caller refuses them
-    if upright.mode == "La":
-        upright = upright.convert("LA")
-    if upright.has_transparency_data:
-        return np.asarray(upright.convert("LA" if upright.mode in ("L", "LA") else "RGBA"))
-    return np.asarray(upright.convert("L" if upright.mode in ("1", "L") else "RGB"))
-
-
-def _is_deep_png(path: Path) -> bool:
-    with path.open("rb") as file:
-        start = file.read(26)
-    return start[24] == 16 and start[25] in (2, 4, 6)  # bit depth; RGB, LA, RGBA
-
-
-def _read_deep(path: Path, layout: tiff.Layout | None) -> np.ndarray:
-    try:
-        return _read_deep_png(path) if layout is None else tiff.read_deep_tiff(path, layout)
-    except InputError:
-        raise
-    except Exception as error:  # kornia_rs raises bare Exception
-        raise InputError(
-            f"{path}: its 16-bit samples cannot be read, the file seems damaged or packed in an "
-            "unusual way. Save it anew as 16-bit PNG."
-        ) from error
-
-
-def _read_deep_png(path: Path) -> np.ndarray:
-    kind = path.read_bytes()[25]
-    if kind == 4:
-        raise InputError(
-            f"{path}: is 16-bit grey with transparency, which cannot be read at full depth. "
-            "Save it without transparency."
-        )
-    return np.asarray(kornia_rs.io.read_image_png_u16(str(path), "rgb" if kind == 2 else "rgba"))
+def _read_deep(path: Path, header: Header) -> np.ndarray:
+    """Read samples of 16 bits in several channels, which Pillow would cut to 8."""
+    layout = header.layout
+    if layout and layout.planes:  # OpenCV misreads them
+        array = rotated(np.moveaxis(tifffile.imread(path, key=0), 0, -1), header.orientation)
+    else:
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            array = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+        if array is None:
+            raise _damaged(path)
+        array = array[..., [2, 1, 0, 3][: array.shape[2]]]
+        if not layout:  # OpenCV turns a TIFF by itself
+            array = rotated(array, header.orientation)
+    return array[..., :3] if layout and layout.unknown else array

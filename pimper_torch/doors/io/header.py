@@ -31,10 +31,10 @@ def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> floa
     >>> focal_from_exif({0xA405: 50}, width=3600, height=2400)
     5000.0
     """
-    zoom = max(1.0, _positive(tags.get(ExifTags.Base.DigitalZoomRatio)))
-    focal_mm = _positive(tags.get(ExifTags.Base.FocalLength))
-    equivalent = _positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    resolution = _positive(tags.get(ExifTags.Base.FocalPlaneXResolution))
+    zoom = max(1.0, positive_number(tags.get(ExifTags.Base.DigitalZoomRatio)))
+    focal_mm = positive_number(tags.get(ExifTags.Base.FocalLength))
+    equivalent = positive_number(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    resolution = positive_number(tags.get(ExifTags.Base.FocalPlaneXResolution))
     unit = tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)
     unit_mm = _MM_PER_UNIT.get(unit) if isinstance(unit, int) else None
     has_plane = bool(focal_mm and resolution and unit_mm)
@@ -43,14 +43,14 @@ def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> floa
     if not (has_plane and unit_mm):
         return math.nan
     taken = max(
-        _positive(tags.get(ExifTags.Base.ExifImageWidth)),
-        _positive(tags.get(ExifTags.Base.ExifImageHeight)),
+        positive_number(tags.get(ExifTags.Base.ExifImageWidth)),
+        positive_number(tags.get(ExifTags.Base.ExifImageHeight)),
     )
     resized = max(width, height) / taken if taken else 1.0
     return zoom * focal_mm * resolution / unit_mm * resized
 
 
-def _positive(value: object) -> float:
+def positive_number(value: object) -> float:
     """Read a number of EXIF; 0 where it is absent, zero, infinite or nonsense."""
     try:
         number = float(value)  # type: ignore[arg-type]  # anything may stand in a file

@@ -9,7 +9,8 @@ from PIL import ExifTags, Image
 
 from pimper_torch.doors.io.extras import load_extra
 from pimper_torch.doors.io.header import Header, focal_from_exif
-from pimper_torch.doors.io.profiles import colour_of_codes, colour_of_exif, read_profile
+from pimper_torch.doors.io.profiles import colour_of_codes, colour_of_exif, colour_of_info
+from pimper_torch.doors.io.tiff import PREMULTIPLIED
 from pimper_torch.ground.radiometry.colour import SILENT, Colour
 from pimper_torch.runtime.errors import InputError
 
@@ -44,10 +45,7 @@ def read_heic(path: Path | str) -> np.ndarray:
     opened = _opened(path)
     image = opened[opened.primary_index]
     if image.mode.partition(";")[0] in ("RGBa", "La"):
-        raise InputError(
-            f"{path}: has colours multiplied by their opacity; needed: a photograph without "
-            "transparency. Save it as PNG."
-        )
+        raise InputError(f"{path}: {PREMULTIPLIED}")
     # A copy, made while the file that owns the memory is alive.
     return np.array(image, copy=True)
 
@@ -58,9 +56,9 @@ def _opened(path: Path | str) -> Any:  # noqa: ANN401 - of a package that may be
 
 
 def _colour(info: Mapping[str, Any]) -> Colour:
-    profile, codes = info.get("icc_profile"), info.get("nclx_profile")
-    if isinstance(profile, bytes) and profile:
-        return read_profile(profile)
+    codes = info.get("nclx_profile")
+    if info.get("icc_profile"):
+        return colour_of_info(info)
     if not isinstance(codes, Mapping):
         return SILENT
     # Its matrix and range are undone by the decoder.

@@ -110,8 +110,8 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-# Of the warning that a given response contradicts what files say.
-CONTRADICTED = "is given, but"
+# Of the warning that files say something else than the response that is given.
+CONTRADICTED = "what is given is taken"
 
 
 def tell_cautions(
@@ -121,34 +121,37 @@ def tell_cautions(
 
     Args:
         encoding: As given. A measured curve is not compared with what files say.
+
+    Raises:
+        InputError: Names a file whose colours cannot be followed, unless a response is given.
     """
     kinds: dict[str, list[str]] = defaultdict(list)
     for path, header in zip(paths, headers, strict=True):
-        for sentence in (*header.cautions, *_of_colour(header, encoding)):
+        sentences, said = [*header.cautions], header.colour
+        if said.trouble and encoding.response == "auto":
+            raise InputError(
+                f"{path}: {said.source} {said.trouble}, and cannot be followed; needed: sRGB, or a "
+                "profile of tone curves and primaries such as Display P3. Save it so by a program "
+                "that follows it, such as GIMP or ImageMagick, or give the true response by "
+                "`photographs.response`."
+            )
+        if said.trouble:
+            sentences.append(
+                f"{said.source} {said.trouble}, and is not followed; {CONTRADICTED}, with the "
+                "primaries of sRGB"
+            )
+        elif said.response is not None and not isinstance(encoding.response, Path):
+            given = response_of(encoding)
+            if encoding.response != "auto" and disagree(given, said.response):
+                sentences.append(
+                    f"the response {told(given)} is given, but {said.source} says "
+                    f"{told(said.response)}; {CONTRADICTED}. Leave out `photographs.response` to "
+                    "follow the files"
+                )
+        for sentence in sentences:
             kinds[sentence].append(Path(path).name)
     for sentence, names in kinds.items():
         caution(
             f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
             stacklevel=3,
         )
-
-
-def _of_colour(header: Header, encoding: Encoding) -> list[str]:
-    said, choice = header.colour, encoding.response
-    if isinstance(choice, Path):
-        return []
-    if choice == "auto":
-        if not said.trouble:
-            return []
-        taken = "srgb" if said.response is None else told(said.response)
-        return [
-            f"{said.source} {said.trouble}, and cannot be followed; taken is the response {taken}. "
-            "Give the true one by `photographs.response`, or save them as sRGB"
-        ]
-    given = response_of(encoding)
-    if said.response is None or not disagree(given, said.response):
-        return []
-    return [
-        f"the response {told(given)} is given, but {said.source} says {told(said.response)}; what "
-        "is given is taken. Leave out `photographs.response` to follow the files"
-    ]

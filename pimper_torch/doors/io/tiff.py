@@ -1,193 +1,125 @@
-"""TIFF: which page is the picture, and what its samples mean."""
+"""TIFF: whether its samples are a photograph's, by the tags of its directories."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import kornia_rs.io
-import numpy as np
-import tifffile
-from PIL import Image, TiffImagePlugin
+from PIL import TiffImagePlugin
 
 from pimper_torch.runtime.errors import InputError
 
-Opacity = Literal["none", "alpha", "premultiplied", "unknown"]
-
-_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC = 254, 255, 258, 262
-_SUB_IFDS, _EXTRA, _FORMAT = 330, 338, 339
-_REDUCED, _MASK = 1, 4  # bits of the subfile's type
-_WHITE_IS_ZERO, _GRAY, _RGB, _PALETTE, _CMYK = 0, 1, 2, 3, 5
-_NAMES = {
-    0: "gray",
-    1: "gray",
-    2: "RGB",
-    5: "CMYK",
-    6: "YCbCr",
-    8: "CIELab",
-    9: "ICC Lab",
-    10: "ITU Lab",
-    32844: "LogL",
-    32845: "LogLuv",
-}
+_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _SAMPLES = 254, 255, 258, 262, 277
+_PLANAR, _TRANSFER, _SUB_IFDS, _EXTRA, _FORMAT = 284, 301, 330, 338, 339
+_TAGS = (
+    *(_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _SAMPLES, _PLANAR, _TRANSFER, _SUB_IFDS),
+    *(_EXTRA, _FORMAT),
+)
+_WHITE_IS_ZERO, _GRAY, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
+_NAMES = {0: "gray", 1: "gray", 2: "RGB", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 32845: "LogLuv"}
+_KINDS = {1: "uint", 2: "int", 3: "float", 5: "complex int", 6: "complex"}
 _SENSOR = (32803, 34892)  # a colour filter array, or linear raw: DNG
-CMYK_CAUTION = (
-    "is CMYK, made for printing, and is turned into RGB without its profile; saved as RGB it would "
-    "keep the camera's colours"
+_MAX_DIRECTORIES = 100  # a choice: stacks of microscopes have more, photographs a few copies
+CONVERT = (
+    "Convert it to sRGB, by ImageMagick for instance: `magick in.tif -colorspace sRGB out.png`."
 )
-_RAW = (
-    "holds what a sensor saw, camera raw by the name of TIFF, or a small copy of it. Give it the "
-    "suffix that its camera gives, or develop it to linear TIFF of 16 bits."
+PREMULTIPLIED = (
+    "has colours multiplied by their opacity; needed: a photograph without transparency, or with "
+    f"plain colours. {CONVERT}"
 )
-# What extra samples are: 999 is what CorelDRAW writes for alpha.
-_OPACITIES: Mapping[int, Opacity] = {0: "unknown", 1: "premultiplied", 2: "alpha", 999: "alpha"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Where the picture of a file lies, and what its samples mean.
+    """What the samples of a TIFF mean.
 
     Attributes:
-        page: Number of the directory that holds the picture.
-        deep: Read by :func:`read_deep_tiff`: colour or opacity of more than 8 bits.
+        deep: Colour of 16 bits, which Pillow would cut to 8.
+        planes: Deep colour that is stored one colour after the other.
         inverted: 0 is white, and Pillow does not undo it.
         full: Level of full scale that the file tells.
-        cautions: What cannot be followed, or had to be chosen.
+        transfer: It has a TransferFunction, a table of radiance.
+        unknown: Samples besides colours have a meaning that the file does not tell.
     """
 
-    page: int = 0
-    deep: bool = False
-    inverted: bool = False
-    opacity: Opacity = "none"
-    full: int = 255
-    cautions: tuple[str, ...] = ()
+    deep: bool
+    planes: bool
+    inverted: bool
+    full: int
+    transfer: bool
+    unknown: bool
 
 
-def layout_of(path: Path | str, image: TiffImagePlugin.TiffImageFile) -> Layout:
-    """Find the picture among a TIFF's pages, and leave the image at it."""
-    page, cautions = _picture(Path(path), image)
-    tags: Mapping[int, Any] = image.tag_v2
-    bits = tags.get(_BITS, (1,))
-    photometric = tags.get(_PHOTOMETRIC, _WHITE_IS_ZERO)
-    if 2 in tags.get(_FORMAT, (1,)):
+def layout_of(path: Path | str) -> Layout:
+    """Check that a TIFF holds one photograph of 8 or 16 bits.
+
+    Raises:
+        InputError: It has several pages, or samples that are none of a photograph.
+    """
+    tags, *others = _directories(Path(path))
+    bits, photometric = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC, _WHITE_IS_ZERO)
+    samples, depth = tags.get(_SAMPLES, len(bits)), max(bits)
+    if photometric in _SENSOR or (_is_copy(tags) and _SUB_IFDS in tags):
         raise InputError(
-            f"{path}: has samples with a sign, whose dark level nobody tells; needed: 8 or 16 bits "
-            "without. Save it anew, with 0 for no light."
+            f"{path}: holds what a sensor saw, camera raw by the name of TIFF, or a small copy of "
+            "it. Give it the suffix that its camera gives, or develop it to linear TIFF of 16 bits."
+        )
+    if others and (_is_copy(tags) or not all(_is_copy(other) for other in others)):
+        raise InputError(
+            f"{path}: has several pages; needed: one photograph a file, and nothing after it but "
+            "small copies of it. Split it, by ImageMagick for instance: `magick in.tif out_%d.tif`."
+        )
+    kind = _KINDS.get(max(tags.get(_FORMAT, (1,))), "unknown")
+    if kind != "uint" or depth > 16:
+        raise unfit(path, f"{kind}{depth}")
+    gray = photometric in (_WHITE_IS_ZERO, _GRAY)
+    deep = depth > 8 and not gray
+    if not (
+        (depth <= 8 and (gray or photometric in (_RGB, _PALETTE, _YCBCR)))
+        or (gray and samples == 1)
+        or ({*bits} == {16} and photometric == _RGB and samples in (3, 4))
+    ):
+        name = _NAMES.get(photometric, f"photometric interpretation {photometric}")
+        raise InputError(
+            f"{path}: holds {name} of {depth} bits, {samples} samples a pixel; needed: RGB or gray "
+            f"of 8 or 16 bits (gray of 16 without transparency). {CONVERT}"
         )
     extra = tags.get(_EXTRA, ())
-    gray = photometric in (_WHITE_IS_ZERO, _GRAY, _PALETTE)
-    colours = 4 if photometric == _CMYK else 1 if gray else 3
-    extra = extra if extra or len(bits) <= colours else (2,) * (len(bits) - colours)
-    kinds: list[Opacity] = [_OPACITIES.get(one, "unknown") for one in extra]
-    opacity: Opacity = "unknown" if kinds else "none"
-    opacity = next((one for one in kinds if one != "unknown"), opacity)
-    if "unknown" in kinds:
-        cautions.append(
-            "has samples besides its colours whose meaning it does not tell; they are left out"
-        )
-    if photometric == _CMYK:
-        cautions.append(CMYK_CAUTION)
+    if 1 in extra:
+        raise InputError(f"{path}: {PREMULTIPLIED}")
     return Layout(
-        page=page,
-        deep=len(bits) > 1 and max(bits) > 8,
-        inverted=photometric == _WHITE_IS_ZERO and max(bits) > 8,
-        opacity=opacity,
-        full=2 ** max(8, min(16, int(max(bits)))) - 1,
-        cautions=tuple(cautions),
+        deep=deep,
+        planes=deep and tags.get(_PLANAR) == 2,
+        inverted=photometric == _WHITE_IS_ZERO and depth > 8,
+        full=2 ** max(8, depth) - 1,
+        transfer=_TRANSFER in tags,
+        unknown=not {*extra} <= {2, 999},  # opacity, which CorelDRAW calls 999
     )
 
 
-def _picture(path: Path, image: TiffImagePlugin.TiffImageFile) -> tuple[int, list[str]]:
-    """Go to the largest page that is no reduced copy and no mask; of equals the first."""
-    most = 100  # stacks of microscopes have more, and are no photographs
-    count = min(getattr(image, "n_frames", 1), most + 1)
-    if count == 1:
-        _refuse_thumbnail(path, image)
-        return 0, []
-    if count > most:
-        raise InputError(f"{path}: has more than {most} pages; needed: one photograph a file.")
-    sizes = []
-    for page in range(count):
-        try:
-            image.seek(page)
-        except (SyntaxError, ValueError):  # of samples that Pillow has no name for
-            sizes.append(0)
-            continue
-        kind = image.tag_v2.get(_SUBFILE, 1 if image.tag_v2.get(_OLD_SUBFILE) == 2 else 0)
-        whole = not kind & (_REDUCED | _MASK)
-        sizes.append(image.size[0] * image.size[1] if whole else 0)
-    best = sizes.index(max(sizes))
-    image.seek(best)
-    _refuse_thumbnail(path, image)
-    again = sizes.count(sizes[best])
-    if again == 1 or max(sizes) == 0:
-        return best, []
-    return best, [f"has {again} pages of one size, of which the first is read"]
+def _directories(path: Path) -> Iterator[Mapping[int, Any]]:
+    """Read the tags of a file's directories, one a page."""
+    with path.open("rb") as file:
+        head = file.read(8)
+        head += file.read(8) if head[2] == 43 else b""  # of files beyond 4 GB
+        directory = TiffImagePlugin.ImageFileDirectory_v2(head)
+        seen = {0}
+        while directory.next not in seen and len(seen) <= _MAX_DIRECTORIES:
+            seen.add(directory.next)
+            file.seek(directory.next)
+            directory.load(file)
+            if tags := {tag: directory[tag] for tag in _TAGS if tag in directory}:
+                yield tags
 
 
-def _refuse_thumbnail(path: Path, image: TiffImagePlugin.TiffImageFile) -> None:
-    """Refuse a reduced copy whose original lies in a directory below it, as in camera raw."""
-    tags = image.tag_v2
-    if tags.get(_PHOTOMETRIC) in _SENSOR or (
-        tags.get(_SUBFILE, 0) & _REDUCED and _SUB_IFDS in tags
-    ):
-        raise InputError(f"{path}: {_RAW}")
+def _is_copy(tags: Mapping[int, Any]) -> bool:
+    """Return whether a page is a reduced copy of another, or a mask."""
+    return bool(tags.get(_SUBFILE, 0) & 5) or tags.get(_OLD_SUBFILE) == 2
 
 
-def read_deep_tiff(path: Path | str, layout: Layout) -> np.ndarray:
-    """Read colour of more than 8 bits, ``height width channel``; opacity comes last."""
-    with tifffile.TiffFile(path) as file:
-        page = file.pages[layout.page]
-        assert isinstance(page, tifffile.TiffPage), "read one by one, pages are whole"
-        samples, interleaved = page.samplesperpixel, page.planarconfig == 1
-        plain = (page.bitspersample, page.sampleformat, page.photometric) == (16, 1, _RGB)
-        if plain and interleaved and samples == 3 and layout.page == 0:
-            # LZW and PackBits, which tifffile reads only with a further package.
-            return np.asarray(kornia_rs.io.read_image_tiff_u16(str(path), "rgb"))
-        array = page.asarray()
-        array = array if interleaved else np.moveaxis(array, 0, -1)
-        if array.dtype not in (np.uint8, np.uint16):
-            return array  # the caller refuses it
-        return _as_colour(array, page, layout)
-
-
-def _as_colour(array: np.ndarray, page: tifffile.TiffPage, layout: Layout) -> np.ndarray:
-    full, colours = np.uint32(layout.full), 4 if page.photometric == _CMYK else 3
-    colour, opacity = array[..., :colours], array[..., colours : colours + 1]
-    if page.photometric == _CMYK:  # as Pillow does with 8 bits
-        light = full - np.minimum(colour, full).astype(np.uint32)
-        colour = (light[..., :3] * light[..., 3:] + full // 2) // full
-    if layout.opacity in ("none", "unknown"):
-        return colour.astype(np.uint16)
-    if layout.opacity == "premultiplied":
-        whole = np.maximum(opacity.astype(np.uint32), 1)
-        colour = np.minimum((colour.astype(np.uint32) * full + whole // 2) // whole, full)
-    return np.concatenate([colour.astype(np.uint16), opacity], axis=-1)
-
-
-def read_gray_tiff(image: Image.Image, layout: Layout | None) -> np.ndarray:
-    """Read gray of 16 bits without opacity from Pillow's image, dark at 0."""
-    array = np.asarray(image).astype(np.uint16)
-    if layout is None or not layout.inverted:
-        return array
-    return (layout.full - np.minimum(array, layout.full)).astype(np.uint16)
-
-
-def unread_tiff(path: Path | str) -> str:
-    """Return the reason why Pillow does not know a TIFF: kind of samples, sentence, or empty."""
-    try:
-        with tifffile.TiffFile(path) as file:
-            page = file.pages.first
-            if int(page.photometric) in _SENSOR:
-                return _RAW
-            kind, photometric = page.dtype, int(page.photometric)
-            if kind is None or kind not in (np.uint8, np.uint16):
-                return "" if kind is None else str(kind)
-            colour = _NAMES.get(photometric, f"photometric interpretation {photometric}")
-            return (
-                f"holds {colour} of {page.bitspersample} bits, {page.samplesperpixel} samples a "
-                "pixel; needed: RGB or gray of 8 or 16 bits (gray of 16 without transparency). "
-                "Save it so."
-            )
-    except Exception:  # tifffile raises whatever its parser does: no TIFF, then
-        return ""
+def unfit(path: Path | str, kind: str) -> InputError:
+    """Return the refusal of samples of another kind, such as float32."""
+    return InputError(
+        f"{path}: its samples are {kind}; needed: 8 or 16 bits, whole numbers. Save it anew, as "
+        "16-bit TIFF for instance, with the level of saturation at full scale."
+    )

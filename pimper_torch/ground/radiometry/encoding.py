@@ -24,7 +24,7 @@ class Encoding:
     0.25 and 16384 are the same in files of 16 bits.
 
     Attributes:
-        response: auto takes what each file says (its ICC profile, PNG's gAMA and cICP, EXIF),
+        response: auto takes what each file says (its ICC profile, PNG's cICP, EXIF),
             sRGB where it is silent; or, whatever they say, srgb; linear; the exponent of a gamma
             curve, such as 2.2; a CSV or NPY file with a measured response curve.
         saturation: Level at which the sensor saturates, one or red, green and blue; auto finds

@@ -1,6 +1,5 @@
 from pathlib import Path
 
-import kornia_rs.io
 import numpy as np
 import pytest
 import scipy.io
@@ -10,6 +9,7 @@ from PIL import Image
 from pimper_bench.datasets import posed
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.truth import Capture, Truth
+from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid
@@ -43,7 +43,7 @@ def paint_deep():
     def write(path: Path, levels: object, width: int, height: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         pixels = np.broadcast_to(np.asarray(levels, dtype=np.uint16), (height, width, 3))
-        kornia_rs.io.write_image_png_u16(str(path), np.ascontiguousarray(pixels), "rgb")
+        write_deep_png(pixels, path)
 
     return write
 
