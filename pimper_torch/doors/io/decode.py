@@ -272,12 +272,12 @@ def _read_deep(path: Path, header: Header) -> np.ndarray:
     else:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
-            array = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+            found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
         finally:
             cv2.utils.logging.setLogLevel(level)
-        if array is None:
+        if found is None:
             raise _damaged(path)
-        array = array[..., [2, 1, 0, 3][: array.shape[2]]]
+        array = found[..., [2, 1, 0, 3][: found.shape[2]]]
         if not layout:  # OpenCV turns a TIFF by itself
             array = rotated(array, header.orientation)
     return array[..., :3] if layout and layout.unknown else array

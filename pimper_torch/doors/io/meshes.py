@@ -34,8 +34,7 @@ _NEEDED = "PLY, OBJ, STL, OFF or GLB"
 # Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
 # A cloud's spacing is taken for a thousandth of its radius.
 _MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
-_KINDS = {torch.uint8: ("uchar", "u1"), torch.float32: ("float", "<f4")}
-_KINDS |= {torch.float64: ("double", "<f8")}
+_KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
 
 
 def write_ply(
@@ -64,13 +63,11 @@ def write_ply(
         known = getattr(mesh, name)
         if known is not None:
             columns[name] = known.float()
-    kinds = [_KINDS[one.dtype] for one in columns.values()]
-    vertices = np.empty(
-        len(mesh.vertices_world),
-        [(name, kind) for name, (_, kind) in zip(columns, kinds, strict=True)],
-    )
-    for name, values in columns.items():
-        vertices[name] = values.detach().cpu().numpy()
+    arrays = {name: values.detach().cpu().numpy() for name, values in columns.items()}
+    row = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
+    vertices = np.empty(len(mesh.vertices_world), row)
+    for name, array in arrays.items():
+        vertices[name] = array
     kind = [("count", "u1"), ("corners", "<i4", 3)]
     faces = np.empty(len(mesh.faces), kind if measured is None else [*kind, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
@@ -80,7 +77,7 @@ def write_ply(
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(vertices)}",
-        *(f"property {kind} {name}" for name, (kind, _) in zip(columns, kinds, strict=True)),
+        *(f"property {_KINDS[array.dtype.name]} {name}" for name, array in arrays.items()),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         *([] if measured is None else ["property uchar measured"]),
@@ -170,10 +167,7 @@ def read_mesh(path: Path | str) -> Mesh:
             f"{path}: the corners of its faces {found}; needed: indices of its "
             f"{len(mesh.vertices_world)} vertices. Export it again."
         )
-    names = ("normals_world", "albedo", *_ERRORS)
-    known = {name: getattr(mesh, name) for name in names}
-    broken = [name for name, one in known.items() if one is not None and not_finite(one)]
-    return mesh.replace(**dict.fromkeys(broken)) if broken else mesh
+    return mesh
 
 
 def write_glb(
@@ -303,22 +297,18 @@ def _rows(values: Any) -> Tensor | None:  # noqa: ANN401 - untyped
 
 
 def _joined(parts: Sequence[Mesh]) -> Mesh:
-    """Put parts in one mesh; what not every part has is dropped."""
-    if len(parts) == 1:
-        return parts[0]
+    """Put parts in one mesh; what not every part has, or is not finite throughout, is dropped."""
     starts = accumulate((len(part.vertices_world) for part in parts), initial=0)
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
-
-    def all_of(values: Sequence[Tensor | None]) -> Tensor | None:
-        there = [value for value in values if value is not None]
-        return torch.cat(there) if len(there) == len(values) else None
-
+    known: dict[str, Tensor] = {}
+    for name in ("normals_world", "albedo", *_ERRORS):
+        values = [getattr(part, name) for part in parts]
+        if all(one is not None and not not_finite(one) for one in values):
+            known[name] = torch.cat(values)
     return Mesh(
         vertices_world=torch.cat([part.vertices_world for part in parts]),
         faces=torch.cat(faces),
-        normals_world=all_of([part.normals_world for part in parts]),
-        albedo=all_of([part.albedo for part in parts]),
-        **{name: all_of([getattr(part, name) for part in parts]) for name in _ERRORS},
+        **known,
     )
 
 

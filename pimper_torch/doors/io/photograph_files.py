@@ -119,30 +119,16 @@ def tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
     names = {path.relative_to(folder).parts[0] for path in read}
     raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
-    kinds: Counter[str] = Counter()
-    examples: list[str] = []
     twins: list[str] = []
-    lacking: set[str] = set()
-    for path in sorted(folder.iterdir()):
-        suffix = path.suffix.lower()
-        if path.name.startswith(".") or path.name in names:
+    kinds: dict[Path, str] = {}
+    for path in sorted(_visible(folder)):
+        developed = path.suffix.lower() in (*SUFFIXES, *HEIC_SUFFIXES) and path.is_file()
+        if path.name in names:
             continue
-        if path.is_symlink() and not path.exists():
-            kind = "broken link"
-        elif path.is_dir():
-            kind = "folder of images" if _holds_images(path) else ""
-        elif path.stem.casefold() in raw and suffix in (*SUFFIXES, *HEIC_SUFFIXES):
+        if developed and path.stem.casefold() in raw:
             twins.append(path.name)
-            continue
-        else:
-            known = _PICTURES.fullmatch(suffix) or _VIDEO.fullmatch(suffix)
-            kind = suffix[1:].upper() if known else ""
-            extra = extra_of(path) if known else ""
-            if extra and not is_installed(extra):
-                lacking.add(extra)
-        if kind:
-            kinds[kind] += 1
-            examples.append(path.name)
+        elif kind := _kind(path):
+            kinds[path] = kind
     if twins:
         caution(
             f"{folder}: {some(twins)} were not read, as camera raw of the same names was. Move the "
@@ -150,16 +136,29 @@ def tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
             stacklevel=3,
         )
     if kinds:
-        counts = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
+        counts = ", ".join(f"{kind} ({count})" for kind, count in Counter(kinds.values()).items())
+        extras = {extra_of(path) for path in kinds if path.is_file()} - {""}
         hint = "".join(
-            f' `pip install "pimper_torch[{extra}]"` reads {extra}.' for extra in sorted(lacking)
+            f' `pip install "pimper_torch[{extra}]"` reads {extra}.'
+            for extra in sorted(extras)
+            if not is_installed(extra)
         )
         caution(
-            f"{folder}: these were not read: {counts}; {some(examples)}. Read are files ending in "
-            f"{', '.join(SUFFIXES)}, {_MORE}, not those in folders inside.{hint} Convert or move "
-            "what belongs to the photographs.",
+            f"{folder}: these were not read: {counts}; {some([path.name for path in kinds])}. Read "
+            f"are files ending in {', '.join(SUFFIXES)}, {_MORE}, not those in folders inside."
+            f"{hint} Convert or move what belongs to the photographs.",
             stacklevel=3,
         )
+
+
+def _kind(path: Path) -> str:
+    """Name what looks like photographs and is not read; empty for anything else."""
+    if path.is_symlink() and not path.exists():
+        return "broken link"
+    if path.is_dir():
+        return "folder of images" if _holds_images(path) else ""
+    looks = _PICTURES.fullmatch(path.suffix) or _VIDEO.fullmatch(path.suffix)
+    return path.suffix[1:].upper() if looks else ""
 
 
 def _holds_images(folder: Path) -> bool:

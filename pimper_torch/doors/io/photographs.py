@@ -89,31 +89,25 @@ def load_views(
     headers = [read_header(path) for path in paths]
     tell_cautions(Path(folder), paths, headers, encoding)
     names = tuple(image_name(path, folder) for path in paths)
-    mask_paths = _match_masks(names, Path(masks)) if masks is not None else None
+    matched = _match_masks(names, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
     pictures = read_pictures(paths, headers, sizes, encoding)
     images = pictures.images
-    has_masks = mask_paths is not None or any(one is not None for one in pictures.opaque)
+    has_masks = matched is not None or any(one is not None for one in pictures.opaque)
     drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
-    opacities, dark = [], False
-    if mask_paths is not None:
-        opacities = _read_masks(mask_paths, paths, headers)
-        dark = mask_object == "dark"
-        if mask_object == "auto":
-            dark = _object_is_dark(opacities, str(masks))
+    opacities = _read_masks(matched, paths, headers) if matched else []
+    if mask_object == "dark" or (mask_object == "auto" and _object_is_dark(opacities, masks)):
+        for (opacity,) in each(opacities):
+            opacity.copy_(1 - opacity)
     for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
         if opacities:
-            opacity = 1 - opacities[index] if dark else opacities[index]
-            drawn[index, :high, :wide] = resized_mask(opacity, wide, high)
+            drawn[index, :high, :wide] = resized_mask(opacities[index], wide, high)
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
         drop_pages()
-    _refuse_black(images, sizes, names, Path(folder))
     if has_masks and not opacities:
         _tell_alpha(pictures.opaque, names, Path(folder))
-    if has_masks:
-        _refuse_empty(drawn, names, Path(masks) if masks is not None else None)
-    _judge_saturation(images, drawn, names, Path(folder))
+    _judge(images, drawn, sizes, names, Path(folder), masks)
     return Views(
         images=images,
         sizes_px=torch.tensor(sizes),
@@ -181,15 +175,13 @@ def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
     """
     by_stem = {image_name(path.with_suffix(""), folder): path for path in list_images(folder)}
     found = [_mask_of(name, by_stem) for name in names]
-    lost = [name for name, mask in zip(names, found, strict=True) if mask is None]
-    if lost:
-        free = {_MASK.sub(r"\1", mask.name): mask for mask in by_stem.values() if mask not in found}
-        others = match_files(lost, list(free), where=str(folder), what="mask")
-        places = dict(zip(lost, others, strict=True))
-        found = [
-            mask if mask or (at := places[name]) is None else list(free.values())[at]
-            for name, mask in zip(names, found, strict=True)
-        ]
+    if lost := [index for index, mask in enumerate(found) if mask is None]:
+        free = [mask for mask in by_stem.values() if mask not in found]
+        called = [_MASK.sub(r"\1", mask.name) for mask in free]
+        wanted = [names[index] for index in lost]
+        places = match_files(wanted, called, where=str(folder), what="mask")
+        for index, at in zip(lost, places, strict=True):
+            found[index] = None if at is None else free[at]
     missing = [name for name, mask in zip(names, found, strict=True) if mask is None]
     if missing:
         raise InputError(
@@ -219,7 +211,7 @@ def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height wi
 def _read_masks(
     paths: Sequence[Path], photographs: Sequence[Path], headers: Sequence[Header]
 ) -> list[Float[Tensor, "_ _"]]:
-    """Read 1 on the object, 0 off it."""
+    """Read 1 where masks are bright, 0 elsewhere; of the photographs' sizes, turned as they are."""
     masks = [read_header(path) for path in paths]
     levels = parts([(mask.height, mask.width) for mask in masks])
     for (level,), path, mask, header in zip(each(levels), paths, masks, headers, strict=True):
@@ -238,36 +230,37 @@ def _laid(
     Args:
         drawn: As the mask's file has it, turned by an EXIF of its own.
     """
-    ways = [drawn]
-    if header.orientation != 1 and mask.orientation == 1:
-        ways.append(torch.from_numpy(rotated(drawn.numpy(), header.orientation)))
-    fitting = [way for way in ways if way.shape == (header.height, header.width)]
-    if fitting:
-        return fitting[0]
-    raise InputError(
-        f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} is "
-        f"{header.width} x {header.height}; needed: a mask of the same size."
-    )
+    size, laid = (header.height, header.width), drawn
+    if drawn.shape != size and mask.orientation == 1:
+        laid = torch.from_numpy(rotated(drawn.numpy(), header.orientation))
+    if laid.shape != size:
+        raise InputError(
+            f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} "
+            f"is {header.width} x {header.height}; needed: a mask of the same size."
+        )
+    return laid
 
 
-def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: str) -> bool:
+def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str | None) -> bool:
     """Return whether masks show the object dark, by all of them together; a warning says so."""
+    if not opacities:
+        return False
     border, centre = [], []
     for (opacity,) in each(opacities):
         high, wide = opacity.shape
-        border += [opacity[0].mean(), opacity[-1].mean(), opacity[:, 0].mean()]
-        border.append(opacity[:, -1].mean())
+        border += [opacity[0].mean(), opacity[-1].mean()]
+        border += [opacity[:, 0].mean(), opacity[:, -1].mean()]
         inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
         centre.append(inner.mean())
-    fractions = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    around, inside = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
     # An object that fills its photographs is bright in the centre, too.
-    dark = fractions[1] < 0.75 < fractions[0]
+    dark = inside < 0.75 < around
     if dark:
         caution(
-            f"{where}: the masks are bright along {fractions[0]:.0%} of the border and "
-            f"{fractions[1]:.0%} of the centre, so the object is taken to be dark in them. "
-            "`--mask-object bright` says that it is not.",
-            stacklevel=4,
+            f"{where}: the masks are bright along {around:.0%} of the border and {inside:.0%} of "
+            "the centre, so the object is taken to be dark in them. `--mask-object bright` says "
+            "that it is not.",
+            stacklevel=3,
         )
     return dark
 
@@ -293,64 +286,43 @@ def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor,
     return levels
 
 
-def _refuse_black(
+def _judge(
     images: Float[Tensor, "view channel height width"],
+    drawn: Bool[Tensor, "view height width"],
     sizes: Sequence[tuple[int, int]],
     names: tuple[str, ...],
     folder: Path,
+    masks: Path | str | None,
 ) -> None:
-    # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
-    lit = [
-        float((image[:, :high, :wide] > 1e-3).float().mean()) > _LIT_FRACTION
-        for (image,), (wide, high) in zip(each(images), sizes, strict=True)
-    ]
-    black = [name for name, one in zip(names, lit, strict=True) if not one]
+    """Refuse photographs black or saturated all over, and masks of nothing; warn of nearly so."""
+    black, empty, left = list[str](), list[str](), dict[str, float]()
+    for name, (image, mask), (wide, high) in zip(names, each(images, drawn), sizes, strict=True):
+        # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
+        if float((image[:, :high, :wide] > 1e-3).float().mean()) <= _LIT_FRACTION:
+            black.append(name)
+        if not bool(mask.any()):
+            empty.append(name)
+        left[name] = float((image.amax(dim=0)[mask] < SATURATED).float().mean())
     if black:
         raise InputError(
             f"{folder}: {some(black)} {'is' if len(black) == 1 else 'are'} black all over. Take "
             "them out of the folder; at least some of the object has to be lit."
         )
-
-
-def _judge_saturation(
-    images: Float[Tensor, "view channel height width"],
-    drawn: Bool[Tensor, "view height width"],
-    names: tuple[str, ...],
-    folder: Path,
-) -> None:
-    """Refuse photographs saturated all over, and warn of those with hardly anything else."""
-    usable = [
-        float((image.amax(dim=0)[mask] < SATURATED).float().mean())
-        for image, mask in each(images, drawn)
-    ]
-    blind = [
-        name for name, fraction in zip(names, usable, strict=True) if fraction <= _LIT_FRACTION
-    ]
+    if empty:
+        where = f"{masks}: the masks" if masks else "the alpha channels"
+        raise InputError(
+            f"{where} of {some(empty)} mark no pixel as object; needed: bright (opaque) on the "
+            "object, black off it. Draw them again, or leave these photographs out."
+        )
+    blind = [name for name, fraction in left.items() if fraction <= _LIT_FRACTION]
     what = "Expose less, or tell the level of saturation by `photographs.saturation`"
     if blind:
         raise InputError(
             f"{folder}: {some(blind)} {'is' if len(blind) == 1 else 'are'} saturated all over. "
             f"Take them out of the folder. {what}."
         )
-    scant = [
-        f"{name} ({fraction:.1%} left)"
-        for name, fraction in zip(names, usable, strict=True)
-        if fraction < 0.1
-    ]
-    if scant:
+    if scant := [f"{name} ({one:.1%} left)" for name, one in left.items() if one < 0.1]:
         caution(
             f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
             stacklevel=3,
-        )
-
-
-def _refuse_empty(
-    drawn: Bool[Tensor, "view height width"], names: tuple[str, ...], folder: Path | None
-) -> None:
-    empty = [name for name, (mask,) in zip(names, each(drawn), strict=True) if not bool(mask.any())]
-    if empty:
-        where = f"{folder}: the masks" if folder else "the alpha channels"
-        raise InputError(
-            f"{where} of {some(empty)} mark no pixel as object; needed: bright (opaque) on the "
-            "object, black off it. Draw them again, or leave these photographs out."
         )

@@ -1,7 +1,8 @@
 """Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,6 +61,8 @@ class _Kind(NamedTuple):
 
 # Levels of saturation of files of a kind, fractions of full scale, one a colour.
 _Whites = Mapping[_Kind, Float[Tensor, " channel"]]
+# Of all files of a kind: how often each level occurs, and in how many files it does so often.
+_Tally = Int[Tensor, "2 channel level"]
 
 
 def read_pictures(
@@ -82,38 +85,25 @@ def read_pictures(
         InputError: Names a file that cannot be read, that the encoding does not fit, or that is
             much larger than all others.
     """
-    response = None if encoding.response == "auto" else response_of(encoding)
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
-    _refuse_padding(files, sizes_px, channels)
+    raster, pixels = len(files) * width * height, sum(map(prod, sizes_px))
+    if raster * channels >= _MUCH_PADDING and raster >= _MAX_PADDING * pixels:
+        file, (wide, high) = max(zip(files, sizes_px, strict=True), key=lambda one: prod(one[1]))
+        raise InputError(
+            f"{file}: has {wide} x {high} pixels, all have {pixels} together; needed: photographs "
+            "of similar sizes, as memory is taken for the largest. Take it out of the folder, or "
+            "give all one longest side by `--max-size-px`."
+        )
     images = zeros((len(files), channels, height, width))
-    given = None if encoding.saturation == "auto" else encoding
-    opaque, tallies = _fill(images, files, sizes_px, response, encoding, {}, tally=given is None)
+    opaque, tallies = _fill(images, files, sizes_px, encoding, {})
     whites = _found(tallies)
-    _tell_low(files[0].parent, tallies, whites)
+    for told in (*_low_levels(tallies, whites), *_found_levels(whites)):
+        caution(f"{files[0].parent}: {told}", stacklevel=3)
     if whites:
-        _tell(files[0].parent, whites)
-        opaque, _ = _fill(images, files, sizes_px, response, encoding, whites, tally=False)
+        opaque, _ = _fill(images, files, sizes_px, encoding, whites)
     return Pictures(images=images, opaque=opaque)
-
-
-def _refuse_padding(
-    files: Sequence[Path], sizes_px: Sequence[tuple[int, int]], channels: int
-) -> None:
-    """Refuse, before memory is taken, a picture that all others would be padded to."""
-    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
-    areas = [wide * high for wide, high in sizes_px]
-    raster = len(files) * width * height
-    if raster * channels < _MUCH_PADDING or raster < _MAX_PADDING * sum(areas):
-        return
-    largest = areas.index(max(areas))
-    (wide, high), usual = sizes_px[largest], sizes_px[areas.index(sorted(areas)[len(areas) // 2])]
-    raise InputError(
-        f"{files[largest]}: has {wide} x {high} pixels, others have {usual[0]} x {usual[1]}; "
-        "needed: photographs of similar sizes, as memory is taken for the largest. Take it out of "
-        "the folder, or give all one longest side by `--max-size-px`."
-    )
 
 
 def radiance_of(
@@ -165,30 +155,20 @@ def resized_mask(
     return resized(opacity[None], width, height)[0] >= OPAQUE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Tally(Record):
-    """Histogram of levels over all files of equal bits, and each level's number of files."""
-
-    counts: Int[Tensor, "channel level"]
-    photographs: Int[Tensor, "channel level"]
-
-
 def _fill(
     images: Float[Tensor, "view channel height width"],
     paths: Sequence[Path],
     sizes_px: Sequence[tuple[int, int]],
-    given: Response | None,
     encoding: Encoding,
     whites: _Whites,
-    *,
-    tally: bool,
 ) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[_Kind, _Tally]]:
-    """Write the radiance of each file into the images; count its levels if that is asked for.
+    """Write the radiance of each file into the images, and count its levels.
 
     Args:
-        given: Response of all; ``None`` for that of each file.
-        whites: Levels of saturation that were found.
+        whites: Levels of saturation that were found; with some, or a level that is given, none
+            are counted.
     """
+    given = None if encoding.response == "auto" else response_of(encoding)
     opaque: list[Tensor | None] = []
     drawn: Tensor | None = None
     tallies: dict[_Kind, _Tally] = {}
@@ -208,21 +188,13 @@ def _fill(
                 drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
             drawn[index, :high, :wide] = resized_mask(decoded.alpha, wide, high)
             opaque[-1] = drawn[index]
-        if tally:
-            tallies[kind] = _counted(decoded, images.shape[1], tallies.get(kind))
+        if encoding.saturation == "auto" and not whites:
+            levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
+            counts = torch.stack([one.bincount(minlength=decoded.full + 1) for one in levels])
+            tally = torch.stack([counts, (counts >= PIXELS).long()])
+            tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
         drop_pages()
     return tuple(opaque), tallies
-
-
-def _counted(decoded: Decoded, channels: int, former: _Tally | None) -> _Tally:
-    full = decoded.full
-    levels = (full * decoded.samples).round().to(torch.int32)
-    counts = torch.stack([torch.bincount(one.flatten(), minlength=full + 1) for one in levels])
-    counts = counts.expand(channels, -1)
-    often = (counts >= PIXELS).long()
-    if former is None:
-        return _Tally(counts=counts, photographs=often)
-    return _Tally(counts=former.counts + counts, photographs=former.photographs + often)
 
 
 def file_response(decoded: Decoded) -> Response:
@@ -248,15 +220,11 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
     """
     whites = {}
     for kind, tally in tallies.items():
-        found = [
-            find_saturation(counts, photographs)
-            for counts, photographs in zip(tally.counts, tally.photographs, strict=True)
-        ]
-        levels = [level for level in found if level is not None]
-        if not levels:
+        found = [find_saturation(*counts) for counts in tally.unbind(dim=1)]
+        highest = max((level for level in found if level is not None), default=None)
+        if highest is None:
             continue
-        filled = [max(levels) if level is None else level for level in found]
-        white = torch.tensor(filled) / kind.full
+        white = torch.tensor([highest if one is None else one for one in found]) / kind.full
         beyond = kind.response.linear_from_encoded(white[:, None, None]).min()
         end = kind.response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
         if beyond < SATURATED * end:
@@ -264,37 +232,30 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
     return whites
 
 
-def _tell(folder: Path, whites: _Whites) -> None:
+def _found_levels(whites: _Whites) -> Iterator[str]:
+    """State the levels of saturation that were found."""
     for kind, white in whites.items():
-        full = kind.full
-        levels = [str(round(full * float(one))) for one in white]
-        same = len(set(levels)) == 1
-        text = levels[0] if same else f"{', '.join(levels)} (red, green, blue)"
-        caution(
-            f"{folder}: values of its files of {full.bit_length()} bits pile up at {text} of "
-            f"{full}, which is taken for the level of saturation. If it is not, set "
-            "`photographs.saturation` to the true level, or to 1 for full scale.",
-            stacklevel=4,
+        levels = [str(round(kind.full * float(one))) for one in white]
+        text = levels[0] if len({*levels}) == 1 else f"{', '.join(levels)} (red, green, blue)"
+        yield (
+            f"values of its files of {kind.full.bit_length()} bits pile up at {text} of "
+            f"{kind.full}, which is taken for the level of saturation. If it is not, set "
+            "`photographs.saturation` to the true level, or to 1 for full scale."
         )
 
 
-def _tell_low(folder: Path, tallies: Mapping[_Kind, _Tally], whites: _Whites) -> None:
-    """Warn of files of 16 bits that may hold 10, 12 or 14, as cameras' sensors do."""
-    deep = {
-        kind: tally
-        for kind, tally in tallies.items()
-        if kind.full == 2**16 - 1 and not kind.full_told
-    }
+def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> Iterator[str]:
+    """State that files of 16 bits may hold 10, 12 or 14, as cameras' sensors do."""
+    deep = [kind for kind in tallies if kind.full == 2**16 - 1 and not kind.full_told]
     if not deep or any(kind in whites for kind in deep):
         return
-    highest = max(int(tally.counts.sum(dim=0).nonzero().max()) for tally in deep.values())
+    highest = max(int(tallies[kind][0].sum(dim=0).nonzero().max()) for kind in deep)
     bits = next((bits for bits in _SENSOR_BITS if highest < 2**bits), None)
     if bits is not None:
-        caution(
-            f"{folder}: no value of its files of 16 bits is above {highest} of 65535. If they hold "
-            f"{bits} bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; "
-            "saturated pixels are taken for radiance otherwise.",
-            stacklevel=4,
+        yield (
+            f"no value of its files of 16 bits is above {highest} of 65535. If they hold {bits} "
+            f"bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; saturated "
+            "pixels are taken for radiance otherwise."
         )
 
 
@@ -304,9 +265,9 @@ def _levels(
     """Return black and white of a file as fractions of its full scale."""
     full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black
+    given: tuple[float | int, ...] = ()
     if saturation == "auto":
         white = (torch.ones(channels) if found is None else found)[:channels]
-        given: tuple[float | int, ...] = ()
     else:
         given = saturation if isinstance(saturation, tuple) else (saturation,) * channels
         white = torch.tensor([one if one <= 1 else one / full for one in given])
