@@ -137,7 +137,8 @@ def of_idr(rig: Cameras, folder: Path) -> Path:
 
 
 def of_matrices(rig: Cameras, folder: Path) -> Path:
-    return saved(folder, K=rig.intrinsics[0], cam_from_world=rig.cam_from_world[:, :3])
+    pose = rig.cam_from_world
+    return saved(folder, K=rig.intrinsics[0], R=pose[:, :3, :3], t=pose[:, :3, 3])
 
 
 def of_named_poses(rig: Cameras, folder: Path) -> Path:
@@ -254,7 +255,7 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
         ({}, "no arrays"),
         ({"P": np.zeros((3, 3, 4))}, "no inverse"),
         ({"P": np.zeros((3, 4, 3))}, "3x4 numbers a camera as P"),
-        ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((3, 3))}, "side by side.*K, R, t"),
+        ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((2, 3))}, "as many R as t"),
         ({"K": np.eye(3), "cam_from_world": np.zeros((3, 3, 4))}, "a rotation in"),
         ({"K": -np.eye(3), "cam_from_world": [np.eye(4)] * 3}, "as K 0"),
         ({"K": np.eye(3), "cam_from_world": [np.eye(4)] * 2}, "3 photographs.*2 cameras"),

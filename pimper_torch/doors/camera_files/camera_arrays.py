@@ -38,8 +38,8 @@ def read_camera_arrays(
     our conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x
     right, y down, z forward):
 
-    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world``, ``[R | t]`` (3x4 or
-      4x4 each);
+    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world`` (3x4 or 4x4 each) or
+      with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
     - or ``projections`` or ``P``, 3x4 each, ``K [R | t]`` up to a factor.
 
     They belong to ``names``, if that array is there, or else to the photographs in plain order of
@@ -88,10 +88,15 @@ def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
         return _decomposed(projections, file)
     intrinsics = _array(arrays, ("intrinsics", "K"), ((3, 3),), file)
     matrices = _array(arrays, ("cam_from_world",), ((3, 4), (4, 4)), file)
+    rotations = _array(arrays, ("R",), ((3, 3),), file)
+    shifts = _array(arrays, ("t",), ((3,), (3, 1)), file)
+    if matrices is None and rotations is not None and shifts is not None:
+        file.expect(len(rotations) == len(shifts), "as many R as t", f"{len(shifts)} t")
+        matrices = torch.cat([rotations, shifts.reshape(-1, 3, 1)], dim=2)
     if intrinsics is None or matrices is None or not len(matrices):
         file.refuse(
-            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, R and t side by side "
-            "(3x4); or projections (P)",
+            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, or with R and t; or "
+            "projections (P)",
             some(sorted(arrays)) or "no arrays",
         )
     several = len(intrinsics) in (1, len(matrices))
