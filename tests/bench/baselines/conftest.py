@@ -54,7 +54,7 @@ def photographed():
         texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
         truth = render_shape(shape, cameras, point_lights.harmonics_world(), texture)
         scene = sparse_scene(truth, 200, generator)
-        config = TriangulateConfig(num_points=30, fill=False)
+        config = TriangulateConfig(num_points=30)
         return truth, scene, Triangulate(config)(scene)
 
     return build

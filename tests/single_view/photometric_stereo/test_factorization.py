@@ -2,8 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.method.sfm.track_observations import evenly
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.single_view.photometric_stereo.regress_lights import evenly, factorize_photographs
+from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
 
 def in_span(found, true):
