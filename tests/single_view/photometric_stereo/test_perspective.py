@@ -3,15 +3,17 @@ import torch
 from one_view import photograph, point_lights
 from reliefs import bumps_in_perspective, regions
 from torch.autograd.functional import jvp
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.render_in_memory import Sphere
-from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.perspective import (
     factorize_in_perspective,
     integrability_equations,
 )
+from tests.single_view.scenes import angles_deg
 
 
 @pytest.fixture
@@ -19,16 +21,15 @@ def generator():
     return torch.Generator().manual_seed(1)
 
 
-def error_deg(shading, normals):
-    cross = torch.linalg.cross(shading, normals, dim=0).norm(dim=0)
-    return torch.rad2deg(torch.atan2(cross, (shading * normals).sum(dim=0))).mean()
-
-
 def seen_in_perspective(generator, noise=0.0, widest_deg=30.0, steepest=1.0):
     normals, mask, intrinsics, _ = bumps_in_perspective(64, generator, steepest=steepest)
     lights = point_lights(12, generator, widest_deg)
     made = photograph(normals, regions(64, generator), mask, lights, generator, noise)
     return made, intrinsics
+
+
+def off_deg(found, true):
+    return angles_deg(found, true).mean()
 
 
 def lit(made):
@@ -56,12 +57,13 @@ def test_equations_vanish_on_normals_of_a_surface(generator):
     assert values[-1] < 1e-10 < 1e-4 < values[-2]  # and nothing else solves them
 
 
-def test_everything_but_scale_is_found(generator):
-    made, intrinsics = seen_in_perspective(generator)
+@pytest.mark.parametrize("steepest", [1.0, -1.0])
+def test_everything_but_scale_is_found_hollows_and_hills(generator, steepest):
+    made, intrinsics = seen_in_perspective(generator, steepest=steepest)
     shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics)
     # What is left are fifth derivatives over squares of seven pixels.
-    assert error_deg(shading, made.normals) < 0.2
-    assert error_deg(lights.mT, made.lights.mT) < 0.2
+    assert off_deg(shading, made.normals) < 0.2
+    assert off_deg(lights.mT, made.lights.mT) < 0.2
     factor = made.lights.square().sum(dim=1).mean().sqrt()
     assert_close(shading, factor * made.shading, rtol=0.02, atol=0.02)
     assert_close(lights @ shading, made.images.sum(dim=1)[:, made.mask], atol=1e-10, rtol=0)
@@ -70,8 +72,7 @@ def test_everything_but_scale_is_found(generator):
 def test_a_ball_which_has_two_solutions_is_refused(generator):
     size, focal = 64, 88.0
     intrinsics = torch.tensor([[focal, 0, 32], [0, focal, 32], [0, 0, 1]]).double()
-    pixels = pixel_centers(size, size, intrinsics)
-    rays = torch.cat([(pixels - 32) / focal, torch.ones(size, size, 1).double()], dim=-1)
+    rays = homogeneous((pixel_centers(size, size, intrinsics) - 32) / focal)
     ball = Sphere(center=(0.0, 0.0, 3.2))
     depth = ball.intersect(torch.zeros_like(rays), rays)
     mask = depth < 2.9
@@ -82,19 +83,12 @@ def test_a_ball_which_has_two_solutions_is_refused(generator):
         factorize_in_perspective(made.images, mask, intrinsics, lit(made))
 
 
-@pytest.mark.parametrize("steepest", [1.0, -1.0])
-def test_hollows_are_told_from_hills(generator, steepest):
-    made, intrinsics = seen_in_perspective(generator, steepest=steepest)
-    shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics)
-    assert error_deg(shading, made.normals) < 0.2
-
-
 def test_shadows_are_left_out(generator):
     made, intrinsics = seen_in_perspective(generator, widest_deg=65.0)
     seen = lit(made)
     assert 0.02 < 1 - seen.double().mean() < 0.5
     shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics, seen)
-    assert error_deg(shading, made.normals) < 0.3
+    assert off_deg(shading, made.normals) < 0.3
     dark = made.images.sum(dim=1)[:, made.mask][~seen]
     assert ((lights @ shading)[~seen] - dark).min() < -0.1  # the product goes below zero there
 
@@ -103,7 +97,7 @@ def test_noise_of_half_a_per_cent_is_borne(generator):
     made, intrinsics = seen_in_perspective(generator, noise=0.005)
     shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics, radius=4)
     # A pixel's own noise costs 0.5 degrees; perspective of 40 degrees is a weak cue.
-    assert error_deg(shading, made.normals) < 3
+    assert off_deg(shading, made.normals) < 3
 
 
 def test_oblong_and_skewed_pixels_are_followed(generator):
@@ -111,41 +105,40 @@ def test_oblong_and_skewed_pixels_are_followed(generator):
     made, intrinsics = seen_in_perspective(generator)
     change = torch.tensor([[1.0, 0.2, 3.0], [0.0, 0.7, -5.0], [0.0, 0.0, 1.0]]).double()
     # Rays K^-1 u of the new camera are change^-1 of the old, normals turn by its transpose.
-    oblong = intrinsics @ change
-    rotated = torch.nn.functional.normalize(change.mT @ made.normals, dim=0)
-    assert error_deg(rotated, made.normals) > 1
-    shading, _ = factorize_in_perspective(made.images, made.mask, oblong)
+    rotated = normalize(change.mT @ made.normals, dim=0)
+    assert off_deg(rotated, made.normals) > 1
+    shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics @ change)
     # Lights turn by the inverse, and images stay the product: the truth for the new camera.
-    assert error_deg(shading, rotated) < 0.2
+    assert off_deg(shading, rotated) < 0.2
 
 
 def test_dtype_and_pixels_without_enough_views(generator):
     made, intrinsics = seen_in_perspective(generator)
     seen = torch.ones(12, made.normals.shape[1], dtype=torch.bool)
     seen[2:, 100] = False
-    shading, lights = factorize_in_perspective(
-        made.images.float(), made.mask, intrinsics.float(), seen
-    )
+    images = made.images.float()
+    shading, lights = factorize_in_perspective(images, made.mask, intrinsics.float(), seen)
     assert shading.dtype == lights.dtype == torch.float32
     assert (shading[:, 100] == 0).all()
     kept = torch.arange(shading.shape[1]) != 100
-    assert error_deg(shading[:, kept].double(), made.normals[:, kept]) < 0.2
+    assert off_deg(shading[:, kept].double(), made.normals[:, kept]) < 0.2
 
 
-def test_what_does_not_fit_is_refused(generator):
+THIN = (torch.arange(64) % 2 == 0)[:, None].expand(64, 64)
+THREE = (torch.arange(12) < 3)[:, None].expand(12, 64**2)
+
+
+@pytest.mark.parametrize(
+    ("change", "needed"),
+    [
+        (lambda images, mask, K: (images[:2], mask, K), "2 views"),
+        (lambda images, mask, K: (images, mask, -K), "focal lengths"),
+        (lambda images, _, K: (images, THIN, K), "squares of 7 x 7"),
+        (lambda images, mask, K: (images[:1].expand(5, -1, -1, -1), mask, K), "rank two"),
+        (lambda images, mask, K: (images, mask, K, THREE), "0 pixels more than 3"),
+    ],
+)
+def test_what_does_not_fit_is_refused(generator, change, needed):
     made, intrinsics = seen_in_perspective(generator)
-    images, mask = made.images, made.mask
-    with pytest.raises(InputError, match="2 views"):
-        factorize_in_perspective(images[:2], mask, intrinsics)
-    with pytest.raises(InputError, match="focal lengths"):
-        factorize_in_perspective(images, mask, -intrinsics)
-    thin = torch.zeros_like(mask)
-    thin[::2] = True
-    with pytest.raises(InputError, match="squares of 7 x 7"):
-        factorize_in_perspective(images, thin, intrinsics)
-    with pytest.raises(InputError, match="rank two"):
-        factorize_in_perspective(images[:1].expand(5, -1, -1, -1), mask, intrinsics)
-    three = torch.zeros(12, int(mask.sum()), dtype=torch.bool)
-    three[:3] = True
-    with pytest.raises(InputError, match="0 pixels more than 3"):
-        factorize_in_perspective(images, mask, intrinsics, three)
+    with pytest.raises(InputError, match=needed):
+        factorize_in_perspective(*change(made.images, made.mask, intrinsics))
