@@ -27,13 +27,13 @@ class _Rays(NamedTuple):
     Attributes:
         directions: To a point, with its distance for length; through a pixel.
         inside: Whether a pixel's mask has it; true for points.
-        count: Of those to points.
+        num_points: Of those to points.
     """
 
     origins: Float[Tensor, "ray 3"]
     directions: Float[Tensor, "ray 3"]
     inside: Bool[Tensor, " ray"]
-    count: int
+    num_points: int
 
 
 def compare_with_scene(
@@ -148,17 +148,21 @@ def _fit(mesh: Mesh, rays: _Rays) -> _Fit:
     met, length = cast.face >= 0, rays.directions.norm(dim=1)
     # Nothing is near in a mesh that the cameras are inside of.
     near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
-    reached, shown, inside = met[: rays.count], met[rays.count :], rays.inside[rays.count :]
+    reached, shown, inside = (
+        met[: rays.num_points],
+        met[rays.num_points :],
+        rays.inside[rays.num_points :],
+    )
     hits = int(reached.sum())
     distance = on_mesh = overlap = math.nan
     if hits:
-        points = (rays.origins + rays.directions)[: rays.count][reached]
+        points = (rays.origins + rays.directions)[: rays.num_points][reached]
         distance = float(NearestSurface(mesh).query(points).distance.median()) / diagonal
-    if hits >= min(30, max(1, rays.count // 4)):  # fewer tell nothing
-        on_mesh = int((near[: rays.count] & reached).sum()) / hits
+    if hits >= min(30, max(1, rays.num_points // 4)):  # fewer tell nothing
+        on_mesh = int((near[: rays.num_points] & reached).sum()) / hits
     if len(inside):
         overlap = int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
-    return _Fit(rays.count, hits, on_mesh, overlap, distance, diagonal)
+    return _Fit(rays.num_points, hits, on_mesh, overlap, distance, diagonal)
 
 
 def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:

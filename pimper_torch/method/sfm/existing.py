@@ -74,8 +74,8 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
         if not resize_fits(lens, width, height)
     ]
     as_stored = all(
-        resize_fits(lens, *turned_size(*size, quarters))
-        for lens, size, quarters in zip(model.lenses, sizes, exif, strict=True)
+        resize_fits(lens, *turned_size(width, height, quarters))
+        for lens, (width, height), quarters in zip(model.lenses, sizes, exif, strict=True)
     )
     if odd and not as_stored:
         raise InputError(

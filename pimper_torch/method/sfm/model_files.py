@@ -233,7 +233,7 @@ def _with_points(
     lost, unseen = int((~finite).sum()), int((point >= 0).sum() - sound.sum())
     if lost or unseen:
         caution(
-            f"The COLMAP model in {folder} is partly broken. Left out are {lost} of {len(finite)} "
+            f"The COLMAP model in {folder} is partly broken. Left out are {lost} of {len(points)} "
             f"points, whose coordinates are not finite, and {unseen} observations, which name no "
             "feature of an image. Write it again if these matter.",
             stacklevel=4,
