@@ -36,27 +36,31 @@ def features(pixels, descriptors):
     )
 
 
-def test_a_twin_off_the_line_is_no_rival_and_one_on_it_is():
-    first = features([[5.0, 10.0], [5.0, 60.0]], [0.0, 90.0])
-    second = features(
-        [[30.0, 11.0], [40.0, 30.0], [30.0, 60.0], [40.0, 61.5]], [10.0, 0.0, 90.0, 92.0]
-    )
-    found = guided_matches(first, second, BESIDE, 0.8)
-    assert found.tolist() == [[0, 0], [1, 2]]  # 0 against 2 degrees: clear
-    ratio = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
-    assert guided_matches(first, ratio, BESIDE, 0.8).tolist() == []
-    assert guided_matches(first, ratio, BESIDE, 0.9).tolist() == [[0, 0]]
+ONE = [[5.0, 10.0]]
+TWO = [[5.0, 10.0], [5.0, 60.0]]
+RIVALS = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
 
 
-def test_matches_are_each_others_best():
-    first = features([[5.0, 10.0], [9.0, 10.5]], [0.0, 10.0])
-    second = features([[30.0, 10.0]], [2.0])
-    assert guided_matches(first, second, BESIDE, 0.8).tolist() == [[0, 0]]
-
-
-def test_descriptors_that_are_unlike_do_not_match_though_nothing_rivals():
-    first, second = features([[5.0, 10.0]], [0.0]), features([[30.0, 10.0]], [45.0])
-    assert guided_matches(first, second, BESIDE, 0.8).tolist() == []
+@pytest.mark.parametrize(
+    ("first", "second", "ratio", "found"),
+    [
+        # A twin off the line is no rival, and one on it is: 0 against 2 degrees is clear.
+        (
+            features(TWO, [0.0, 90.0]),
+            features([[30.0, 11], [40, 30], [30, 60], [40, 61.5]], [10.0, 0, 90, 92]),
+            0.8,
+            [[0, 0], [1, 2]],
+        ),
+        (features(TWO, [0.0, 90.0]), RIVALS, 0.8, []),
+        (features(TWO, [0.0, 90.0]), RIVALS, 0.9, [[0, 0]]),
+        # Each other's best.
+        (features([[5.0, 10], [9, 10.5]], [0.0, 10]), features([[30.0, 10]], [2.0]), 0.8, [[0, 0]]),
+        (features(ONE, [0.0]), features([[30.0, 10.0]], [45.0]), 0.8, []),  # unlike, without rivals
+        (features([[5.0, 200.0]], [0.0]), features(TWO, [10.0, 0.0]), 0.8, []),  # none near
+    ],
+)
+def test_matches_are_clearly_each_others_best_along_the_line(first, second, ratio, found):
+    assert guided_matches(first, second, BESIDE, ratio).tolist() == found
 
 
 def sampsons_distance(fundamental, first, second):
@@ -99,11 +103,6 @@ def test_the_two_largest_products_within_the_distance_are_found(generator, lengt
         assert torch.equal(alike[1], best)
         # Float32 sums of up to 128 products, of size one in all, in another order.
         torch.testing.assert_close(alike[0], largest, rtol=0, atol=length * 6e-8)
-
-
-def test_features_without_any_near_do_not_match():
-    second = features([[30.0, 11.0], [40.0, 30.0]], [10.0, 0.0])
-    assert len(guided_matches(features([[5.0, 200.0]], [0.0]), second, BESIDE, 0.8)) == 0
 
 
 @pytest.fixture(scope="module")

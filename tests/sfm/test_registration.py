@@ -102,26 +102,26 @@ NEIGHBOURS = (True, [(0, 1), (1, 2), (2, 3), (3, 4)])
 EVERY = range(5)
 
 
-def test_a_complete_first_model_is_the_last(told, space):
-    answers = told([EVERY])
-    found = register(space, SETTINGS)
-    assert found.complete
-    assert answers.matched == [(False, all_pairs(5)), NEIGHBOURS]
-    assert answers.mapped == [(5, False)]
-
-
-def test_pairs_of_missing_photographs_are_guided_and_the_mapper_starts_again(told, space):
-    answers = told([[0, 1, 2, 4], [0, 1, 2, 4], EVERY])
-    found = register(space, SETTINGS)
-    assert found.complete
-    assert answers.matched[2:] == [(True, [(0, 3), (1, 3), (2, 3), (3, 4)])]
-    assert answers.mapped == [(5, False), (5, False), (6, False)]
-
-
-def test_every_pair_is_guided_where_a_view_is_misplaced(told, space):
-    answers = told([EVERY, EVERY], [{"d.jpg": 0.1}])
+@pytest.mark.parametrize(
+    ("models", "misplaced", "guided", "seeds"),
+    [
+        ([EVERY], [], [], [5]),  # a complete first model is the last
+        # Pairs of missing photographs, and the mapper starts again.
+        ([[0, 1, 2, 4]] * 2 + [EVERY], [], [[(0, 3), (1, 3), (2, 3), (3, 4)]], [5, 5, 6]),
+        ([EVERY, EVERY], [{"d.jpg": 0.1}], [all_pairs(5)], [5, 5]),  # every pair
+    ],
+)
+def test_pairs_are_guided_and_the_mapper_starts_until_a_model_is_complete(
+    told, space, models, misplaced, guided, seeds
+):
+    answers = told(models, misplaced)
     assert register(space, SETTINGS).complete
-    assert answers.matched[2:] == [(True, all_pairs(5))]
+    assert answers.matched == [
+        (False, all_pairs(5)),
+        NEIGHBOURS,
+        *((True, pairs) for pairs in guided),
+    ]
+    assert answers.mapped == [(seed, False) for seed in seeds]
 
 
 def test_points_of_two_views_count_last_and_the_best_of_all_is_kept(told, space):
