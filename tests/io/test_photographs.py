@@ -2,7 +2,6 @@ import struct
 import time
 import tracemalloc
 import zlib
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
 from pimper_torch.doors.io.photograph_files import list_images
-from pimper_torch.doors.io.photographs import load_views, read_mask
+from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.method.sfm.lenses import choose_lenses
 from pimper_torch.runtime.errors import InputError, PimperWarning
@@ -119,98 +118,6 @@ def test_small_photographs_are_left_alone(photos):
         load_views(photos, max_size_px=-1)
 
 
-def test_masks_are_found_by_stem_and_mark_what_is_not_zero(photos, tmp_path):
-    drawn = np.zeros((8, 12), dtype=np.uint8)
-    drawn[2:5, 3:9] = 1
-    save(tmp_path / "masks" / "1.png", drawn)
-    save(tmp_path / "masks" / "2.tif", drawn * 255)
-    save(tmp_path / "masks" / "10.png.png", np.stack([drawn * 0, drawn * 200, drawn], axis=-1))
-    masks = load_views(photos, masks=tmp_path / "masks").masks
-    assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
-
-
-def soft_disc():
-    """Coverage of the pixels by a disc, 0 to 1, and the pixels that it covers by half."""
-    rows, columns = np.mgrid[:384, :512] / 8
-    fine = np.hypot(rows - 23, columns - 31) < 15
-    coverage = fine.reshape(48, 8, 64, 8).mean(axis=(1, 3))
-    return coverage, torch.from_numpy(coverage >= 0.5)
-
-
-@pytest.mark.parametrize(
-    "form", ["8", "16", "grey", "jpg", "alpha", "cut out", "labels", "0 and 1"]
-)
-def test_masks_mark_what_is_half_covered_in_whatever_files_they_are(tmp_path, form):
-    coverage, truth = soft_disc()
-    bytes_ = (255 * coverage).round().astype(np.uint8)
-    texture = np.random.default_rng(3).integers(1, 255, (48, 64, 3), dtype=np.uint8)
-    array = {
-        "16": (65535 * coverage).round().astype(np.uint16),
-        "grey": bytes_ // 2,
-        "alpha": np.stack([bytes_ * 0] * 3 + [bytes_], axis=-1),
-        "cut out": np.concatenate([texture, bytes_[..., None]], axis=-1),
-        "labels": (coverage >= 0.5) * np.where(np.arange(64) < 30, np.uint8(1), np.uint8(7)),
-        "0 and 1": (coverage >= 0.5).astype(np.uint8),
-    }.get(form, bytes_)
-    for number in range(3):
-        save(tmp_path / "photos" / f"{number}.png", texture)
-        name = f"{number}.{'jpg' if form == 'jpg' else 'png'}"
-        save(tmp_path / "masks" / name, array, **({"quality": 60} if form == "jpg" else {}))
-    masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
-    # The border is 94 pixels long; one above zero beside it is 0.88, one of rounding 0.998.
-    assert overlap(masks[1], truth) > (0.98 if form == "jpg" else 0.995)
-    read = read_mask(tmp_path / "masks" / name)
-    assert torch.equal(read, masks[2])
-
-
-def test_a_mask_of_faint_levels_is_measured_by_the_brightest_of_all(tmp_path):
-    """A soft edge at the photograph's border is no object of its own."""
-    coverage, truth = soft_disc()
-    bytes_ = (255 * coverage).round().astype(np.uint8)
-    for number in range(3):
-        save(tmp_path / "photos" / f"{number}.png", np.full((48, 64, 3), 90, dtype=np.uint8))
-        save(tmp_path / "masks" / f"{number}.png", bytes_)
-    edge = np.zeros((48, 64), dtype=np.uint8)
-    edge[:, 0], edge[:3, 0] = 100, 200
-    save(tmp_path / "masks" / "2.png", edge)
-    masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
-    assert torch.equal(masks[2].nonzero(), torch.tensor([[0, 0], [1, 0], [2, 0]]))
-    assert overlap(masks[0], truth) > 0.995
-
-
-def overlap(one, other):
-    return float((one & other).sum() / (one | other).sum())
-
-
-def test_masks_shrink_with_their_photographs_and_do_not_reach_into_padding(tmp_path):
-    white = np.full((32, 48, 3), 200, dtype=np.uint8)
-    drawn = np.zeros((32, 48), dtype=np.uint8)
-    drawn[:, :24] = 255
-    for number in range(3):
-        high = 32 if number else 24
-        save(tmp_path / "photos" / f"{number}.png", white[:high])
-        save(tmp_path / "masks" / f"{number}.png", drawn[:high])
-    views = load_views(tmp_path / "photos", masks=tmp_path / "masks", max_size_px=24)
-    assert views.masks[1].sum() == 12 * 16
-    assert views.masks[1, :, :12].all()
-    assert not (views.masks & ~views.inside).any()
-
-
-def test_transparency_serves_as_mask_unless_masks_are_given(photos, tmp_path, pixels):
-    alpha = np.full((8, 12, 1), 255, dtype=np.uint8)
-    save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
-    assert load_views(photos).masks is None  # opaque all over says nothing
-    alpha[:4] = 0
-    save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
-    with pytest.warns(PimperWarning, match=r"1 of 3 photographs.*\(2\.png\).*taken for masks"):
-        masks = load_views(photos).masks
-    assert masks[0].all()
-    assert torch.equal(masks[1], torch.from_numpy(alpha[..., 0] > 0))
-    for number in (1, 2, 10):
-        save(tmp_path / "masks" / f"{number}.png", np.full((8, 12), 9, dtype=np.uint8))
-    assert load_views(photos, masks=tmp_path / "masks").masks.all()
-
-
 def test_reading_tells_how_far_it_has_come(photos):
     heard = []
     with listening(lambda done, total: heard.append((done, total))):
@@ -268,20 +175,6 @@ def test_links_are_followed_wherever_they_lead(photos, tmp_path, pixels):
     assert_close(views.images[2].double(), stored, rtol=0, atol=1e-6)
 
 
-def test_a_mask_drawn_in_alpha_is_understood(photos, tmp_path):
-    drawn = np.zeros((8, 12, 4), dtype=np.uint8)
-    drawn[2:6, 3:9, 3] = 255  # black, and opaque on the object
-    for number in (1, 2, 10):
-        save(tmp_path / "masks" / f"{number}.png", drawn)
-    shown = torch.from_numpy(drawn[..., 3] > 0)
-    assert torch.equal(load_views(photos, masks=tmp_path / "masks").masks, shown.expand(3, 8, 12))
-    assert torch.equal(read_mask(tmp_path / "masks" / "1.png"), shown)
-    drawn[2:6, 3:6, :3] = 255  # of an opaque part, only what is bright
-    save(tmp_path / "masks" / "2.png", drawn)
-    masks = load_views(photos, masks=tmp_path / "masks").masks
-    assert torch.equal(masks[1], torch.from_numpy(drawn[..., 0] > 0))
-
-
 def bomb(path, width, height, kind=2):
     """Write a PNG of this size that is black all over, in a file of its thousandth."""
     header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
@@ -327,45 +220,6 @@ def test_padding_does_not_make_a_photograph_black(photos):
     assert load_views(photos).num_views == 4
 
 
-def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path):
-    masks = tmp_path / "masks"
-    for number in (1, 10):
-        save(masks / f"{number}.png", np.full((8, 12), 255, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"no mask for 2\.png.*such as 2\.png"):
-        load_views(photos, masks=masks)
-    save(masks / "2.png", np.full((4, 6), 255, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"2\.png: is 6 x 4, but the photograph 2\.png is 12 x 8"):
-        load_views(photos, masks=masks)
-    save(masks / "2.png", np.zeros((8, 12), dtype=np.uint8))
-    with pytest.raises(InputError, match=r"masks of 2\.png mark no pixel"):
-        load_views(photos, masks=masks)
-    with pytest.raises(InputError, match="nowhere: found nothing"):
-        load_views(photos, masks=tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("polarity", ["auto", "dark", "bright"])
-def test_masks_of_other_programs_are_understood(photos, tmp_path, polarity):
-    """Named ``1_mask.png``, and the object dark on a bright border."""
-    dark = np.full((8, 12), 255, dtype=np.uint8)
-    dark[2:6, 3:9] = 0
-    for number in (1, 2, 10):
-        save(tmp_path / "masks" / f"{number}_mask.png", dark)
-    told = pytest.warns(PimperWarning, match="taken to be dark")
-    with told if polarity == "auto" else nullcontext():
-        masks = load_views(photos, masks=tmp_path / "masks", mask_object=polarity).masks
-    shown = torch.from_numpy((dark > 0) == (polarity == "bright"))
-    assert torch.equal(masks, shown.expand(3, 8, 12))
-
-
-def test_an_object_that_fills_its_photographs_stays_bright(photos, tmp_path):
-    drawn = np.full((8, 12), 255, dtype=np.uint8)
-    drawn[:2, :3] = 0
-    for number in (1, 2, 10):
-        save(tmp_path / "masks" / f"{number}.png", drawn)
-    masks = load_views(photos, masks=tmp_path / "masks").masks
-    assert torch.equal(masks, torch.from_numpy(drawn > 0).expand(3, 8, 12))
-
-
 def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
     names = [f"pose_{pose}/light_{light}.png" for pose in (1, 2, 10) for light in (1, 2)]
     for name in reversed(names):
@@ -393,17 +247,12 @@ def test_two_folders_inside_are_no_poses(tmp_path, pixels):
         load_views(tmp_path)
 
 
-def test_orientation_and_focal_length_come_from_exif(photos, pixels):
-    exif = Image.Exif()
-    exif[274] = 6
-    exif.get_ifd(0x8769)[0xA405] = 50
-    save(photos / "2.png", pixels, exif=exif)
-    views = load_views(photos)
-    assert views.sizes_px.tolist()[1] == [8, 12]
-    upright = np.rot90(pixels, -1).copy()
-    assert_close(views.images[1, :, :12, :8], linear_from_srgb(as_planes(upright)))
-    assert views.focals_px[1].item() == pytest.approx(5000 / 3600 * 12)
-
-
 def as_planes(array):
     return torch.from_numpy(array.astype(np.float32) / 255).permute(2, 0, 1)
+
+
+def test_a_folder_is_known_by_the_path_that_was_given(photos, tmp_path, monkeypatch):
+    (tmp_path / "cam1").symlink_to(photos)
+    monkeypatch.chdir(photos)
+    assert load_views(".").folder == photos.as_posix()
+    assert load_views("../cam1").folder == (tmp_path / "cam1").as_posix()

@@ -182,20 +182,6 @@ def test_no_damage_raises(make_profile):
     assert read_profile(bytes(2**23)).trouble == "is damaged"
 
 
-@pytest.mark.parametrize(("suffix", "tolerance"), [("png", 1e-6), ("tif", 1e-6), ("jpg", 0.03)])
-def test_a_profile_of_gamma_1_8_is_followed_in_every_format(three, make_profile, suffix, tolerance):
-    profile = make_profile(power(1.8), SRGB)
-    ramp = np.repeat(np.linspace(0, 255, 64).round().astype(np.uint8)[None, :, None], 3, axis=2)
-    array = np.repeat(ramp, 16, axis=0)
-    options = {"quality": 100} if suffix == "jpg" else {}
-
-    def write(path):
-        Image.fromarray(array).save(path, icc_profile=profile, **options)
-
-    wanted = torch.from_numpy(array / 255).movedim(-1, 0) ** (461 / 256)
-    assert_close(three(write, suffix), wanted, rtol=0, atol=tolerance)
-
-
 def gamma(number):
     return {"gAMA": struct.pack(">I", number)}
 
@@ -306,13 +292,18 @@ def test_the_curve_of_bt_709_is_inverted():
     assert_close(response.linear_from_encoded(encoded), light, rtol=0, atol=1e-4)
 
 
-def test_photographs_of_one_set_have_a_curve_each(tmp_path, pixels, stored, make_profile):
-    for index, exponent in enumerate((1.0, 1.8, None)):
+def test_photographs_of_one_set_have_a_curve_each_whatever_their_format(tmp_path, make_profile):
+    ramp = np.repeat(np.linspace(0, 255, 64).round().astype(np.uint8)[None, :, None], 3, axis=2)
+    array = np.repeat(ramp, 16, axis=0)
+    stored = torch.from_numpy(array / 255).movedim(-1, 0)
+    exponents = {"0.png": 1.0, "1.tif": 461 / 256, "2.jpg": 461 / 256, "3.png": None}
+    for name, exponent in exponents.items():
         profile = None if exponent is None else make_profile(power(exponent), SRGB)
-        Image.fromarray(pixels).save(tmp_path / f"{index}.png", icc_profile=profile)
-    images = load_views(tmp_path).images.double()
-    wanted = torch.stack([stored, stored ** (461 / 256), linear_from_srgb(stored)])
-    assert_close(images, wanted, rtol=0, atol=1e-6)
+        options = {"quality": 100} if name == "2.jpg" else {}
+        Image.fromarray(array).save(tmp_path / name, icc_profile=profile, **options)
+    for image, (name, exponent) in zip(load_views(tmp_path).images, exponents.items(), strict=True):
+        wanted = linear_from_srgb(stored) if exponent is None else stored**exponent
+        assert_close(image.double(), wanted, rtol=0, atol=0.03 if name == "2.jpg" else 1e-6)
 
 
 def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_profile):

@@ -1,4 +1,3 @@
-import importlib.util
 import warnings
 
 import numpy as np
@@ -202,38 +201,3 @@ def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
     inner = (slice(None), slice(3, -3), slice(3, -3))
     scale = (images[3] / images[0])[inner].median()
     assert_close(scale * images[0][inner], images[3][inner], rtol=0, atol=0.005)
-
-
-def test_without_its_package_raw_is_refused_with_what_to_install(folder, monkeypatch, pixels):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        "pimper_torch.doors.io.extras.find_spec",
-        lambda name: None if name == "rawpy" else find(name),
-    )
-    with pytest.raises(InputError, match=r'0\.dng: is camera raw.*pip install "pimper_torch\[raw'):
-        load_views(folder)
-    with pytest.raises(InputError, match=r'pip install "pimper_torch\[raw\]"'):
-        read_header(folder / "1.dng")
-    for index in range(3):  # with others, it is passed over with a word
-        Image.fromarray(pixels).save(folder / f"{index}.jpg")
-    told = r'were not read: DNG \(3\).* `pip install "pimper_torch\[raw\]"` reads raw\.'
-    with pytest.warns(PimperWarning, match=told):
-        assert load_views(folder).names == ("0.jpg", "1.jpg", "2.jpg")
-
-
-def test_damaged_and_huge_raw_is_refused_by_name(tmp_path, colours, monkeypatch):
-    mosaic = mosaic_of(sensor_of(colours))
-    write_dng(tmp_path / "a.dng", mosaic)
-    whole = (tmp_path / "a.dng").read_bytes()
-    for fraction in (0, 0.001, 0.3, 0.9):
-        (tmp_path / "cut.dng").write_bytes(whole[: int(fraction * len(whole))])
-        with pytest.raises(InputError, match=r"cut\.dng"):
-            decode(tmp_path / "cut.dng")
-    write_dng(tmp_path / "huge.dng", mosaic, size=(30000, 20000))
-    with pytest.raises(InputError, match=r"huge\.dng: cannot be read as camera raw"):
-        decode(tmp_path / "huge.dng")  # more than its bytes hold
-    monkeypatch.setattr("pimper_torch.doors.io.decode.MAX_PIXELS", 1000)
-    with pytest.raises(InputError, match=r"a\.dng: has 60 x 40 pixels"):
-        decode(tmp_path / "a.dng")
-    with pytest.raises(InputError, match=r"gone\.dng: cannot be read \(No such file"):
-        read_header(tmp_path / "gone.dng")

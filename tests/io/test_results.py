@@ -68,41 +68,39 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
 
-def test_depth_leads_back_to_the_surface(reconstruction, tmp_path):
-    write_result(reconstruction, Config(), tmp_path / "out")
-    with np.load(tmp_path / "out" / "depth.npz", allow_pickle=False) as stored:
-        found = {key: torch.from_numpy(stored[key]) for key in stored.files if key != "name"}
-        assert str(stored["name"]) == "b.png"
+def test_depth_leads_back_to_the_surface_and_is_as_far_off_as_the_result_tells(
+    reconstruction, tmp_path
+):
+    told = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
+    found = {}
+    for name, mesh in (("untold", reconstruction.mesh), ("told", told)):
+        write_result(reconstruction.replace(mesh=mesh), Config(), tmp_path / name)
+        with np.load(tmp_path / name / "depth.npz", allow_pickle=False) as stored:
+            assert str(stored["name"]) == "b.png"
+            assert ("expected_error" in stored.files) == (name == "told")
+            found |= {key: torch.from_numpy(stored[key]) for key in stored.files if key != "name"}
     assert_close(found["cam_from_world"], reconstruction.cameras.cam_from_world[1])
     rows, columns = torch.nonzero(found["mask"], as_tuple=True)
     pixels = torch.stack([columns, rows], dim=-1) + 0.5
     rays = rays_through(pixels, found["cam_from_world"], found["intrinsics"])
-    center = reconstruction.cameras.centers_world[1]
-    points = center + found["depth"][rows, columns, None] * rays
+    points = reconstruction.cameras.centers_world[1] + found["depth"][rows, columns, None] * rays
     x, y, z = points.unbind(dim=-1)
     # The mesh's chords lie below or above the bump by up to its curvature over a cell.
     assert (z - 0.5 * torch.exp(-3 * (x**2 + y**2))).abs().max() < 0.02
     assert len(rows) > 500
     assert found["depth"][~found["mask"]].isnan().all()
-    assert "expected_error" not in found  # this result tells none
-
-
-def test_the_expected_error_is_written_where_the_result_tells_it(reconstruction, tmp_path):
-    told = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
-    write_result(reconstruction.replace(mesh=told), Config(), tmp_path / "out")
-    with np.load(tmp_path / "out" / "depth.npz", allow_pickle=False) as stored:
-        found, mask = torch.from_numpy(stored["expected_error"]), stored["mask"]
-    assert 0.45 < found.max() <= 0.5  # blended over the bump, which is so high
-    assert (found[~torch.from_numpy(mask)] == 0).all()
+    assert 0.45 < found["expected_error"].max() <= 0.5  # blended over the bump, which is so high
+    assert (found["expected_error"][~found["mask"]] == 0).all()
 
 
 def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(
     reconstruction, tmp_path
 ):
     write_result(reconstruction, Config(), tmp_path / "out")
-    with Image.open(tmp_path / "out" / "normals.png") as picture:
-        assert (picture.size, picture.mode) == ((60, 40), "RGB")
-        colors = np.asarray(picture).astype(float)
+    for name in ("normals.png", "albedo.png"):
+        with Image.open(tmp_path / "out" / name) as picture:
+            assert (picture.size, picture.mode) == ((60, 40), "RGB")
+    colors = np.asarray(Image.open(tmp_path / "out" / "normals.png")).astype(float)
     assert (colors[0, 0] == 0).all()
     centre = colors[20, 30]  # the top of the bump, seen from straight before it
     assert centre[2] > 240
@@ -110,8 +108,6 @@ def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(
     left, right, up, down = colors[20, 25], colors[20, 35], colors[15, 30], colors[25, 30]
     assert left[0] < 110 < 145 < right[0]
     assert down[1] < 110 < 145 < up[1]
-    with Image.open(tmp_path / "out" / "albedo.png") as picture:
-        assert (picture.size, picture.mode) == ((60, 40), "RGB")
 
 
 def test_lights_in_the_world_shade_as_lights_in_the_patch(reconstruction):
@@ -190,47 +186,34 @@ def test_the_summary_counts(reconstruction):
     assert summary["stages"][0]["samples"] == 96
 
 
-def test_numbers_that_json_cannot_hold_become_null(reconstruction, tmp_path):
+def test_numbers_that_json_cannot_hold_become_null(reconstruction):
     report = reconstruction.report[0].replace(figures={"mean_residual": float("nan")})
-    write_result(reconstruction.replace(report=(report,)), Config(), tmp_path / "out")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["missing_fraction"] is None
-    assert summary["stages"][0]["mean_residual"] is None
+    summary = summary_report(reconstruction.replace(report=(report,)), {})
+    assert (summary["missing_fraction"], summary["stages"][0]["mean_residual"]) == (None, None)
 
 
-def test_a_failure_in_the_centre_leaves_nothing_behind(reconstruction, tmp_path, monkeypatch):
-    for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
-
-        def fail(*_, error=error):
-            raise error
-
-        monkeypatch.setattr(results, "write_model", fail)
-        with pytest.raises((OutputError, KeyboardInterrupt)) as raised:
-            write_result(reconstruction, Config(), tmp_path / "deep" / "out")
-        assert names(tmp_path) == []
-        if isinstance(error, OSError):
-            assert raised.type is OutputError
-            assert "No space left" in str(raised.value)
-
-
-def test_a_failure_keeps_the_former_result(reconstruction, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    write_result(reconstruction, Config(zeta=1.0), out)
-    with pytest.raises(OutputError, match=r"already holds albedo\.png"):
-        write_result(reconstruction, Config(zeta=2.0), out)
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("former", [False, True])
+def test_a_failure_in_the_centre_leaves_nothing_or_the_former_result(
+    reconstruction, tmp_path, monkeypatch, error, former
+):
+    out = tmp_path / "deep" / "out"
+    if former:
+        write_result(reconstruction, Config(zeta=1.0), out)
+        with pytest.raises(OutputError, match=r"already holds albedo\.png"):
+            write_result(reconstruction, Config(zeta=2.0), out)
 
     def fail(*_):
-        raise OSError("broken")
+        raise error
 
-    with monkeypatch.context() as patched:
-        patched.setattr(results, "write_model", fail)
-        with pytest.raises(OutputError, match="broken"):
-            write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
-    assert "1.0" in (out / "config.yaml").read_text()
-    assert names(tmp_path) == ["out"]
-    write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
-    assert "2.0" in (out / "config.yaml").read_text()
-    assert names(tmp_path) == ["out"]
+    monkeypatch.setattr(results, "write_model", fail)
+    told = "No space left" if isinstance(error, OSError) else None
+    with pytest.raises((OutputError, KeyboardInterrupt), match=told):
+        write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
+    assert names(tmp_path) == (["deep"] if former else [])
+    if former:
+        assert names(out.parent) == ["out"]
+        assert "1.0" in (out / "config.yaml").read_text()
 
 
 def test_a_page_that_nobody_wants_is_not_written(reconstruction, tmp_path):
@@ -257,16 +240,22 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     assert asset == (tmp_path / "cup" / "asset.glb").read_bytes()
 
 
-def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("file", "file: is a file"),
+        ("file/out", "out: cannot be written"),
+        ("link", "link: is a link to nothing"),
+        ("new", "cannot be written, as .* refuses"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch, name, why):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file: is a file"):
-        prepare_output(tmp_path / "file", "result")
-    with pytest.raises(OutputError, match="out: cannot be written"):
-        prepare_output(tmp_path / "file" / "out", "result")
-
-    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
-    with pytest.raises(OutputError, match=f"cannot be written, as {tmp_path} refuses"):
-        prepare_output(tmp_path / "out", "result")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    if name == "new":
+        monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+    with pytest.raises(OutputError, match=why):
+        prepare_output(tmp_path / name, "result")
 
 
 def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
