@@ -10,7 +10,6 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.photograph_files import list_images
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.method.sfm.lenses import choose_lenses
@@ -125,33 +124,25 @@ def test_reading_tells_how_far_it_has_come(photos):
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_a_video_is_refused_with_the_command_that_makes_photographs_of_it(tmp_path):
-    (tmp_path / "clip.MP4").write_bytes(b"ftyp")
-    for asked in (tmp_path, tmp_path / "clip.MP4"):
-        with pytest.raises(InputError, match=r"clip.MP4: is a video; .*`pimper frames .*clip.MP4"):
-            list_images(asked)
-
-
-def test_a_missing_folder_a_file_and_an_empty_folder_are_refused(tmp_path):
-    with pytest.raises(InputError, match="nowhere: found nothing; needed: a folder"):
-        load_views(tmp_path / "nowhere")
-    (tmp_path / "a.png").write_text("")
-    with pytest.raises(InputError, match=r"a\.png: found a file; needed: a folder"):
-        load_views(tmp_path / "a.png")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"no images; it is empty.*\.jpg.*\.tiff"):
-        load_views(tmp_path / "empty")
-    (tmp_path / "empty" / "a.gif").write_text("")
-    with pytest.raises(InputError, match=r"no images; it holds a\.gif"):
-        load_views(tmp_path / "empty")
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_too_few_photographs_are_refused(photos, count):
-    for path in sorted(photos.iterdir())[count:]:
-        path.unlink()
-    with pytest.raises(InputError, match=f"found {count} .*needed: at least 3"):
-        load_views(photos)
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("nowhere", "nowhere: found nothing; needed: a folder"),
+        ("a.png", r"a\.png: found a file; needed: a folder"),
+        ("empty", r"no images; it is empty.*\.jpg.*\.tiff"),
+        ("gif", r"no images; it holds a\.gif"),
+        ("clip.MP4", r"clip\.MP4: is a video; .*`pimper frames .*clip\.MP4"),
+        ("film", r"clip\.MP4: is a video; .*`pimper frames .*clip\.MP4"),
+        ("photos", "found 2 .*needed: at least 3"),
+    ],
+)
+def test_what_is_no_folder_of_photographs_is_refused(tmp_path, photos, name, why):
+    for file in ("a.png", "gif/a.gif", "clip.MP4", "film/clip.MP4", "empty/.hidden"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_bytes(b"ftyp")
+    (photos / "10.png").unlink()
+    with pytest.raises(InputError, match=why):
+        load_views(tmp_path / name)
 
 
 def test_black_photographs_are_refused_by_name(photos):
@@ -175,25 +166,9 @@ def test_links_are_followed_wherever_they_lead(photos, tmp_path, pixels):
     assert_close(views.images[2].double(), stored, rtol=0, atol=1e-6)
 
 
-def bomb(path, width, height, kind=2):
-    """Write a PNG of this size that is black all over, in a file of its thousandth."""
-    header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
-    packer = zlib.compressobj(1)
-    line = bytes(1 + width * (3 if kind == 2 else 1))
-    body = b"".join(packer.compress(line * 100) for _ in range(height // 100)) + packer.flush()
-    chunks = ((b"IHDR", header), (b"IDAT", body), (b"IEND", b""))
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + b"".join(
-            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-            for name, body in chunks
-        )
-    )
-
-
-@pytest.mark.parametrize("kind", [0, 2])
-def test_one_huge_image_among_small_ones_is_refused_before_it_is_read(photos, kind):
-    bomb(photos / "3.png", 13_000, 2_000, kind)
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_one_huge_image_among_small_ones_is_refused_before_it_is_read(photos, mode):
+    Image.new(mode, (13_000, 2_000)).save(photos / "3.png")
     data = bytearray((photos / "3.png").read_bytes())
     data[20:24] = struct.pack(">I", 13_000)  # the header says more than the file holds
     data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))

@@ -98,7 +98,7 @@ def _header_of(path: Path) -> Header:
             colour = Colour(source="TIFF", trouble="has a TransferFunction, a table of levels")
         orientation = exif.get(ExifTags.Base.Orientation, 1)
         cautions = []
-        if orientation not in range(1, 9):
+        if not (isinstance(orientation, int) and 1 <= orientation <= 8):
             cautions.append(
                 f"has an EXIF orientation of {orientation!r:.20}, not of 1 to 8; it is taken as "
                 "upright"
