@@ -27,7 +27,7 @@ from pimper_bench.datasets import read_llff, read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_bench.truth import Capture
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.records import Estimate, Mesh, SparseScene, Views

@@ -16,7 +16,7 @@ from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.size.given import Mark
 from pimper_torch.doors.size.marks import place_of
 from pimper_torch.doors.size.scale import Scale
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 
 # The surface of the small result has a random confidence.
 UNSURE = "ignore:.*hardly determine the surface:pimper_torch.runtime.errors.PimperWarning"

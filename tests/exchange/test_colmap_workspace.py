@@ -9,7 +9,7 @@ from pimper_bench.datasets import read_colmap
 from pimper_torch.doors.exchange.colmap_workspace import write_workspace
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.result.viz.maps import view_maps
 
 FILES = ("a.png", "b.png", "c.png")

@@ -45,9 +45,10 @@ from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.sfm.colmap import read_model, reconstruction_of, write_binary
+from pimper_torch.method.sfm.colmap import reconstruction_of, write_binary
 from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Mesh, Views
 from pimper_torch.records.stored import load_record, save_record

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from pimper_torch.doors.io.decode import decode, read_header, rotated
 from pimper_torch.doors.io.photograph_files import list_images
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import Encoding, Linear, srgb_from_linear
+from pimper_torch.ground.radiometry import Linear
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import XYZ_TO_CAMERA, write_dng
 
@@ -156,11 +156,6 @@ def test_raw_is_turned_as_its_exif_says(tmp_path, colours, orientation, size):
     assert np.isnan(read_header(tmp_path / "a.dng").focal_px)
 
 
-def test_a_response_that_is_given_wins_over_raw_too(folder):
-    with pytest.warns(PimperWarning, match="srgb is given, but camera raw says linear"):
-        load_views(folder, encoding=Encoding(response="srgb"))
-
-
 def test_raw_is_read_and_the_jpeg_of_the_same_photograph_passed_over(folder, pixels):
     raw = load_views(folder)
     for name in ("0.jpg", "1.JPG", "2.jpeg"):
@@ -192,12 +187,3 @@ def test_raw_shows_what_the_cameras_own_picture_shows(tmp_path, colours):
     whole, crop = (decode(tmp_path / f"{name}.dng").samples for name in ("whole", "crop"))
     rows, columns = slice(8, 56), slice(40 - 34, 40 - 4)  # what was below is on the left
     assert torch.equal(crop, whole[:, rows, columns])
-
-
-def test_raw_and_jpeg_of_other_names_are_one_set(folder, colours):
-    picture = (255 * srgb_from_linear(colours)).round().to(torch.uint8).movedim(0, -1).numpy()
-    Image.fromarray(picture).save(folder / "5.png")
-    images = load_views(folder).images.double()
-    inner = (slice(None), slice(3, -3), slice(3, -3))
-    scale = (images[3] / images[0])[inner].median()
-    assert_close(scale * images[0][inner], images[3][inner], rtol=0, atol=0.005)

@@ -24,7 +24,7 @@ from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.result.asset.finish import written_channels
 from pimper_torch.result.asset.mesh_files import MeshFiles

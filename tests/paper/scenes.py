@@ -5,7 +5,8 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.patches.decompose import Decompose, DecomposeConfig
+from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import (
     Cameras,

@@ -4,7 +4,8 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.paper.align import Align, AlignConfig, patch_status, vertex_anchors
+from pimper_torch.paper.align import Align, patch_status, vertex_anchors
+from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.paper.seams import (
     Pulls,
     curvature_along,

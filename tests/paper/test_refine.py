@@ -6,7 +6,8 @@ from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.surfaces import unit_face_normals
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.paper.refine import Refine, RefineConfig, seam_weight, smooth_seams
+from pimper_torch.paper.paper_config import RefineConfig
+from pimper_torch.paper.refine import Refine, seam_weight, smooth_seams
 from tests.paper.scenes import ball, changed, facets_over, height_fields, level, rings
 
 SPACING = 0.02

@@ -15,7 +15,8 @@ from pimper_torch.paper.cloud_filters import (
     spread_to_count,
     well_accompanied,
 )
-from pimper_torch.paper.triangulate import Triangulate, TriangulateConfig, peel
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate, peel
 from pimper_torch.runtime.errors import ReconstructionError
 
 

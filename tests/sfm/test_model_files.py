@@ -13,8 +13,9 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.colmap_library import loaded
-from pimper_torch.method.sfm.colmap import model_of, read_model, reconstruction_of, write_binary
+from pimper_torch.method.sfm.colmap import model_of, reconstruction_of, write_binary
 from pimper_torch.method.sfm.model import select_views
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 POINTS, VIEWS = 20, 4

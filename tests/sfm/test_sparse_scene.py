@@ -5,14 +5,10 @@ from torch.testing import assert_close
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.colmap import reprojection_errors
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.sparse_scene import (
-    assemble_scene,
-    point_colors,
-    reprojection_errors,
-    write_model,
-)
+from pimper_torch.method.sfm.sparse_scene import assemble_scene, point_colors, write_model
 from pimper_torch.method.silhouettes.cues import SilhouetteDetails, cues_of
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 

@@ -11,7 +11,7 @@ from pimper_torch.cli.main import main
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 
 log = logging.getLogger(__name__)
 SIZE = {"width": 640, "height": 480}

@@ -26,7 +26,7 @@ from pimper_torch.doors.camera_files.read_cameras import FORMATS, read_cameras
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npy

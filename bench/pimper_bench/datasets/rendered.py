@@ -15,8 +15,8 @@ from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.radiometry import Encoding
-from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.method.sfm.epipolar import pinholes_of
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.config import build
 from pimper_torch.runtime.errors import ConfigError, InputError

@@ -15,8 +15,8 @@ from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.io.photographs import load_views, read_mask
 from pimper_torch.ground.radiometry import Encoding
-from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.method.sfm.sparse_scene import assemble_scene
 from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views

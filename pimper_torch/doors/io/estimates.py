@@ -10,8 +10,8 @@ from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.reports import common_lights
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
-from pimper_torch.method.sfm.colmap import read_model
 from pimper_torch.method.sfm.epipolar import pinholes_of
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Estimate, Reconstruction
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npz

@@ -177,8 +177,8 @@ def _fill(
         response = file_response(decoded) if given is None else given
         kind = _Kind(decoded.full, decoded.full_told, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
-        _require_fit(response, decoded, paths[index])
-        radiance = radiance_of(decoded, _on_full_scale(response, decoded), black, white)
+        fitted = _fitted(response, decoded, paths[index])
+        radiance = radiance_of(decoded, fitted, black, white)
         if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
             radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
@@ -203,14 +203,6 @@ def file_response(decoded: Decoded) -> Response:
     if said is None or (isinstance(said, Curve) and len(said.radiance) > len(decoded.samples)):
         return Srgb()
     return said
-
-
-def _on_full_scale(response: Response, decoded: Decoded) -> Response:
-    """Let a curve that was measured over 16 bits begin and end with those that a file uses."""
-    most = 2**decoded.bits - 1
-    if not isinstance(response, Curve) or response.bits is None or decoded.full == most:
-        return response
-    return replace(response, encoded=response.encoded * most / decoded.full)
 
 
 def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
@@ -291,19 +283,23 @@ def _levels(
     return dark, white
 
 
-def _require_fit(response: Response, decoded: Decoded, path: Path) -> None:
-    """Refuse a curve that was measured on files of another kind."""
+def _fitted(response: Response, decoded: Decoded, path: Path) -> Response:
+    """Return a response over the levels of a file; refuse a curve measured on files of others."""
     if not isinstance(response, Curve):
-        return
+        return response
+    most = 2**decoded.bits - 1
     if response.bits not in (None, decoded.bits):
         last = float(response.encoded[-1]) * (2**response.bits - 1)
         raise InputError(
-            f"{path}: holds {decoded.bits} bits, levels 0 to {2**decoded.bits - 1}, but the "
-            f"response curve ends at level {last:g}, for files of {response.bits} bits; needed: a "
-            "curve over the levels of these files, or over fractions of full scale from 0 to 1."
+            f"{path}: holds {decoded.bits} bits, levels 0 to {most}, but the response curve ends "
+            f"at level {last:g}, for files of {response.bits} bits; needed: a curve over the "
+            "levels of these files, or over fractions of full scale from 0 to 1."
         )
     if len(response.radiance) not in (1, decoded.samples.shape[0]):
         raise InputError(
             f"{path}: is gray, but the response curve is one for red, green and blue; needed: one "
             "for all."
         )
+    if response.bits is None or decoded.full == most:
+        return response
+    return replace(response, encoded=response.encoded * most / decoded.full)

@@ -5,7 +5,7 @@ from pathlib import Path
 from pimper_torch.doors.exchange.result import Result, read_result
 from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.method.chains.chain import Step
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Mesh, Reconstruction, SparseScene
 from pimper_torch.result.viewer.server import HOST, PORT
 from pimper_torch.result.viewer.viewer import Viewer

@@ -9,7 +9,7 @@ from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError, MissingProgramError, ReconstructionError
 

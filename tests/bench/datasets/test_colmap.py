@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_bench.datasets import read_colmap
 from pimper_torch.doors.exchange.colmap_workspace import write_colmap
-from pimper_torch.method.sfm.colmap import read_model
+from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.runtime.errors import InputError
 
 # `hand_camera` as a quaternion: a third of a turn about (-1, -1, -1), w = 0.5.
