@@ -68,8 +68,8 @@ def test_samples_of_unknown_meaning_are_left_out_with_a_word(pixels, tmp_path):
 def test_small_copies_beside_a_photograph_are_passed_over(tmp_path, pixels, factor):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(pixels * factor, photometric="rgb")
-        for step in (2, 4):
-            file.write(pixels[::step, ::step] * factor, photometric="rgb", subfiletype=1)
+        for step, marked in ((1, 1), (2, 0)):
+            file.write(pixels[::step, ::step] * factor, photometric="rgb", subfiletype=marked)
     header = read_header(tmp_path / "a.tif")
     assert ((header.width, header.height), header.cautions) == ((12, 8), ())
     assert_close(decode(tmp_path / "a.tif").samples, planes(pixels), rtol=0, atol=1e-6)

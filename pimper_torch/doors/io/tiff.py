@@ -9,11 +9,11 @@ from PIL import TiffImagePlugin
 
 from pimper_torch.runtime.errors import InputError
 
-_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _SAMPLES = 254, 255, 258, 262, 277
+_SUBFILE, _OLD_SUBFILE, _WIDTH, _BITS, _PHOTOMETRIC, _SAMPLES = 254, 255, 256, 258, 262, 277
 _PLANAR, _TRANSFER, _SUB_IFDS, _EXTRA, _FORMAT = 284, 301, 330, 338, 339
 _TAGS = (
-    *(_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _SAMPLES, _PLANAR, _TRANSFER, _SUB_IFDS),
-    *(_EXTRA, _FORMAT),
+    *(_SUBFILE, _OLD_SUBFILE, _WIDTH, _BITS, _PHOTOMETRIC, _SAMPLES),
+    *(_PLANAR, _TRANSFER, _SUB_IFDS, _EXTRA, _FORMAT),
 )
 _WHITE_IS_ZERO, _GRAY, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _NAMES = {0: "gray", 1: "gray", 2: "RGB", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 32845: "LogLuv"}
@@ -64,7 +64,9 @@ def layout_of(path: Path | str) -> Layout:
             f"{path}: holds what a sensor saw, camera raw by the name of TIFF, or a small copy of "
             "it. Give it the suffix that its camera gives, or develop it to linear TIFF of 16 bits."
         )
-    if others and (_is_copy(tags) or not all(_is_copy(other) for other in others)):
+    # Thumbnails are not always marked; cameras write some without a width.
+    small = [_is_copy(page) or 2 * page.get(_WIDTH, 0) <= tags[_WIDTH] for page in others]
+    if others and (_is_copy(tags) or not all(small)):
         raise InputError(
             f"{path}: has several pages; needed: one photograph a file, and nothing after it but "
             "small copies of it. Split it, by ImageMagick for instance: `magick in.tif out_%d.tif`."
