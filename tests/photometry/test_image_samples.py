@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING
 from pimper_torch.method.photometry.light_models import ImageSamples
 
 

@@ -19,10 +19,9 @@ from torch import Tensor
 
 from pimper_torch.ground.kernels.arrays import as_array
 from pimper_torch.ground.kernels.switch import compiled_for
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
 from pimper_torch.ground.linalg.least_squares import compressed_equations, normal_equations
 from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.ground.linalg.robust import robust_variance
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.linalg.systems import solutions, solve_compressed
 from pimper_torch.method.fusion.equations import Equations

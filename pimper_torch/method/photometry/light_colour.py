@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
-from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation
+from pimper_torch.ground.kernels.twin_constants import MIN_DEVIATION
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.method.photometry.light_models import left_out, predicts_better
 
 # Stops that a photograph is brightened by at most: below an eighth of the others' brightness the

@@ -17,8 +17,7 @@ from torch.nn.functional import avg_pool2d, normalize, pad
 
 from pimper_torch.ground.geometry.directions import even_directions
 from pimper_torch.ground.geometry.pixels import scale_intrinsics
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
-from pimper_torch.ground.linalg.robust import cauchy_weights, median_deviation
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.records import (
     Cameras,

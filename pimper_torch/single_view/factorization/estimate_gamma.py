@@ -20,8 +20,12 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
-from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation, with_slope
+from pimper_torch.ground.linalg.robust import (
+    CAUCHY_TUNING,
+    cauchy_weights,
+    robust_deviation,
+    with_slope,
+)
 from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record, Views

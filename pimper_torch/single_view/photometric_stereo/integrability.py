@@ -21,8 +21,7 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
-from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 

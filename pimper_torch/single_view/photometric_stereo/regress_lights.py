@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING
-from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation
+from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.method.photometry.bilinear import Factors
 from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
