@@ -37,9 +37,8 @@ class Output:
       whether an earlier run found the record; time and memory are that run's then.
     - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
       ``needed``, ``advice``.
-    - ``object-begin``, of ``batch``: ``name``, ``place``. ``object-stage``: ``name``, ``stage``,
-      ``seconds_left``. ``object-end``: ``name``, ``status``, ``message``, ``place``, ``tries``,
-      ``seconds``, and ``again``, whether it is tried again.
+    - ``object-end``, of ``batch``: ``name``, ``status``, ``message``, ``place``, ``seconds``,
+      ``tries``.
     - ``result``: ``paths`` by name, and figures of the command.
     - ``error``: ``kind``, ``message``, ``exit_code``; it is the last one then.
 

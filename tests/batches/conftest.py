@@ -33,7 +33,7 @@ class World:
 
     def batch(self, **options):
         """Carry out the batch, and give the outcomes by their names."""
-        found = batch(self.folder / "scans", self.out, listener=self, **options)
+        found = batch(self.folder / "scans", self.out, listener=self.heard.append, **options)
         return {one.name: one for one in found}
 
     def statuses(self, **options) -> dict[str, str]:
@@ -44,17 +44,12 @@ class World:
         path = self.out / f"{name}.begun"
         return len(path.read_text()) if path.exists() else 0
 
-    def progressed(self, name, event):
-        self.heard.append((name, event["event"], event.get("stage", event.get("place"))))
-
-    def settled(self, outcome, again):
-        self.heard.append((outcome.name, outcome.status, again))
-
 
 @pytest.fixture
 def world(tmp_path, monkeypatch):
     assert sys.platform == "linux"
     monkeypatch.setattr(task, "_CHILD", CHILD)
+    monkeypatch.setattr(task, "_TRIES", 2)
     monkeypatch.setattr(task, "_LOOK_SECONDS", 0.05)
     monkeypatch.setattr(task, "_PATIENCE_SECONDS", 0.3)
     return World(tmp_path)

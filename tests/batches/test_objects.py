@@ -29,15 +29,6 @@ def test_a_folder_of_folders_has_an_object_each(scans):
     ]
 
 
-def test_a_pattern_names_objects_by_what_it_leaves_open(tmp_path):
-    for path in ("may/cup/photos", "may/ball/photos", "june/cup/photos", "june/notes"):
-        (tmp_path / path).mkdir(parents=True)
-    (tmp_path / "july.txt").touch()
-    assert names(f"{tmp_path}/may/*/photos") == ["ball", "cup"]
-    assert names(f"{tmp_path}/*/*/photos") == ["june-cup", "may-ball", "may-cup"]
-    assert names(f"{tmp_path}/[jm]*") == ["june", "may"]
-
-
 def test_a_table_has_settings_in_every_row(scans, tmp_path):
     (tmp_path / "mine.yaml").write_text("scales: [0.5]\n")
     table = tmp_path / "list.csv"
@@ -115,5 +106,5 @@ def test_a_wrong_setting_is_refused_by_its_row_before_anything_starts(world, sca
 def test_settings_of_all_come_before_those_of_a_row(world, scans):
     table = world.folder / "list.csv"
     table.write_text("photos,faces\nscans/cup,500\n")
-    (task,) = planned_batch(read_objects(table), world.out, ("--faces", "9", "--stl")).tasks
+    (task,) = planned_batch(read_objects(table), world.out, ("--faces", "9", "--stl"))
     assert task.arguments[4:] == ("--faces", "9", "--stl", "--faces", "500", "--json")

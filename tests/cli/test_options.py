@@ -37,8 +37,7 @@ RUNS = {
         "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25",
     ],
     "batch": [
-        "{table} --out {out} --jobs 1 --tries 2 --time-limit 30 --mem-gb 2 --cpus-per-task 1 "
-        "--overwrite",
+        "{table} --out {out} --jobs 1 --time-limit 30 --mem-gb 2 --cpus-per-task 1 --overwrite",
         "{table} -o {out} --timeout-min 30 --dask {scheduler}",
         "{table} -o {out} --slurm part",
     ],

@@ -1,7 +1,6 @@
-"""The objects of a batch: a folder of folders, a pattern of folders, or a table."""
+"""The objects of a batch: a folder of folders, or a table."""
 
 import csv
-import glob
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,6 @@ from pimper_torch.runtime.errors import ConfigError, InputError, some
 CSV, HTML = "batch.csv", "batch.html"
 
 _PATHS = ("DIR", "FILE", "PATH")
-_WILD = re.compile(r"[*?[]")
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 
 
@@ -47,30 +45,34 @@ class Object:
 
 
 def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Object]:
-    """List the objects of a folder, a pattern, a table, or of folders in turn.
+    """List the objects of a folder, of a table, or of folders in turn.
 
     Args:
-        given: A folder of folders, each with photographs or with a folder ``photos``; a pattern
-            such as ``scans/*/photos``; a CSV file whose columns are ``photos``, ``name`` and
-            options of ``pimper reconstruct`` without dashes; or several objects or folders.
+        given: A folder of folders, each with photographs or with a folder ``photos``; a CSV file
+            whose columns are ``photos``, ``name`` and options of ``pimper reconstruct`` without
+            dashes; or several objects or folders.
     """
     if not isinstance(given, Path | str):
         found = [one if isinstance(one, Object) else _in_folder(Path(one)) for one in given]
-        return _distinct(found, "the list")
-    path = Path(given)
-    if path.is_dir():
-        folders = (one for one in sorted(path.iterdir()) if not one.name.startswith("."))
+    elif Path(given).is_dir():
+        folders = (one for one in sorted(Path(given).iterdir()) if not one.name.startswith("."))
         found = [_in_folder(one) for one in folders if one.is_dir()]
-    elif path.suffix.lower() == ".csv":
-        found = _in_table(path)
     else:
-        found = _by_pattern(str(given))
+        found = _in_table(Path(given))
+    where = str(given) if isinstance(given, Path | str) else "the list"
     if not found:
         raise InputError(
-            f"{given}: no objects; needed: a folder of folders of photographs, a pattern of such "
-            "folders in quotes ('scans/*/photos'), or a CSV file with a column `photos`."
+            f"{where}: no objects; needed: a folder of folders of photographs, or a CSV file with "
+            "a column `photos`."
         )
-    return _distinct(found, str(given))
+    counts = Counter(one.name.casefold() for one in found)  # which some disks do not tell apart
+    same = [f"{one.photos} ({one.name})" for one in found if counts[one.name.casefold()] > 1]
+    if same:
+        raise InputError(
+            f"{where}: several objects have one name: {some(same)}; needed: a name each. Give a "
+            "CSV file with a column `name`."
+        )
+    return found
 
 
 def _in_folder(folder: Path) -> Object:
@@ -78,26 +80,14 @@ def _in_folder(folder: Path) -> Object:
     return Object(name=folder.resolve().name, photos=inner if inner.is_dir() else folder)
 
 
-def _by_pattern(pattern: str) -> list[Object]:
-    """Name folders by the parts of their paths from the first wildcard to the last."""
-    parts = Path(pattern).parts
-    wild = [place for place, part in enumerate(parts) if _WILD.search(part)]
-    if not wild:
-        return []
-    after = len(parts) - 1 - wild[-1]
-    found = []
-    for path in sorted(map(Path, glob.glob(pattern, recursive=True))):  # noqa: PTH207 - absolute, too
-        if path.is_dir():
-            name = "-".join(path.parts[wild[0] : len(path.parts) - after])
-            found.append(Object(name=name, photos=path))
-    return found
-
-
 def _in_table(path: Path) -> list[Object]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); needed: CSV in UTF-8.") from error
+        raise InputError(
+            f"{path}: cannot be read ({error}); needed: a folder of folders of photographs, or a "
+            "CSV file in UTF-8."
+        ) from error
     lines = text.splitlines()
     head = lines[0] if lines else ""
     delimiter = ";" if ";" in head and "," not in head else ","
@@ -150,15 +140,3 @@ def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list
 def _kinds() -> dict[str, str]:
     """Return what follows every option of ``pimper reconstruct``, of any preset."""
     return {name: one.value for one in every_option("reconstruct") for name in one.names}
-
-
-def _distinct(found: list[Object], where: str) -> list[Object]:
-    counts = Counter(one.name.casefold() for one in found)  # which some disks do not tell apart
-    twice = [one for one in found if counts[one.name.casefold()] > 1]
-    if twice:
-        same = [f"{one.photos} ({one.name})" for one in twice]
-        raise InputError(
-            f"{where}: several objects have one name: {some(same)}; needed: a name each. Give a "
-            "CSV file with a column `name`."
-        )
-    return found

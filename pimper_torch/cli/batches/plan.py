@@ -3,7 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
@@ -24,33 +24,20 @@ _REPLACES = "--overwrite"
 _PATIENCE, _LEAST_S = 10.0, 3600.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """The tasks of a batch.
-
-    Attributes:
-        settled: Objects that are not begun: whole already, or refused.
-    """
-
-    tasks: tuple[Task, ...]
-    settled: tuple[Outcome, ...]
-
-
 def planned_batch(
     objects: Sequence[Object],
     out: Path,
     settings: Sequence[str] = (),
     *,
     overwrite: bool = False,
-    limit_s: float | None = None,
-    mem_gb: float | None = None,
-) -> Plan:
+) -> list[Task | Outcome]:
     """Check every object as ``pimper reconstruct`` would, and estimate what it takes.
 
     Args:
         settings: Options of ``pimper reconstruct`` for every object; its own come after them.
-        limit_s: Seconds that a try may take; by the estimate unless given.
-        mem_gb: Memory that a run takes; the estimate unless given.
+
+    Returns:
+        A task for each object; its outcome where it is not begun: whole already, or refused.
     """
     out = out.absolute()
     read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
@@ -68,9 +55,8 @@ def planned_batch(
                 arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
                 out=target,
                 key=_key(own, inputs_of(job).values()),
-                limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
-                mem_gb=mem_gb or gigabytes,
-                threads=1,
+                limit_s=max(_LEAST_S, _PATIENCE * seconds),
+                mem_gb=gigabytes,
             )
             if is_whole(task):
                 return Outcome(name=thing.name, status="kept")
@@ -83,11 +69,7 @@ def planned_batch(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # each run warns of its own
-        found = [one(thing) for thing in objects]
-    return Plan(
-        tasks=tuple(each for each in found if isinstance(each, Task)),
-        settled=tuple(each for each in found if isinstance(each, Outcome)),
-    )
+        return [one(thing) for thing in objects]
 
 
 def runs_at_once(gigabytes: Sequence[float]) -> int:

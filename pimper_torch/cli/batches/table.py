@@ -1,11 +1,13 @@
-"""The table of a batch: as CSV, as a page with pictures, and in a terminal."""
+"""The table of a batch, as CSV and as a page with pictures."""
 
 import csv
 import html
 import io
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from dataclasses import asdict
+from pathlib import Path
+from urllib.parse import quote
 
 from pimper_torch.cli.batches.objects import CSV, HTML
 from pimper_torch.cli.batches.task import Outcome
@@ -29,70 +31,38 @@ img {{ width: 240px }} .failed, .lost {{ color: #b00 }}
 """
 
 
-def rows_of(
-    outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]
-) -> list[dict[str, object]]:
-    """Return a row an object, by its columns: how it ended, and figures of its result."""
-    rows = []
-    for one in outcomes:
-        row: dict[str, object] = {}
-        if one.status in ("ended", "kept"):
-            summary = json.loads((out / one.name / "summary.json").read_text(encoding="utf-8"))
-            row = {name: summary.get(name, "") for name in _COLUMNS}
-        row |= {"name": one.name, "status": one.status, "tries": one.tries, "place": one.place}
-        row |= {"message": one.message, "photographs": str(photos[one.name])}
-        row["seconds"] = round(one.seconds or float(str(row.get("seconds") or 0)), 1)
-        rows.append(row)
-    return rows
-
-
-def terminal(out: Path) -> str:
-    """Read a batch's table, and return it without messages and paths, in columns."""
-    with (out / CSV).open(encoding="utf-8", newline="") as file:
-        rows = [*csv.DictReader(file)]
-    names = ("name", "status", "tries", "seconds", "registered", "faces")
-    cells = [names, *([row[name] for name in names] for row in rows)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
-    lines = (
-        "  ".join(
-            cell.ljust(width) if column < 2 else cell.rjust(width)  # numbers to the right
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in cells
-    )
-    return "\n".join(lines)
-
-
-def write_table(rows: Sequence[Mapping[str, object]], out: Path) -> None:
+def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
     """Write ``batch.csv`` and ``batch.html``, with pictures that link to the objects' reports."""
+    rows = [_row(one, out) | {"photographs": str(photos[one.name])} for one in outcomes]
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, _COLUMNS, restval="")
     table.writeheader()
     table.writerows(rows)
-    ended = sum(row["status"] in ("ended", "kept") for row in rows)
+    ended = sum(one.status in ("ended", "kept") for one in outcomes)
     head = "".join(f"<th>{name.replace('_', ' ')}</th>" for name in ("", *_COLUMNS))
-    body = "\n".join(f"<tr>{_picture(row, out)}{_cells(row)}</tr>" for row in rows)
-    page = _PAGE.format(
-        title=f"{ended} of {len(rows)} objects", sign=SIGNS[HTML], rows=f"<tr>{head}</tr>\n{body}"
-    )
+    lines = [f"<tr>{head}</tr>", *(f"<tr>{_cells(row, out)}</tr>" for row in rows)]
+    title = f"{ended} of {len(rows)} objects"
+    page = _PAGE.format(title=title, sign=SIGNS[HTML], rows="\n".join(lines))
     for name, content in ((CSV, text.getvalue()), (HTML, page)):
         with file_written_whole(out / name) as fresh:
             fresh.write_text(content, encoding="utf-8", newline="")
 
 
-def _picture(row: Mapping[str, object], out: Path) -> str:
-    name = str(row["name"])
-    picture, report = (out / name / file for file in ("overview.png", "report.html"))
-    if not picture.exists():
-        return "<td></td>"
-    target, source = (
-        PurePosixPath("/", name, path.name).as_uri().removeprefix("file:///")
-        for path in (report if report.exists() else picture, picture)
-    )
-    return f'<td><a href="{target}"><img loading="lazy" src="{source}" alt=""></a></td>'
+def _row(one: Outcome, out: Path) -> dict[str, object]:
+    """Return how an object ended and figures of its result, by column."""
+    row: dict[str, object] = {}
+    if one.status in ("ended", "kept"):
+        summary = json.loads((out / one.name / "summary.json").read_text(encoding="utf-8"))
+        row = {name: summary.get(name, "") for name in _COLUMNS}
+    seconds = round(one.seconds or float(str(row.get("seconds") or 0)), 1)
+    return row | asdict(one) | {"seconds": seconds}
 
 
-def _cells(row: Mapping[str, object]) -> str:
+def _cells(row: Mapping[str, object], out: Path) -> str:
+    folder, link = out / str(row["name"]), quote(str(row["name"]))
+    target = "report.html" if (folder / "report.html").exists() else "overview.png"
+    shown = f'<a href="{link}/{target}"><img loading="lazy" src="{link}/overview.png" alt=""></a>'
+    picture = shown if (folder / "overview.png").exists() else ""
     status = html.escape(str(row["status"]))
-    cells = (html.escape(str(row.get(name, ""))) for name in _COLUMNS)
-    return "".join(f'<td class="{status}">{cell}</td>' for cell in cells)
+    cells = (html.escape(str(row.get(column, ""))) for column in _COLUMNS)
+    return f"<td>{picture}</td>" + "".join(f'<td class="{status}">{cell}</td>' for cell in cells)

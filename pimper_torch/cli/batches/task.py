@@ -2,8 +2,8 @@
 
 A worker starts ``pimper reconstruct`` as a process of its own, so that a run that is killed, hangs
 or takes all memory leaves the worker unharmed. All that driver and workers share is the folder of
-the batch. There, in ``.stages``, an object has a lease with the token of the newest try, which any
-other try ends at; a log with the events of its runs; and the key of what its result is made from.
+the batch. There, in ``.stages``, an object has a log with the events of its runs, and the key of
+what its result is made from. The lock is that of the result's folder, and is never taken away.
 """
 
 import json
@@ -11,20 +11,24 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from platform import node
-from typing import IO, Any, Literal
-
-from filelock import FileLock, Timeout
+from textwrap import shorten
+from typing import IO, Literal
 
 from pimper_torch.cli.deaths import what_killed
 from pimper_torch.doors.outputs.marker import MARKER, STAGES
-from pimper_torch.doors.outputs.stages import HOLDER, LOCK
+from pimper_torch.doors.outputs.stages import locked
+from pimper_torch.runtime.errors import OutputError
 
 Status = Literal["ended", "failed", "lost", "kept", "waiting"]
+
+STOPPED: set[Path] = set()
+"""Folders of batches that were interrupted: their runs in this process end."""
 
 # What a child runs: it ends when its parent does, and then is `pimper`.
 _CHILD = """
@@ -38,11 +42,10 @@ sys.exit(main(supervised=True))
 """
 # Of errors that another worker, with more memory, may not make.
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
+_TRIES = 3
 _LOOK_SECONDS = 0.5
 # A choice: a stage's step is longer in large runs, which are killed then; their stages are kept.
 _PATIENCE_SECONDS = 10.0
-# The lock of a try that does not see its lease withdrawn in this time is taken from it.
-_SILENCE_SECONDS = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +56,6 @@ class Task:
         arguments: Of ``pimper reconstruct``, with absolute paths.
         key: Hash of the arguments and of all files that are read.
         limit_s: Seconds after which a try is ended.
-        avoid: Workers on which earlier tries were lost.
     """
 
     name: str
@@ -62,18 +64,16 @@ class Task:
     key: str
     limit_s: float
     mem_gb: float
-    threads: int
-    token: str = ""
-    avoid: tuple[str, ...] = ()
+    threads: int = 1
 
     def beside(self, suffix: str) -> Path:
         """Return a file of the object in ``.stages`` of the batch."""
         return self.out.parent / STAGES / f"{self.name}{suffix}"
 
     @property
-    def log(self) -> Path:
-        """The events of all tries, a JSON object a line, among what else their runs said."""
-        return self.beside(".jsonl")
+    def stopped(self) -> bool:
+        """Whether the batch was interrupted in this process."""
+        return self.out.parent in STOPPED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,31 +82,49 @@ class Outcome:
 
     Attributes:
         status: ``ended`` with a result; ``failed`` by itself, as it will anywhere; ``lost``, as
-            another worker may not; ``kept``, as the result was whole before; ``waiting`` where no
+            another try may not; ``kept``, as the result was whole before; ``waiting`` where no
             try was begun.
         message: Why there is no result.
-        stage: That was under way at the end.
+        place: Host of the worker.
     """
 
     name: str
     status: Status
     message: str = ""
     place: str = ""
-    stage: str = ""
     seconds: float = 0.0
     tries: int = 0
 
 
-def carry_out(task: Task, place: str = "") -> Outcome:
-    """Reconstruct an object in a child process, which writes its events to the task's log.
+def carry_out(task: Task, attempt: Callable[[Task], Outcome] | None = None) -> Outcome:
+    """Reconstruct an object, again where a run is lost.
 
     Args:
-        place: Name of the worker; the host's unless given.
+        attempt: Carries out one try; :func:`attempted` unless given.
     """
-    began, place = time.monotonic(), place or node()
-    status, message = _result(task, place, began + task.limit_s)
+    for number in count(1):
+        try:
+            outcome = (attempt or attempted)(task)
+        except Exception as error:
+            outcome = lost(task, error)
+        if outcome.status != "lost" or number == _TRIES or task.stopped:
+            break
+    return replace(outcome, tries=number)
+
+
+def lost(task: Task, error: Exception) -> Outcome:
+    """Return the outcome of a task whose engine or worker raised an error."""
+    reason = f"{type(error).__name__}: {shorten(str(error), 300, placeholder=' ...')}"
+    message = f"its worker was lost, or cannot carry it out ({reason.rstrip('.: ')})."
+    return Outcome(name=task.name, status="lost", message=message)
+
+
+def attempted(task: Task) -> Outcome:
+    """Try once, in a child process that writes its events to the task's log."""
+    began = time.monotonic()
+    status, message = _tried(task, began + task.limit_s)
     seconds = time.monotonic() - began
-    return Outcome(name=task.name, status=status, message=message, place=place, seconds=seconds)
+    return Outcome(name=task.name, status=status, message=message, place=node(), seconds=seconds)
 
 
 def is_whole(task: Task) -> bool:
@@ -121,48 +139,44 @@ def is_whole(task: Task) -> bool:
     return False
 
 
-def events(file: IO[bytes]) -> Iterator[dict[str, Any]]:
-    """Read events from where a log is open; what else stands there is passed over."""
-    while (line := file.readline()).endswith(b"\n"):
-        with suppress(ValueError):
-            event = json.loads(line)
-            if isinstance(event, dict) and "event" in event:
-                yield event
-    file.seek(-len(line), os.SEEK_CUR)  # a line that is being written
-
-
-def _result(task: Task, place: str, latest: float) -> tuple[Status, str]:
-    with task.log.open("ab+") as log:
-        begun = log.seek(0, os.SEEK_END)
-        refused = _wait_for_lock(task, log, latest)
-        if refused is not None:
-            return "lost", refused
-        if is_whole(task):
-            return "kept", ""
-        key = task.beside(".key")
-        if not (key.exists() and key.read_text(encoding="utf-8") == task.key):
-            key.write_text(task.key, encoding="utf-8")
-        child = _start(task, log)
-        begins = {"event": "try", "place": place, "host": node(), "process": child.pid}
-        log.write(json.dumps(begins).encode() + b"\n")
-        log.flush()
+def _tried(task: Task, latest: float) -> tuple[Status, str]:
+    patient = time.monotonic() + _PATIENCE_SECONDS  # with a run whose worker has just died
+    while True:
         try:
-            reason = _wait(task, child, latest)
+            with locked(task.out, task.out):
+                if is_whole(task):
+                    return "kept", ""
+                key = task.beside(".key")
+                if not (key.exists() and key.read_text(encoding="utf-8") == task.key):
+                    key.write_text(task.key, encoding="utf-8")
+            break
+        except OutputError as error:  # another run holds it: that is said, and nothing taken away
+            if time.monotonic() > patient:
+                return "waiting", f"not begun: {error}"
+            time.sleep(_LOOK_SECONDS)
+    with task.beside(".jsonl").open("ab+") as log:
+        begun = log.seek(0, os.SEEK_END)
+        child = _started(task, log)
+        try:
+            while child.poll() is None and not task.stopped and time.monotonic() < latest:
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(_LOOK_SECONDS)
+            code = child.poll()
         finally:
             _end(child)
-        if reason is not None:
-            return "lost", reason
         log.seek(begun)
-        errors = [one for one in events(log) if one["event"] == "error"]
-    if child.returncode == 0:
+        errors = [json.loads(line) for line in log if line.startswith(b'{"event": "error"')]
+    if code == 0:
         return "ended", ""
-    if child.returncode not in (1, 2) or not errors:
-        return "lost", what_killed(child.returncode)
-    message, kind = str(errors[-1]["message"]), errors[-1]["kind"]
-    return ("lost" if kind in _OF_MEMORY else "failed"), message
+    if code is None:
+        limit = f"it took longer than {task.limit_s / 60:.0f} minutes (`--time-limit`)."
+        return "lost", "it was stopped." if task.stopped else limit
+    if code not in (1, 2) or not errors:
+        return "lost", what_killed(code)
+    return "lost" if errors[-1]["kind"] in _OF_MEMORY else "failed", str(errors[-1]["message"])
 
 
-def _start(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
+def _started(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
     path = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
         [sys.executable, "-c", _CHILD, str(os.getpid()), *task.arguments],
@@ -180,28 +194,6 @@ def _start(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
     )
 
 
-def _wait(task: Task, child: "subprocess.Popen[bytes]", latest: float) -> str | None:
-    """Wait for a run; return why it is to be ended before its end."""
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(_LOOK_SECONDS)
-            return None
-        if reason := _reason_to_stop(task, latest):
-            return reason
-
-
-def _reason_to_stop(task: Task, latest: float) -> str | None:
-    if time.monotonic() > latest:
-        return f"it took longer than {task.limit_s / 60:.0f} minutes (`--time-limit`)."
-    try:
-        held = task.beside(".lease").read_text(encoding="utf-8")
-    except FileNotFoundError:
-        held = ""
-    except OSError:  # a shared folder that is away for a moment
-        return None
-    return None if held == task.token else "it was stopped."
-
-
 def _end(child: "subprocess.Popen[bytes]") -> None:
     if child.poll() is None:
         child.terminate()
@@ -209,40 +201,3 @@ def _end(child: "subprocess.Popen[bytes]") -> None:
             child.wait(_PATIENCE_SECONDS)
     child.kill()
     child.wait()
-
-
-def _wait_for_lock(task: Task, log: IO[bytes], latest: float) -> str | None:
-    """Wait until no other run holds the folder of the result; return why it cannot be had.
-
-    A try whose lease is withdrawn ends by itself. One that does not, as its machine hangs, loses
-    the lock; what it may write still has the same bits.
-    """
-    lock = task.out / STAGES / LOCK
-    asked = time.monotonic()
-    while lock.exists():
-        try:
-            with FileLock(lock, timeout=0):
-                return None
-        except Timeout:
-            pass
-        except (OSError, NotImplementedError):  # of which the run warns
-            return None
-        if reason := _reason_to_stop(task, latest):
-            return f"another run writes to {task.out}; {reason}"
-        if time.monotonic() - asked > _SILENCE_SECONDS and _is_ours(lock, log):
-            with suppress(OSError):
-                lock.unlink()
-        time.sleep(_LOOK_SECONDS)
-    return None
-
-
-def _is_ours(lock: Path, log: IO[bytes]) -> bool:
-    """Return whether a lock's holder is a run that an earlier try began."""
-    with suppress(OSError):
-        holder = lock.with_name(HOLDER).read_text(encoding="utf-8")
-        log.seek(0)
-        tries = [one for one in events(log) if one["event"] == "try"]
-        return any(
-            holder.startswith(f"process {one['process']} on {one['host']} ") for one in tries
-        )
-    return False

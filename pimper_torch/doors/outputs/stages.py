@@ -65,8 +65,8 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
         with suppress(OSError):
             known = holder.read_text(encoding="utf-8")
         raise OutputError(
-            f"{shown}: another run writes there: {known}. Wait until it has ended, or write "
-            "elsewhere."
+            f"{shown}: another run writes there: {known}. Wait until it has ended, end it where "
+            "it hangs, or write elsewhere."
         ) from error
     except OSError as error:
         raise OutputError(f"{shown}: cannot be locked ({error}). Write elsewhere.") from error
