@@ -1,7 +1,4 @@
-"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way.
-
-A jump of the pictures, in which there is no frame, counts as one distance only.
-"""
+"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -10,7 +7,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from torch import Tensor, cat
+from torch import Tensor
 
 from pimper_torch.runtime.errors import InputError
 
@@ -81,29 +78,19 @@ def chosen(scan: Scan, count: int) -> Int[Tensor, " chosen"]:
     """Choose the sharpest frame of each of equal stretches of the way.
 
     Returns:
-        Numbers of frames, ascending; fewer where others show what these do.
+        Numbers of frames, ascending; fewer where the pictures jump, or others show what these do.
 
     Raises:
-        InputError: Fewer frames than are to be chosen, or nothing moves.
+        InputError: Nothing moves.
     """
     frames, whole = len(scan.way), float(scan.way[-1]) if len(scan.way) else 0.0
-    if frames < count:
-        raise InputError(
-            f"the video has {frames} frames, and {count} are to be chosen. Choose fewer."
-        )
     if whole < 0.1:
         raise InputError(
             f"nothing moves in the {frames} frames of the video (by {whole:.1%} of their width in "
             "all); needed: a camera that goes round the object, or an object that turns."
         )
-    steps = scan.way.double().diff()
-    # A stretch is the largest s with sum(min(step, s)) >= count s, each jump being one: what the
-    # smaller steps leave for each stretch without the j largest, at least. Frames that have moved
-    # by less than a pixel of those that flow is measured in show the same.
-    jumps = cat([steps.new_zeros(1), steps.sort(descending=True).values[: count - 1].cumsum(dim=0)])
-    left = (steps.sum() - jumps).clamp(min=0) / (count - torch.arange(len(jumps)))
-    length = max(float(left.min()), 1 / _WIDTH_PX)
-    place = cat([steps.new_zeros(1), steps.clamp(max=length).cumsum(dim=0)]) / length
+    # Frames that have moved by less than a pixel of those that flow is measured in show the same.
+    place = scan.way.double() / max(whole / count, 1 / _WIDTH_PX)
     # Sums of the length may round down.
     stretch = (place + 1e-6).floor().clamp(max=count - 1)
     middle = (place - stretch - 0.5).abs()

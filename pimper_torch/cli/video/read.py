@@ -1,8 +1,8 @@
 """Frames of a video as they are shown. The only importer of PyAV, an extra."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,19 @@ _LOCAL = {"protocol_whitelist": "file"}
 # Transfer characteristics of ITU-T H.273 whose light is not that of a display of standard range.
 _HIGH_RANGE = {16: "PQ (HDR10, Dolby Vision)", 18: "HLG"}
 
+_CONVERT = (
+    "{}: is interlaced, changes its size, or has pixels that are not square; needed: whole "
+    "pictures of one size. Convert it: "
+    "ffmpeg -i {} -vf bwdif=0,scale=iw*sar:ih,setsar=1 -crf 12 plain.mp4"
+)
+
 
 def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
     """Read the brightness of every frame, in the order in which they are shown, not turned.
 
     Raises:
-        InputError: No video, one that cannot be decoded, or PyAV is not installed.
+        InputError: No video, one that cannot be decoded, whose pixels are not square or whose
+            frames are interlaced, or PyAV is not installed.
     """
     for number, frame in enumerate(_frames(path)):
         if number == 0 and int(frame.color_trc) in _HIGH_RANGE:
@@ -48,11 +55,7 @@ def frame_pictures(
 
 
 def _frames(path: Path) -> Iterator[Any]:
-    """Decode frames to whole pictures of square pixels; no side shrinks.
-
-    The other field is interpolated (Weston 3-field deinterlacing) where a frame is marked as
-    interlaced.
-    """
+    """Decode whole pictures of square pixels and one size; anything else is refused."""
     try:
         import av
     except ImportError as error:
@@ -60,54 +63,27 @@ def _frames(path: Path) -> Iterator[Any]:
             f'{path}: videos are read by PyAV, which is not installed: pip install "pimper_torch'
             '[video]".'
         ) from error
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "nothing"
-        raise InputError(f"{path}: found {found}; needed: a video, such as .mp4 or .mov.")
     try:
         with av.open(str(path), metadata_errors="replace", options=_LOCAL) as container:
             streams = container.streams.video
-            if container.format.name in ("hls", "dash", "concat") or not streams:
-                raise InputError(f"{path}: holds no pictures that move; needed: a video.")
-            yield from _shown(path, container, streams[0])
+            listed = container.format.name in ("hls", "dash", "concat")
+            if listed or not streams or streams[0].codec_context is None:
+                raise InputError(f"{path}: holds no pictures that FFmpeg decodes; needed: a video.")
+            stream = streams[0]
+            stream.thread_type = "AUTO"
+            size, shape = (stream.width, stream.height), stream.sample_aspect_ratio or 1
+            if max(size) > 16_384:
+                raise InputError(f"{path}: is {size}; needed: 16384 pixels a side at most.")
+            for frame in container.decode(stream):
+                same = (frame.width, frame.height) == size
+                if frame.interlaced_frame or shape != 1 or not same:
+                    raise InputError(_CONVERT.format(path, quote(path.name)))
+                yield frame
     except av.error.FFmpegError as error:
         raise InputError(
-            f"{path}: cannot be decoded as a video ({error.strerror}). Copy it again, or convert "
-            "it to MP4 (H.264)."
+            f"{path}: cannot be decoded as a video ({error.strerror}); needed: one such as .mp4 or "
+            ".mov. Copy it again, or convert it to MP4 (H.264)."
         ) from error
-
-
-def _shown(path: Path, container: Any, stream: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
-    from av.filter import Graph
-
-    if stream.codec_context is None:
-        raise InputError(f"{path}: FFmpeg knows no decoder for it. Convert it to MP4 (H.264).")
-    shape = float(stream.sample_aspect_ratio or 1)
-    width, height = round(stream.width * max(shape, 1)), round(stream.height / min(shape, 1))
-    if max(width, height) > 16_384:
-        raise InputError(f"{path}: is {width} x {height}; needed: 16384 pixels a side at most.")
-    stream.thread_type = "AUTO"
-    graph = Graph()
-    for frame in container.decode(stream):
-        if (frame.width, frame.height) != (stream.width, stream.height):
-            raise InputError(f"{path}: its frames change their size; needed: one size.")
-        if not graph.configured:
-            graph.link_nodes(
-                graph.add_buffer(template=frame, time_base=stream.time_base),
-                graph.add("bwdif", "mode=send_frame:deint=interlaced"),
-                graph.add("scale", f"{width}:{height}:flags=lanczos"),
-                graph.add("buffersink"),
-            ).configure()
-        graph.vpush(frame)
-        yield from _pulled(graph)
-    if graph.configured:
-        graph.vpush(None)
-        yield from _pulled(graph)
-
-
-def _pulled(graph: Any) -> Iterator[Any]:  # noqa: ANN401 - untyped
-    with suppress(BlockingIOError, EOFError):  # where it waits for the next frame
-        while True:
-            yield graph.vpull()
 
 
 def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401 - untyped
