@@ -19,8 +19,8 @@ from pimper_torch.ground.radiometry import FROM_FILES, Encoding
 class _Job:
     """Report what is installed here, and whether photographs are fit for a run, in seconds.
 
-    Of photographs: number, sizes, blur, saturation, exposure, lenses, overlap, and an estimate
-    of time and memory; each with what to do. Exit code 2 where a run would be refused.
+    Of photographs: number, sizes, blur, saturation, exposure, overlap, and an estimate of time
+    and memory; each with what to do. Exit code 2 where a run would be refused.
 
     Attributes:
         photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.

@@ -149,13 +149,11 @@ def _read(job: Job) -> Views:
 
 def _examine(job: Job, views: Views) -> None:
     """Warn of what `pimper doctor` finds without comparing what photographs show."""
-    config, own = job.config, set()
-    if job.inputs.sparse is not None or config.reconstruct.shared_camera:
-        own.add("lenses")
-    if not isinstance(config, CoarseToFineConfig) or config.scales[-1] < 1:
-        own.add("cost")  # which is that of `default`
+    config = job.config
+    # The estimate is that of `default`.
+    dear = isinstance(config, CoarseToFineConfig) and config.scales[-1] >= 1
     for finding in examine_views(views):
-        if finding.severity == "warning" and finding.check not in own:
+        if finding.severity == "warning" and (dear or finding.check != "cost"):
             caution(f"{job.photos}: {finding}", stacklevel=2)
 
 

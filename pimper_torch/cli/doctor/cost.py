@@ -1,6 +1,6 @@
 """Estimates of a run's time and memory."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from pimper_torch.cli.doctor.findings import Finding
@@ -70,29 +70,16 @@ def planned(
     return [*stages, ("extract", 0.5 + 18.0 * one * scales[-1] ** 2), *finish]
 
 
-def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Iterator[Finding]:
+def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Finding:
     """Report the estimate, and whether the memory is there."""
-    if not photographs:
-        return
     megapixels = sum(one.width * one.height for one in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
     told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
-    if (disk := 0.045 * megapixels) > needed:  # photographs twice, masks and pyramids
-        told = f"{told}; {disk:.0f} GB of disk for temporary files"
     if available_gb is None or needed <= available_gb:
-        yield Finding("cost", "ok", told)
-        return
-    longest = max(max(one.width, one.height) for one in photographs)
-    fits = max(0.0, (0.9 * available_gb - _GB) / _GB_A_MEGAPIXEL_OF_ONE) * len(photographs)
-    size = int(longest * min(1.0, fits / megapixels) ** 0.5) // 50 * 50
-    smaller = f"Give `--max-size-px {size}`, or fewer photographs."
-    yield Finding(
-        "cost",
-        "warning",
-        f"{told}; {available_gb:.1f} GB are free",
-        "as much memory as the run takes",
-        smaller if size else "Free memory, or take fewer photographs.",
-    )
+        return Finding("cost", "ok", told)
+    found = f"{told}; {available_gb:.1f} GB are free"
+    advice = "Shrink the photographs (`--max-size-px`), take fewer, or free memory."
+    return Finding("cost", "warning", found, "as much memory as the run takes", advice)
 
 
 def minutes(seconds: float) -> str:

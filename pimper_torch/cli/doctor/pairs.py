@@ -1,6 +1,6 @@
 """Overlap of photographs, by features of small copies."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -20,24 +20,20 @@ from pimper_torch.runtime.errors import some
 
 def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[VerifiedPair]:
     """Match small copies with one another; pairs that have nothing in common are left out."""
-    large = [index for index, copy in enumerate(copies) if min(copy.shape) >= SMALLEST_PX]
-    if len(large) < 2:
+    count, shapes = len(copies), [copy.shape for copy in copies]
+    if count < 2 or min(map(min, shapes)) < SMALLEST_PX:  # which a run refuses
         return []
-    height, width = (max(copies[index].shape[axis] for index in large) for axis in (0, 1))
-    padded = [
-        pad(copies[index], (0, width - copies[index].shape[1], 0, height - copies[index].shape[0]))
-        for index in large
-    ]
+    height, width = (max(sides) for sides in zip(*shapes, strict=True))
+    padded = [pad(copy, (0, width - copy.shape[1], 0, height - copy.shape[0])) for copy in copies]
     views = Views(
         images=torch.stack(padded)[:, None],
-        sizes_px=torch.tensor([copies[index].shape[::-1] for index in large]),
-        names=tuple(map(str, large)),
+        sizes_px=torch.tensor([shape[::-1] for shape in shapes]),
+        names=tuple(map(str, range(count))),
         masks=None,
-        focals_px=torch.full((len(large),), torch.nan),
+        focals_px=torch.full((count,), torch.nan),
     )
     settings = ReconstructConfig(peak_threshold=0.004, max_features=1500, affine_shape=False)
     # Those next to one another first: round a turntable the last is by the first.
-    count = len(large)
     pairs = sorted(
         all_pairs(count), key=lambda pair: min(pair[1] - pair[0], count - pair[1] + pair[0])
     )
@@ -45,17 +41,12 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Verifi
         find_features(space, settings, [None] * count, range(count))
         # Of 40 photographs all pairs; fewer verified matches come about by chance.
         match_pairs(space, pairs[:800], settings, 12)
-        return [
-            pair.replace(views=(large[pair.views[0]], large[pair.views[1]]))
-            for pair in verified_pairs(space)
-        ]
+        return verified_pairs(space)
 
 
-def overlap(names: Sequence[str], matches: Sequence[VerifiedPair]) -> Iterator[Finding]:
-    """Return whether matches connect all photographs."""
+def overlap(names: Sequence[str], matches: Sequence[VerifiedPair]) -> Finding:
+    """Report whether matches connect all photographs."""
     count = len(names)
-    if count < 2:
-        return
     links = np.array([pair.views for pair in matches], dtype=np.int64).reshape(-1, 2)
     usual = sorted(np.bincount(links.flatten(), minlength=count))[count // 2]
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count))
@@ -64,9 +55,8 @@ def overlap(names: Sequence[str], matches: Sequence[VerifiedPair]) -> Iterator[F
     apart = [name for name, one in zip(names, group, strict=True) if one != largest]
     found = f"each photograph matches {usual} others in the median"
     if not apart:
-        yield Finding("overlap", "ok", f"{found}, all of them connected")
-        return
-    yield Finding(
+        return Finding("overlap", "ok", f"{found}, all of them connected")
+    return Finding(
         "overlap",
         "warning",
         f"{found}; {len(apart)} of {count} are not connected with the rest: {some(apart, 4)}",

@@ -82,7 +82,6 @@ class Photograph(Record):
 
     Attributes:
         width: As a run would take it, in pixels.
-        focal_px: By EXIF; NaN where it does not say.
         bright: Radiance that a hundredth of the pixels exceed; 1 is saturation.
         blur_px: Standard deviation of the blur at the strongest edges; NaN where there are none.
         small: Mean of the colours in a small copy.
@@ -91,7 +90,6 @@ class Photograph(Record):
     name: str
     width: int
     height: int
-    focal_px: float
     saturated: float
     bright: float
     blur_px: float
@@ -101,7 +99,6 @@ class Photograph(Record):
 def summarize(
     name: str,
     radiance: Float[Tensor, "channel height width"],
-    focal_px: float,
     mask: Bool[Tensor, "height width"] | None = None,
 ) -> Photograph:
     """Make the numbers and the small copy of linear radiance; saturation counts in the mask."""
@@ -117,7 +114,6 @@ def summarize(
         name=name,
         width=width,
         height=height,
-        focal_px=focal_px,
         saturated=float(counted.sum()) / max(1, counted.numel()),
         bright=float(highest.flatten().kthvalue(math.ceil(0.99 * highest.numel())).values),
         blur_px=edge_blur_px(radiance.mean(dim=0)),
@@ -131,9 +127,8 @@ def of_views(views: Views) -> list[Photograph]:
     def one(index: int) -> Photograph:
         width, height = views.sizes_px[index].tolist()
         image = views.images[index, :, :height, :width].detach().cpu().float()
-        focal = math.nan if views.focals_px is None else float(views.focals_px[index])
         mask = None if views.masks is None else views.masks[index, :height, :width].cpu()
-        return summarize(views.names[index], image, focal, mask)
+        return summarize(views.names[index], image, mask)
 
     with torch.no_grad():
         return list(side_by_side(one, range(views.num_views), tracked=False))
