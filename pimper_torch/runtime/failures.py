@@ -104,6 +104,12 @@ def skipped_patches(
     )
 
 
+def skipped_solver(stage: str, name: str, error: BaseException, done: str) -> None:
+    """Note equations without a solution; see :func:`skipped`."""
+    reason = reason_of(error)
+    skipped(Failure(stage=stage, what="solver", name=name, reason=reason, done=done), error=error)
+
+
 def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:
     """List each failure once, in an order that threads do not change."""
     return tuple(sorted({one for one in entries if isinstance(one, Failure)}, key=_order))
@@ -140,9 +146,7 @@ def solved_or(
     except Exception as error:
         if not by_data(error):
             raise
-        reason = reason_of(error)
-        failure = Failure(stage=stage, what="solver", name=name, reason=reason, done=done)
-        skipped(failure, error=error)
+        skipped_solver(stage, name, error, done)
     return otherwise()
 
 

@@ -165,8 +165,10 @@ def put_in_place(target: Path) -> None:
             (target / MARKER).replace(stages / MARKER)
         former = read_marker(stages)
         for path in sort_out(target, former)[0] if former else ():
-            with suppress(OSError):  # a folder in which is something else
-                path.rmdir() if path.is_dir() else path.unlink()
+            if not path.is_dir():
+                path.unlink()
+            elif not any(path.iterdir()):
+                path.rmdir()
         (stages / MARKER).unlink(missing_ok=True)
         for path in sorted(new.iterdir()):
             if path.name != MARKER:

@@ -15,8 +15,7 @@ from pimper_torch.ground.linalg.prepared import (
 )
 from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.ground.linalg.sums import total
-from pimper_torch.records.failure import Failure
-from pimper_torch.runtime.failures import reason_of, skipped
+from pimper_torch.runtime.failures import skipped_solver
 from pimper_torch.runtime.parallel import over_rows
 
 # At this size a factor takes three times as long to make as a hierarchy, and a third as long to
@@ -115,8 +114,7 @@ def solve_compressed(
 def _by_factor(what: str, error: SingularSystemError) -> None:
     """Note that multigrid did not converge."""
     done = "It is solved by a Cholesky factor instead, which takes more time and memory"
-    failure = Failure(stage="linalg", what="solver", name=what, reason=reason_of(error), done=done)
-    skipped(failure, error=error)
+    skipped_solver("linalg", what, error, done)
 
 
 def _like_a_laplacian(

@@ -25,8 +25,8 @@ from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.linalg.systems import solutions, solve_compressed
 from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.records import Failure, Record
-from pimper_torch.runtime.failures import reason_of, skipped
+from pimper_torch.records import Record
+from pimper_torch.runtime.failures import skipped_solver
 
 # Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a
 # spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
@@ -149,14 +149,8 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " v
 
 def _kept(error: SingularSystemError) -> None:
     """Note that a solve failed."""
-    failure = Failure(
-        stage="fuse",
-        what="solver",
-        name="the fusion",
-        reason=reason_of(error),
-        done="The surface is the one before that solve: of the solve before, or of the patches",
-    )
-    skipped(failure, error=error)
+    done = "The surface is the one before that solve: of the solve before, or of the patches"
+    skipped_solver("fuse", "the fusion", error, done)
 
 
 def _solved(
