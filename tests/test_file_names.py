@@ -58,22 +58,25 @@ def test_names_that_are_the_same_byte_for_byte_come_first():
     assert matched(["a_b.jpg", "a b.jpg", "a_b.png", "A_B.jpg"], present) == [1, 0, 3, 2]
 
 
-def test_among_images_of_one_name_those_of_the_photographs_folder_count():
-    present = ["cam1/000.png", "cam2/000.png", "cam1/001.png", "cam2/001.png"]
-    names = ["000.png", "001.png"]
-    assert matched(names, present, "/data/cam1") == [0, 2]
-    assert matched(names, present, "/data/cam2") == [1, 3]
-    assert matched(names, present, "C:\\data\\CAM2") == [1, 3]
-    assert matched(["cam2/001.png", "cam1/001.png"], present, "/data/photos") == [3, 2]
+CAMS = ["cam1/000.png", "cam2/000.png", "cam1/001.png", "cam2/001.png"]
 
 
-def test_folders_agree_from_the_end_of_the_path_on():
-    present = ["left/cam1/0.png", "right/cam1/0.png"]
-    assert matched(["0.png"], present, "/left/right/cam1") == [1]
-
-
-def test_an_image_without_a_folder_comes_before_those_of_folders_that_nothing_names():
-    assert matched(["0.png"], ["cam1/0.png", "0.png"], "/data/photos") == [1]
+@pytest.mark.parametrize(
+    ("wanted", "present", "folder", "places"),
+    [
+        (["000.png", "001.png"], CAMS, "/data/cam1", [0, 2]),
+        (["000.png", "001.png"], CAMS, "/data/cam2", [1, 3]),
+        (["000.png", "001.png"], CAMS, "C:\\data\\CAM2", [1, 3]),
+        (["cam2/001.png", "cam1/001.png"], CAMS, "/data/photos", [3, 2]),
+        (["0.png"], ["left/cam1/0.png", "right/cam1/0.png"], "/left/right/cam1", [1]),
+        (["0.png"], ["cam1/0.png", "0.png"], "/data/photos", [1]),
+        # Of another folder, where some are of the photographs' own.
+        (["000.png", "001.png"], ["cam1/000.png", *CAMS[1::2]], "/data/cam1", [0, None]),
+        (["001.png"], ["cam1/000.png", *CAMS[1::2]], "/data/photos", [2]),
+    ],
+)
+def test_folders_that_agree_from_the_end_of_the_path_on_decide(wanted, present, folder, places):
+    assert matched(wanted, present, folder) == places
 
 
 @pytest.mark.parametrize(
@@ -98,9 +101,3 @@ def test_two_photographs_that_fit_one_image_are_refused_with_both():
 
 def test_an_image_that_is_taken_exactly_is_no_other_photograph_s():
     assert matched(["a.jpg", "A.jpg"], ["a.jpg"]) == [0, None]
-
-
-def test_images_of_another_folder_are_left_where_some_are_of_the_photographs_own():
-    present = ["cam1/000.png", "cam2/000.png", "cam2/001.png"]
-    assert matched(["000.png", "001.png"], present, "/data/cam1") == [0, None]
-    assert matched(["001.png"], present, "/data/photos") == [2]

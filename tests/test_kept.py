@@ -1,7 +1,5 @@
 """Runs that go on where an earlier one ended."""
 
-import warnings
-
 import pytest
 import torch
 from probes import small_scene
@@ -134,27 +132,3 @@ def test_a_store_that_cannot_be_written_ends_no_run(given, whole, tmp_path):
     with pytest.warns(PimperWarning, match=r"cannot be kept there.*Free space"):
         result, _ = run(given, tmp_path / "file" / "folder")
     assert bits(result) == bits(whole[0])
-
-
-def test_damaged_records_are_made_again(given, whole, tmp_path):
-    expected, folder, _ = whole
-    for path in folder.iterdir():
-        data = bytearray(path.read_bytes())
-        data[len(data) * 3 // 4] ^= 16
-        (tmp_path / path.name).write_bytes(data)
-    result, listener = run(given, tmp_path)
-    assert listener.kept == []
-    assert bits(result) == bits(expected)
-
-
-def test_what_was_warned_of_is_warned_of_again(given, tmp_path):
-    for _ in range(2):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            _, listener = run(
-                given, tmp_path, factorize={"min_views": 6, "min_light_variation": 0.9}
-            )
-        messages = {str(one.message) for one in caught if one.category is PimperWarning}
-        assert any("patches keep the normals" in message for message in messages)
-    assert "photometry" in listener.kept
-    assert "photometry" not in listener.done
