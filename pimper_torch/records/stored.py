@@ -58,6 +58,8 @@ def save_record(record: Record, path: str | Path, about: Mapping[str, str] | Non
         if isinstance(leaf, Tensor):
             tensors.setdefault(id(leaf), (pytree.keystr(keys).removeprefix("."), leaf))
     text = as_json(record, {key: name for key, (name, _) in tensors.items()})
+    # What could not be read again is refused here.
+    of_json(json.loads(text), type(record), type(record).__name__, dict(tensors.values()))
     trial = path.with_name(f".{path.name}.new-{secrets.token_hex(4)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -182,7 +184,7 @@ def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa
         case {"tensor": str(name)} if _is_a(hint, AbstractArray | Tensor):
             return name in tensors
         case dict():
-            return _is_a(origin, Mapping)
+            return _is_a(origin, Mapping) and hints[:1] == (str,)
         case list():
             return origin is tuple and (hints[-1:] == (...,) or len(hints) == len(found))
     return type(found) is origin or (type(found) is int and origin is float)

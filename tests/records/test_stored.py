@@ -174,6 +174,9 @@ def test_a_record_on_a_graph_is_saved_without_it(odds, path):
     [
         (lambda: 1, "A file cannot hold a function; needed: records, "),
         (Path("a"), "cannot hold a PosixPath"),
+        ([1], "Odds.many.0 is .1.; needed"),
+        ({1: 2}, "Odds.many.0 is .*; needed"),
+        (records.PatchStatus.FAILED, "Odds.many.0 is 5; needed"),
         (torch.zeros(2, dtype=torch.complex128), "cannot hold a torch.complex128"),
         (torch.eye(2).to_sparse(), "cannot hold a torch.float32 torch.sparse_coo Tensor"),
         (torch.zeros(2, device="meta"), "needed: .* dense tensors with values"),
