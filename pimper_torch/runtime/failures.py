@@ -1,6 +1,6 @@
 """One bad patch, view or solver does not end a run: it is left out, and told at the end.
 
-Only what data can cause is left out: numbers that are not finite, matrices that are singular, and
+Only what data can cause is left out: numbers that are not finite, equations without a solution, and
 input of one part that cannot be used. Other errors are mistakes in a program, or a lack of memory,
 and end the run.
 """
@@ -11,13 +11,11 @@ from dataclasses import replace
 from itertools import groupby
 from typing import TypeVar
 
-import numpy as np
 import torch
 from jaxtyping import Int
 
 from pimper_torch.records.failure import Failure, LeftOut
 from pimper_torch.runtime.errors import (
-    InputError,
     NumericalError,
     OnFailure,
     OutOfMemoryError,
@@ -30,9 +28,6 @@ Result = TypeVar("Result")
 
 # What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
-
-# Torch's own name for it is not typed.
-_LinAlgError: type[Exception] = getattr(torch.linalg, "LinAlgError")  # noqa: B009
 
 
 @contextmanager
@@ -143,9 +138,7 @@ def solved_or(
     """
     try:
         return solve()
-    except Exception as error:
-        if not by_data(error):
-            raise
+    except NumericalError as error:
         skipped_solver(stage, name, error, done)
     return otherwise()
 
@@ -155,18 +148,6 @@ def out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
-
-
-def by_data(error: BaseException) -> bool:
-    """Return whether numbers may have caused an error, rather than a mistake in a program.
-
-    >>> by_data(torch.linalg.LinAlgError("singular")), by_data(KeyError("lights"))
-    (True, False)
-    """
-    numeric = (ArithmeticError, np.linalg.LinAlgError, InputError, NumericalError)
-    # Torch's kernels raise RuntimeError itself; its subclasses but one are of other kinds.
-    of_torch = type(error) in (RuntimeError, _LinAlgError) and not out_of_memory(error)
-    return isinstance(error, numeric) or of_torch
 
 
 def reason_of(error: BaseException) -> str:

@@ -22,7 +22,6 @@ from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.visual_hull import Everywhere, Hull
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
 from pimper_torch.runtime.config import Range, require_ranges
-from pimper_torch.runtime.failures import solved_or
 from pimper_torch.runtime.parallel import num_workers, side_by_side
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -89,13 +88,7 @@ def contour_rays(
     config = config or RayConfig()
 
     def of_view(view: int) -> ContourRays:
-        return solved_or(
-            lambda: _of_view(silhouettes.inside[view], cameras, view, config),
-            lambda: _nothing(cameras),
-            stage="contours",
-            name=f"contours of view {view}",
-            done="The surface is found without these contours",
-        )
+        return _of_view(silhouettes.inside[view], cameras, view, config)
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
     return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])

@@ -1,6 +1,6 @@
 """Depth maps of all views from windows that match, coarse to fine."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -23,7 +23,6 @@ from pimper_torch.method.coarse.window_matching import (
     shifted,
 )
 from pimper_torch.records import Record, SparseScene
-from pimper_torch.runtime.failures import solved_or
 from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
@@ -85,11 +84,10 @@ def depth_maps(
     for factor in config.factors(max(scene.views.images.shape[-2:])):
         level = level_of(scene, factor)
         search = partial(_search, scene, points, level, config, maps[-1] if maps else None)
-        solve = partial(_search_or_nothing, search, scene.views.names, level)
         # Small results among what threads free would keep their memory from being used again.
         fields = zeros((2, *level.tone.shape), level.tone.dtype, level.tone.device)
         found = []
-        for view, one in enumerate(side_by_side(solve, range(scene.cameras.num_views))):
+        for view, one in enumerate(side_by_side(search, range(scene.cameras.num_views))):
             fields[0, view], fields[1, view] = one.inverse_depth, one.score
             found.append(one.replace(inverse_depth=fields[0, view], score=fields[1, view]))
         maps.append(_checked(factor, level, fields, found))
@@ -103,20 +101,6 @@ class _Found(Record):
     score: Float[Tensor, "height width"]
     step: float
     sources: Int[Tensor, " source"]
-
-
-def _search_or_nothing(
-    search: Callable[[int], _Found], names: Sequence[str], level: MatchingLevel, view: int
-) -> _Found:
-    blank = torch.zeros_like(level.tone[view])
-    none = torch.zeros(0, dtype=torch.long, device=blank.device)
-    return solved_or(
-        lambda: search(view),
-        lambda: _Found(inverse_depth=blank, score=blank, step=0.0, sources=none),
-        stage="coarse_surface",
-        name=f"depths of {names[view]}",
-        done="The coarse surface is found without these",
-    )
 
 
 def _search(
