@@ -1,4 +1,4 @@
-"""Fusion by overlapping blocks against fusion of the whole, on a cap of a sphere of 150 facets."""
+"""Fusion by overlapping blocks against fusion of the whole, on a cap of a sphere of 96 facets."""
 
 import pytest
 import torch
@@ -12,12 +12,12 @@ from pimper_torch.records import Mesh
 from tests.fusion.test_sphere import cap_of, free, noisy, off_sphere
 from tests.threads import on_threads
 
-MOST = 900.0
+MOST = 600.0
 
 
 @pytest.fixture(scope="module")
 def cap():
-    return cap_of(5)
+    return cap_of(4)
 
 
 @pytest.fixture(scope="module")

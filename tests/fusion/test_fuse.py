@@ -410,13 +410,14 @@ def unlit(given):
 
 def test_a_guess_that_the_photographs_contradict_is_not_believed_however_sure_it_is(swept):
     lifted, given = swept(0.5)
-    plain = off_plane(lifted, Fuse()(given, FREE)).abs()
+    surface = Fuse()(given, FREE)
+    plain = off_plane(lifted, surface).abs()
     for error_deg in (5.0, 1.0):
         wrong = guessed(lifted, given, lean=0.3, error_deg=error_deg)
         off = off_plane(lifted, Fuse()(wrong, FREE)).abs()
         assert off.quantile(0.9) < plain.quantile(0.9) + 0.05
-        deaf = Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
-        assert torch.equal(deaf.vertices_world, Fuse()(given, FREE).vertices_world)
+    deaf = Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
+    assert torch.equal(deaf.vertices_world, surface.vertices_world)
 
 
 def test_guessed_normals_tell_slopes_where_light_tells_none(swept):

@@ -16,15 +16,7 @@ import trimesh
 from PIL import Image, ImageCms, PngImagePlugin
 
 from pimper_bench.datasets import (
-    read_camera_file,
-    read_colmap,
-    read_diligent,
-    read_idr,
-    read_llff,
     read_rendered,
-    read_transforms,
-    write_colmap,
-    write_idr,
     write_transforms,
 )
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
@@ -43,7 +35,6 @@ from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.io.responses import read_curve
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.colmap import reconstruction_of, write_binary
 from pimper_torch.method.sfm.existing import existing_model
@@ -89,7 +80,6 @@ def make_seeds(root: Path) -> list[Seed]:
         *_models(root / "model"),
         *_tables(root / "table"),
         *_maps(root / "maps"),
-        *_datasets(root / "dataset"),
         *_camera_files(root / "cameras"),
         *_videos(root / "video"),
         _rendered(root / "rendered"),
@@ -287,72 +277,42 @@ def _maps(root: Path) -> list[Seed]:
     return [_alone(root, name, write, read) for name, write in writers.items()]
 
 
-def _datasets(root: Path) -> list[Seed]:
-    views, cameras, points = VIEWS, CAMERAS, _ball().vertices_world
-    write_transforms(views, cameras, root / "transforms", points_world=points)
-    write_idr(views, cameras, root / "idr", points_world=points)
-    write_colmap(views, cameras, root / "colmap", points_world=points)
-    world_from_cam = invert_rigid(cameras.cam_from_world.double()).numpy()
-    for kind in ("llff/images", "meshroom", "metashape/images", "diligent"):
-        (root / kind).mkdir(parents=True)
-        for name in views.names:
-            Image.fromarray(PIXELS).save(root / kind / name)
-    rows, placed = [], []
-    for index, name in enumerate(views.names):
-        pose = world_from_cam[index]
-        columns = np.stack([pose[:3, 1], pose[:3, 0], -pose[:3, 2], pose[:3, 3], [18, 24, 30]], 1)
-        rows.append([*columns.reshape(-1), 1.0, 9.0])
-        text = " ".join(f"{value:.9g}" for value in pose.reshape(-1))
-        placed.append(
-            f'<camera id="{index}" sensor_id="0" label="{name}"><transform>{text}</transform>'
-            "</camera>"
-        )
-    np.save(root / "llff" / "poses_bounds.npy", np.array(rows))
-    sfm = root / "meshroom" / "cameras.sfm"
-    write_sfm(cameras, [f"/x/{name}" for name in views.names], sfm)
-    whole = json.loads(sfm.read_text())
-    for intrinsic in whole["intrinsics"]:
-        intrinsic |= {"distortionType": "radialk3", "distortionParams": ["0.01", "0", "0"]}
-    sfm.write_text(json.dumps(whole))
-    (root / "metashape" / "cameras.xml").write_text(
-        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
-        '<sensor id="0" type="frame"><resolution width="24" height="18"/><calibration type="frame"'
-        ' class="adjusted"><resolution width="24" height="18"/><f>30</f><k1>0.01</k1>'
-        f"</calibration></sensor></sensors><cameras>{''.join(placed)}</cameras></chunk></document>"
-    )
-    lights = "0 0 1\n0.3 0 1\n0 0.3 1\n-0.3 0 1\n"
-    (root / "diligent" / "light_directions.txt").write_text(lights)
-    (root / "diligent" / "light_intensities.txt").write_text("1 1 1\n" * 4)
-    (root / "diligent" / "filenames.txt").write_text("\n".join(views.names))
-    Image.fromarray(MASK).save(root / "diligent" / "mask.png")
-    normals = np.broadcast_to([0.0, 0, 1], (18, 24, 3))
-    scipy.io.savemat(root / "diligent" / "Normal_gt.mat", {"Normal_gt": normals})
-    readers: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-        "transforms": (read_transforms, ("transforms.json",)),
-        "idr": (read_idr, ("cameras.npz",)),
-        "llff": (read_llff, ("poses_bounds.npy",)),
-        "meshroom": (read_camera_file, ("cameras.sfm",)),
-        "metashape": (read_camera_file, ("cameras.xml",)),
-        "colmap": (
-            read_colmap,
-            tuple(f"sparse/0/{part}.bin" for part in ("cameras", "images", "points3D")),
-        ),
-        "diligent": (
-            read_diligent,
-            ("light_directions.txt", "light_intensities.txt", "filenames.txt", "Normal_gt.mat"),
-        ),
-    }
-    return [
-        Seed(f"dataset {name}", root / name, files, read) for name, (read, files) in readers.items()
-    ]
-
-
 def _camera_files(root: Path) -> list[Seed]:
     """Write cameras that come with photographs of other folders, as `--sparse FILE` reads them."""
     K, poses = CAMERAS.intrinsics.numpy(), CAMERAS.cam_from_world.numpy()
+    placed = "".join(
+        f'<camera id="{index}" sensor_id="0" label="{name}"><transform>'
+        f"{' '.join(map(str, np.linalg.inv(pose).reshape(-1)))}</transform></camera>"
+        for index, (name, pose) in enumerate(zip(VIEWS.names, poses, strict=True))
+    )
+    xml = (
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
+        '<sensor id="0" type="frame"><resolution width="24" height="18"/><calibration type="frame"'
+        ' class="adjusted"><resolution width="24" height="18"/><f>30</f><k1>0.01</k1>'
+        f"</calibration></sensor></sensors><cameras>{placed}</cameras></chunk></document>"
+    )
+    names = [f"/x/{name}" for name in VIEWS.names]
+    radial = {"distortionType": "radialk3", "distortionParams": ["0.01", "0", "0"]}
+
+    def meshroom(path: Path) -> None:
+        write_sfm(CAMERAS, names, path)
+        whole = json.loads(path.read_text())
+        whole["intrinsics"] = [one | radial for one in whole["intrinsics"]]
+        path.write_text(json.dumps(whole))
+
+    def idr(path: Path) -> None:
+        last = np.broadcast_to([[[0.0, 0, 0, 1]]], (4, 1, 4))
+        whole = np.concatenate([K @ poses[:, :3], last], axis=1)
+        named = {f"world_mat_{view}": matrix for view, matrix in enumerate(whole)}
+        np.savez(path, **named, **{f"scale_mat_{view}": np.eye(4) for view in range(4)})
+
     writers: dict[str, Callable[[Path], object]] = {
         "turned.npz": lambda path: np.savez(path, K=K, cam_from_world=poses),
         "projections.npz": lambda path: np.savez_compressed(path, P=K @ poses[:, :3]),
+        "idr.npz": idr,
+        "transforms.json": lambda path: write_transforms(VIEWS, CAMERAS, path.parent),
+        "cameras.sfm": meshroom,
+        "cameras.xml": lambda path: path.write_text(xml),
     }
 
     def read(path: Path) -> object:

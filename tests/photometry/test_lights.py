@@ -21,16 +21,6 @@ def data(generator, samples=800, views=9):
     return rho[:, None] * (harmonics(n) @ lights.mT), n, lights, rho
 
 
-def test_lights_are_exact_without_noise_though_half_is_missing(generator):
-    J, n, lights, _ = data(generator)
-    seen = torch.rand(J.shape, generator=generator) > 0.5
-    found = fit_light_field(torch.where(seen, J, torch.nan), seen, n)
-    assert (found.point_light == 0).all()
-    assert_close(
-        found.soft[:, :4], lights, rtol=1e-5, atol=1e-5
-    )  # stops at a relative change of 1e-7
-
-
 def test_lights_survive_a_fifth_of_gross_outliers(generator):
     J, n, lights, _ = data(generator)
     J = J + 0.002 * torch.randn(J.shape, generator=generator, dtype=torch.float64)

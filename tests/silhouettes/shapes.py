@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.method.silhouettes.cuts import Cuts
 from pimper_torch.records import Cameras, Silhouettes
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 120, 100, 180.0, 5.0
@@ -64,6 +65,19 @@ def nearest_to(
     assert best is not None
     assert place is not None
     return best, place
+
+
+def cuts_of(masks: Tensor, margins_px: Tensor, on_plane: bool) -> Cuts:
+    """Cuts of which cues doubt none."""
+    none = torch.zeros(len(masks), dtype=torch.float64)
+    return Cuts(
+        masks=masks,
+        margins_px=margins_px,
+        exposed=none,
+        held=1 + none,
+        on_plane=on_plane,
+        doubted=none > 0,
+    )
 
 
 def ball(points: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.supporting_plane import Plane, fixation
 from pimper_torch.method.silhouettes import cuts, find
-from pimper_torch.method.silhouettes.cues import Cues, SilhouetteDetails, cues_of
-from pimper_torch.method.silhouettes.cuts import Cuts, cuts_of
+from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cuts import cuts_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.method.silhouettes.parallax import (
     plane_agreement,
@@ -18,12 +18,8 @@ from pimper_torch.method.silhouettes.parallax import (
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
-
-SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
-
-
-def overlap(found, truth):
-    return (found & truth).sum(dim=(1, 2)) / (found | truth).sum(dim=(1, 2))
+from tests.silhouettes import shapes
+from tests.silhouettes.conftest import SMALL, overlap
 
 
 def test_a_ball_on_a_table_is_found_in_every_view(staged):
@@ -204,14 +200,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     projections[:, 60:120, 60:180] = 5.0
     masks = torch.zeros_like(staged.truth)
     masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
-    nonsense = Cuts(
-        masks=masks,
-        margins_px=projections,
-        exposed=torch.zeros(12).double(),
-        held=torch.ones(12).double(),
-        on_plane=True,
-        doubted=torch.zeros(12, dtype=torch.bool),
-    )
+    nonsense = shapes.cuts_of(masks, projections, on_plane=True)
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"above the plane.*by {overlap_percent:.0f}%"):
@@ -230,14 +219,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     projections[:, 60:120, 60:180] = 5.0
     masks = projections > 0
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
-    cuts = Cuts(
-        masks=masks,
-        margins_px=projections,
-        exposed=torch.zeros(12).double(),
-        held=torch.ones(12).double(),
-        on_plane=False,
-        doubted=torch.zeros(12, dtype=torch.bool),
-    )
+    cuts = shapes.cuts_of(masks, projections, on_plane=False)
     monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
         assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"

@@ -4,8 +4,8 @@ from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.method.silhouettes.cues import SilhouetteDetails
-from pimper_torch.method.silhouettes.cuts import Cuts
 from pimper_torch.method.silhouettes.reliability import agreement_of, repaired
+from tests.silhouettes import shapes
 
 VIEWS = 8
 
@@ -21,14 +21,7 @@ def cuts_of(changed, on_plane=True, margin=None):
     margins = (disc() if margin is None else margin).expand(VIEWS, 80, 100)
     masks = margins > 0
     masks = torch.cat([torch.stack(changed), masks[len(changed) :]])
-    return Cuts(
-        masks=masks,
-        margins_px=margins,
-        exposed=torch.zeros(len(masks)).double(),
-        held=torch.ones(len(masks)).double(),
-        on_plane=on_plane,
-        doubted=torch.zeros(len(masks), dtype=torch.bool),
-    )
+    return shapes.cuts_of(masks, margins, on_plane)
 
 
 def shadowed():

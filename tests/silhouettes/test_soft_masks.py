@@ -4,19 +4,13 @@ from scenes import observing
 from torch.nn.functional import interpolate
 
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.method.silhouettes.cues import SilhouetteDetails, pointed_at, soft_masks_of
+from pimper_torch.method.silhouettes.cues import pointed_at, soft_masks_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.method.silhouettes.parallax import working_pictures
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import SilhouettePrior
 from pimper_torch.runtime.errors import PimperWarning
+from tests.silhouettes.conftest import SMALL, overlap
 from tests.silhouettes.shapes import HEIGHT, WIDTH, all_round, silhouettes_of
-
-SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
-
-
-def overlap(found, truth):
-    return (found & truth).sum(dim=(1, 2)) / (found | truth).sum(dim=(1, 2))
 
 
 def guessed(names, inside):
