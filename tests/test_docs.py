@@ -48,7 +48,8 @@ PAGES = {
     for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
 }
 
-FEW = {"coarse_surface": {"num_facets": 100}}  # thousands take a third of a minute
+# Thousands of facets take a third of a minute, and silhouettes as long as all else.
+FEW = {"coarse_surface": {"num_facets": 100}, "silhouettes": {"object": "everything"}}
 
 
 def modules_with_examples() -> list[str]:
@@ -75,7 +76,7 @@ def photographed() -> tuple[RenderedScene, SparseScene]:
     point_lights = wandering_lights(9, generator, distance=5.0, spread_deg=35.0)
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
     scene = render_shape(Sphere(), cameras, point_lights.harmonics_world(), texture)
-    return scene, sparse_scene(scene, 30, generator)
+    return scene, sparse_scene(scene, 120, generator)  # depth maps are searched for fewer
 
 
 def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
