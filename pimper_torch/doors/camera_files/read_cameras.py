@@ -37,27 +37,22 @@ FORMATS = [
         name="transforms.json",
         program="NeRF, instant-ngp, nerfstudio",
         suffixes=(".json",),
-        read=lambda path, photographs, sizes_of: read_transforms_cameras(path, sizes_of),
+        read=lambda path, _, sizes_of: read_transforms_cameras(path, sizes_of),
         owns=has_frames,
     ),
     CameraFormat(
         name="cameras.xml",
         program="Metashape",
         suffixes=(".xml",),
-        read=lambda path, photographs, sizes_of: read_metashape_cameras(path),
+        read=lambda path, *_: read_metashape_cameras(path),
     ),
     CameraFormat(
         name="cameras.sfm",
         program="Meshroom",
         suffixes=(".sfm", ".json"),
-        read=lambda path, photographs, sizes_of: read_meshroom_cameras(path),
+        read=lambda path, *_: read_meshroom_cameras(path),
     ),
-    CameraFormat(
-        name="cameras.npz",
-        program="arrays",
-        suffixes=(".npz",),
-        read=read_camera_arrays,
-    ),
+    CameraFormat(name="cameras.npz", program="arrays", suffixes=(".npz",), read=read_camera_arrays),
 ]
 """All formats: the first one that owns a file reads it."""
 
