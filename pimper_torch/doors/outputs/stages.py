@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 from platform import node
 
@@ -73,7 +74,9 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
     try:
         with suppress(OSError):  # the disk is full
             command = shlex.join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
-            holder.write_text(f"process {os.getpid()} on {node()}, `{command}`", encoding="utf-8")
+            now = datetime.now().astimezone().isoformat(" ", "minutes")
+            told = f"process {os.getpid()} on {node()} since {now}, `{command}`"
+            holder.write_text(told, encoding="utf-8")
         yield
     finally:
         with suppress(OSError):
