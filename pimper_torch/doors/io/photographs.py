@@ -213,32 +213,24 @@ def _read_masks(
 ) -> list[Float[Tensor, "_ _"]]:
     """Read 1 where masks are bright, 0 elsewhere; of the photographs' sizes, turned as they are."""
     masks = [read_header(path) for path in paths]
+    for path, photograph, mask, header in zip(paths, photographs, masks, headers, strict=True):
+        size, wanted = (mask.width, mask.height), (header.width, header.height)
+        # Of pixels as they are stored: to be turned by the photograph's EXIF.
+        stored = mask.orientation == 1 and header.orientation >= 5 and size[::-1] == wanted
+        if size != wanted and not stored:
+            raise InputError(
+                f"{path}: is {size[0]} x {size[1]}, but the photograph {photograph.name} is "
+                f"{wanted[0]} x {wanted[1]}; needed: a mask of the same size."
+            )
     levels = parts([(mask.height, mask.width) for mask in masks])
-    for (level,), path, mask, header in zip(each(levels), paths, masks, headers, strict=True):
-        # One of another size is refused without decoding it.
-        if sorted((mask.width, mask.height)) == sorted((header.width, header.height)):
-            level.copy_(_brightness(path))
-    drawn = zip(_on_object(levels), paths, masks, photographs, headers, strict=True)
-    return [_laid(*one) for one in drawn]
-
-
-def _laid(
-    drawn: Float[Tensor, "_ _"], path: Path, mask: Header, photograph: Path, header: Header
-) -> Float[Tensor, "_ _"]:
-    """Return a mask as it is, or where only that fits turned by its photograph's EXIF.
-
-    Args:
-        drawn: As the mask's file has it, turned by an EXIF of its own.
-    """
-    size, laid = (header.height, header.width), drawn
-    if drawn.shape != size and mask.orientation == 1:
-        laid = torch.from_numpy(rotated(drawn.numpy(), header.orientation))
-    if laid.shape != size:
-        raise InputError(
-            f"{path}: is {drawn.shape[1]} x {drawn.shape[0]}, but the photograph {photograph.name} "
-            f"is {header.width} x {header.height}; needed: a mask of the same size."
-        )
-    return laid
+    for (level,), path in zip(each(levels), paths, strict=True):
+        level.copy_(_brightness(path))
+    return [
+        drawn
+        if drawn.shape == (header.height, header.width)
+        else torch.from_numpy(rotated(drawn.numpy(), header.orientation))
+        for drawn, header in zip(_on_object(levels), headers, strict=True)
+    ]
 
 
 def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str | None) -> bool:

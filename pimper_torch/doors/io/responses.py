@@ -137,16 +137,16 @@ def tell_cautions(
             )
         if said.trouble:
             sentences.append(
-                f"{said.source} {said.trouble}, and is not followed; {CONTRADICTED}, with the "
-                "primaries of sRGB"
+                f"{said.source} {said.trouble}, and is not followed; what is given is taken, "
+                "with the primaries of sRGB"
             )
         elif said.response is not None and not isinstance(encoding.response, Path):
             given = response_of(encoding)
             if encoding.response != "auto" and disagree(given, said.response):
                 sentences.append(
                     f"the response {told(given)} is given, but {said.source} says "
-                    f"{told(said.response)}; {CONTRADICTED}. Leave out `photographs.response` to "
-                    "follow the files"
+                    f"{told(said.response)}; what is given is taken. Leave out "
+                    "`photographs.response` to follow the files"
                 )
         for sentence in sentences:
             kinds[sentence].append(Path(path).name)
