@@ -6,8 +6,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
-from urllib.parse import quote
+from pathlib import Path, PurePosixPath
 
 from pimper_torch.cli.batches.objects import CSV, HTML
 from pimper_torch.cli.batches.task import Outcome
@@ -59,7 +58,8 @@ def _row(one: Outcome, out: Path) -> dict[str, object]:
 
 
 def _cells(row: Mapping[str, object], out: Path) -> str:
-    folder, link = out / str(row["name"]), quote(str(row["name"]))
+    folder = out / str(row["name"])
+    link = PurePosixPath("/", folder.name).as_uri().removeprefix("file:///")
     target = "report.html" if (folder / "report.html").exists() else "overview.png"
     shown = f'<a href="{link}/{target}"><img loading="lazy" src="{link}/overview.png" alt=""></a>'
     picture = shown if (folder / "overview.png").exists() else ""
