@@ -30,14 +30,14 @@ def noisy(encoded, size, seed=0):
     return (encoded + size * drawn).clamp(0, 1)
 
 
-def everywhere(encoded):
-    return torch.ones_like(encoded, dtype=torch.bool)
+def estimate(encoded, rank=3):
+    return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_the_gamma_of_a_matrix_without_noise_is_found(gamma):
     encoded = shaded() ** (1 / gamma)
-    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
+    found = estimate(encoded)
     assert_close(found.gamma, gamma, rtol=1e-3, atol=0)
     assert found.determined
     assert found.standard_error < 1e-3 * gamma
@@ -47,7 +47,7 @@ def test_the_gamma_of_a_matrix_without_noise_is_found(gamma):
 
 def test_noise_moves_gamma_by_no_more_than_its_standard_error_tells():
     encoded = noisy(shaded(samples=120) ** (1 / 2.2), 0.01)
-    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
+    found = estimate(encoded)
     assert abs(found.gamma - 2.2) < 3 * found.standard_error < 0.2
     assert 0.007 < found.residual < 0.013  # the noise that was put in
 
@@ -58,7 +58,7 @@ def test_noise_does_not_bias_gamma(gamma, noise):
     found = []
     for seed in range(16):
         encoded = noisy(shaded(seed, views=14, samples=250) ** (1 / gamma), noise, seed)
-        found.append(estimate_gamma(encoded, everywhere(encoded), rank=3))
+        found.append(estimate(encoded))
     off = torch.tensor([one.gamma - gamma for one in found])
     error = torch.tensor([one.standard_error for one in found])
     # Taking entries by their noisy values is off by a whole one on linear data.
@@ -69,14 +69,14 @@ def test_noise_does_not_bias_gamma(gamma, noise):
 
 def test_ambient_light_and_attached_shadows_are_told_from_a_gamma():
     encoded = shaded(samples=150, views=12, ambient=0.2) ** (1 / 2.2)
-    found = estimate_gamma(encoded, everywhere(encoded), rank=4)
+    found = estimate(encoded, rank=4)
     assert abs(found.gamma - 2.2) < 0.25
     assert found.determined
 
 
 def test_srgb_is_near_a_gamma_of_two_point_two_and_explains_its_own_values_better():
     encoded = Srgb().encoded_from_linear(shaded())
-    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
+    found = estimate(encoded)
     assert 2.1 < found.gamma < 2.4
     assert found.residual_srgb < 1e-5 < found.residual < found.residual_linear
 
@@ -85,7 +85,7 @@ def test_cast_shadows_lose_weight():
     encoded = noisy(shaded(samples=150) ** (1 / 2.2), 0.003)
     drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(8))
     spoilt = torch.where(drawn < 0.02, 0.3 * encoded, encoded)
-    found = estimate_gamma(spoilt, everywhere(spoilt), rank=3)
+    found = estimate(spoilt)
     assert abs(found.gamma - 2.2) < 0.1
     assert found.determined
 
@@ -98,8 +98,7 @@ def test_highlights_beside_black_shadows_move_gamma_by_more_than_it_says_but_not
     drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(seed))
     spoilt = torch.where(drawn < 0.02, 0.02, encoded)
     spoilt = torch.where(drawn > 0.98, (encoded + 0.15).clamp_max(1), spoilt)
-    found = estimate_gamma(spoilt, everywhere(spoilt), rank=3)
-    assert abs(found.gamma - 2.2) < 0.2
+    assert abs(estimate(spoilt).gamma - 2.2) < 0.2
 
 
 def test_light_from_one_direction_tells_nothing():
@@ -107,7 +106,7 @@ def test_light_from_one_direction_tells_nothing():
         shaded(aside=0.0, samples=40) * torch.linspace(0.4, 1, 10, dtype=torch.float64)[:, None]
     )
     for values in (encoded ** (1 / 2.2), noisy(encoded ** (1 / 2.2), 0.005)):
-        found = estimate_gamma(values, everywhere(values), rank=3)
+        found = estimate(values)
         assert not found.determined
         assert "not determined" in str(found)
 
@@ -115,14 +114,15 @@ def test_light_from_one_direction_tells_nothing():
 def test_values_that_no_gamma_explains_are_not_determined():
     generator = torch.Generator().manual_seed(9)
     rough = 0.3 + 0.4 * torch.rand(8, 60, generator=generator, dtype=torch.float64)
-    found = estimate_gamma(rough, everywhere(rough), rank=3)
+    found = estimate(rough)
     assert not found.determined
     assert "leave more than noise" in str(found)
     assert found.gamma <= MAX_GAMMA
 
 
-def test_missing_entries_may_hold_anything():
-    encoded = shaded() ** (1 / 1.8)
+def test_missing_entries_may_hold_anything_and_gains_are_absorbed_by_the_lights():
+    gain = torch.linspace(0.6, 1, 10, dtype=torch.float64)[:, None]
+    encoded = gain * shaded() ** (1 / 1.8)
     seen = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(4)) > 0.15
     found = estimate_gamma(torch.where(seen, encoded, torch.nan), seen, rank=3)
     assert_close(found.gamma, 1.8, rtol=1e-3, atol=0)
@@ -161,12 +161,10 @@ def test_photographs_or_masks_of_unlike_sizes_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("change", "rank", "told"),
+    ("change", "rank", "found"),
     [
-        (lambda x: x.where(x != x[3, 5], torch.nan), 3, "1 encoded values are no numbers"),
-        (lambda x: x.where(x != x[3, 5], torch.inf), 3, "1 encoded values are no numbers"),
-        (lambda x: 255 * x, 3, r"encoded values reach from .* needed: fractions"),
-        (lambda x: x - 0.5, 3, r"encoded values reach from -0\.5"),
+        (lambda x: x.where(x != x[3, 5], torch.nan), 3, "1 encoded values are not from 0 to 1"),
+        (lambda x: x - 0.5, 3, r"encoded values are not from 0 to 1; needed: fractions"),
         (lambda x: x, 0, "rank is 0"),
         (lambda x: x[:4], 3, r"only \d+ samples are lit in more than 3 of 4 views"),
         (lambda x: x[:, :11], 3, r"only \d+ samples are lit"),
@@ -174,14 +172,6 @@ def test_photographs_or_masks_of_unlike_sizes_are_refused():
         (lambda x: 0 * x + 1, 3, "only 0 samples are lit"),
     ],
 )
-def test_what_cannot_be_estimated_from_is_refused(change, rank, told):
-    encoded = change(shaded())
-    with pytest.raises(InputError, match=told):
-        estimate_gamma(encoded, everywhere(encoded), rank=rank)
-
-
-def test_gains_of_views_are_absorbed_by_the_lights():
-    gain = torch.linspace(0.6, 1, 10, dtype=torch.float64)[:, None]
-    encoded = gain * shaded() ** (1 / 1.8)
-    found = estimate_gamma(encoded, everywhere(encoded), rank=3)
-    assert_close(found.gamma, 1.8, rtol=1e-3, atol=0)
+def test_values_without_an_estimate_are_refused(change, rank, found):
+    with pytest.raises(InputError, match=found):
+        estimate(change(shaded()), rank)
