@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.paper.integrate import differences, differences_transposed
+from pimper_torch.paper.integrate import differences
 from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
@@ -80,12 +80,9 @@ def find_discontinuities(
         fraction = torch.where(tested, 1.0, _TIE) * inside
         scale, cause = 3.0, StopCause.LIMIT  # pixels
         for taken in range(1, _MAX_ITERATIONS + 1):
-            weights = weight * fraction
-            system = RasterSystem(*steps.split(weights), anchor, tolerance=1e-6)
-            source = differences_transposed(*steps.split(weights * (steps.slope * steps.unit)))
-            if anchor is not None and heights is not None:
-                source = source + anchor * heights
-            residual = joined(*differences(system.solve(source))) / steps.unit - steps.slope
+            system = RasterSystem(*steps.split(weight * fraction), anchor, tolerance=1e-6)
+            right, down = differences(system.fit_steps(*steps.target, heights))
+            residual = joined(right, down) / steps.unit - steps.slope
             deviation = 1.4826 * float(residual[tested].abs().median()) if tested.any() else 0.0
             smallest = max(_SCALE_PX, _NOISE_SCALES * deviation)
             narrowed = scale <= smallest

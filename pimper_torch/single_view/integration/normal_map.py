@@ -97,7 +97,12 @@ def integrate_normal_map(
     weight, known_depth = (
         None if raster is None else raster[box] for raster in (weight, known_depth)
     )
-    unit = _usable(normals[box], mask, weight)
+    length = normals[box].norm(dim=-1)
+    usable = mask & (length > 0) & length.isfinite()
+    if weight is not None:
+        usable = usable & (weight > 0)
+    unit = normals[box] / torch.where(usable, length, 1)[..., None]
+    unit = torch.where(usable[..., None], unit, torch.nan)
     if intrinsics is None:
         steps = orthographic_steps(unit, mask, spacing)
     else:
@@ -119,20 +124,6 @@ def integrate_normal_map(
         valid=pad(steps.valid & mask, frame),
         continuity=continuity,
     )
-
-
-def _usable(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-    weight: Float[Tensor, "height width"] | None,
-) -> Float[Tensor, "height width 3"]:
-    """Return unit normals, NaN where there is none."""
-    length = normals.norm(dim=-1)
-    usable = mask & (length > 0) & length.isfinite()
-    if weight is not None:
-        usable = usable & (weight > 0)
-    safe = torch.where(usable, length, 1)[..., None]
-    return torch.where(usable[..., None], normals / safe, torch.nan)
 
 
 def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> Float[Tensor, " step"]:
