@@ -85,21 +85,6 @@ _REWEIGHTINGS = 3
 _ROWS, _COLUMNS, _REACH = 3, 12, 5.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Problem(Record):
-    """Constants of all rounds; lengths in scene units."""
-
-    patches: PatchSet
-    seams: Seams
-    vertices: Anchors
-    unit: Float[Tensor, ""]
-
-    @property
-    def in_scene(self) -> Float[Tensor, " 4"]:
-        """Factors from units of the edge length to scene units."""
-        return torch.stack([torch.ones_like(self.unit)] * 3 + [self.unit])
-
-
 class Align(Stage):
     r"""Undo the bas-relief transform that photometry leaves each patch with.
 
@@ -146,25 +131,20 @@ class Align(Stage):
         seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)
         if len(seams.facets) == 0:
             return depths
-        problem = _Problem(
-            patches=patches,
-            seams=seams,
-            vertices=vertex_anchors(patches, depths.buckets),
-            unit=seams.edge_lengths.median(),
-        )
+        anchors = vertex_anchors(patches, depths.buckets)
         # h_0 is in units of the edge length here, so that no term of the system has a unit.
-        identity = problem.unit.new_tensor([0, 0, 1, 0])
+        identity = seams.origins.new_tensor([0, 0, 1, 0])
         transforms = identity.expand(patches.num_patches, 4)
         apart = []
         for done in range(config.iterations):
-            pulls = self._met(problem, depths, transforms)
+            pulls = self._met(depths, seams, anchors, transforms)
             if not bool((pulls.weight > 0).any()):
                 return depths
             apart.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
             report(done + 1, config.iterations)
         with torch.no_grad():
-            pulls = self._met(problem, depths, transforms)
+            pulls = self._met(depths, seams, anchors, transforms)
             status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
         aligned = (status == int(AlignStatus.ALIGNED))[:, None]
         if not bool(aligned.all()):
@@ -176,26 +156,30 @@ class Align(Stage):
             on_mesh = _limit_scales(on_mesh, config.scale_limit)
             transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
-                pulls = self._met(problem, depths, transforms)
+                pulls = self._met(depths, seams, anchors, transforms)
         with torch.no_grad():
-            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * problem.unit
+            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * seams.units[3]
         return depths.replace(
-            buckets=_apply(depths, transforms * problem.in_scene, status),
+            buckets=_apply(depths, transforms * seams.units, status),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
     def _met(
-        self, problem: _Problem, depths: DepthPatches, transforms: Float[Tensor, "face 4"]
+        self,
+        depths: DepthPatches,
+        seams: Seams,
+        anchors: Anchors,
+        transforms: Float[Tensor, "face 4"],
     ) -> Pulls:
         """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
-        seams, unit, vertices = problem.seams, problem.unit, problem.vertices
-        in_scene = transforms * problem.in_scene
-        found, feet, both = meet_overlaps(seams, problem.patches, depths.buckets, in_scene)
+        unit, coarse = seams.units[3], depths.patches.coarse
+        in_scene = transforms * seams.units
+        found, feet, both = meet_overlaps(seams, depths.patches, depths.buckets, in_scene)
         met = both.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
         prior[3] = torch.inf  # patches do not move along their normals
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
-        corners = pad(vertices.samples / unit, (0, 1), value=1.0)
+        corners = pad(anchors.samples / unit, (0, 1), value=1.0)
         pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
@@ -207,11 +191,12 @@ class Align(Stage):
             corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
         )
-        noise = _noise(pulls, mismatches(pulls, transforms).norm(dim=-1).detach()).square()
+        # The error of one height field, from the median distance of two.
+        apart = mismatches(pulls, transforms).norm(dim=-1).detach()[met]
+        noise = apart.median().clamp_min(5e-3) / 2**0.5 if len(apart) else torch.ones_like(unit)
         # The weight of an exact anchor is 1. Vertices that are no points of the cloud are guesses.
-        certain = noise / (noise + vertices.variance / unit.square())
-        coarse = problem.patches.coarse
-        weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * vertices.known
+        certain = noise.square() / (noise.square() + anchors.variance / unit.square())
+        weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * anchors.known
         return pulls.replace(corner_weight=self.config.anchor * weight)
 
     def _solve_round(
@@ -234,14 +219,6 @@ class Align(Stage):
             if not torch.equal(limited, transforms):
                 transforms = solve_transforms(scales_held, limited, *terms)
         return transforms
-
-
-def _noise(pulls: Pulls, distance: Float[Tensor, "seam ray"]) -> Float[Tensor, ""]:
-    """Estimate the error of one height field from the median distance of two, in edge lengths."""
-    met = pulls.weight > 0
-    if not bool(met.any()):
-        return torch.ones_like(distance.sum())
-    return distance[met].median().clamp_min(5e-3) / 2**0.5
 
 
 def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Tensor, "face 4"]:

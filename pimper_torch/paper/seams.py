@@ -41,6 +41,12 @@ class Seams(Record):
     seam_of: Int[Tensor, "face 3"]
     place_of: Int[Tensor, "seam 2"]
 
+    @property
+    def units(self) -> Float[Tensor, " 4"]:
+        """Factors from transforms in units of the median edge, which is the last, to the scene."""
+        unit = self.edge_lengths.median()
+        return torch.stack([torch.ones_like(unit)] * 3 + [unit])
+
 
 def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float) -> Seams:
     """Lay rays over all edges that two facets share.
