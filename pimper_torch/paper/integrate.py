@@ -136,10 +136,10 @@ class Integrate(Stage):
                 photometry.normals_patch, photometry.valid, templates.spacing, steepest
             )
             vertices = mesh.vertices_world[mesh.faces[templates.facet]]
-            across, up = transform(templates.patch_from_world, vertices).split([2, 1], dim=-1)
+            corners = transform(templates.patch_from_world, vertices)
             grid = templates.origin, templates.spacing
-            found = sample_raster(height_field[:, None], across, *grid)
-            offset = (found[:, 0] - up[..., 0]).mean(dim=1)
+            found = sample_raster(height_field[:, None], corners[..., :2], *grid)
+            offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
             depth = height_field - offset[:, None, None]
             has_data = photometry.valid.flatten(1).any(dim=1)
             depths = Depths(

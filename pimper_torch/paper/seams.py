@@ -131,9 +131,10 @@ def meet_overlaps(
         met = hit.reshape(shape[:3]) & (own >= 0)[..., None]
         found.append((points.reshape(shape), feet_world.reshape(shape), met))
     raster = seams.origins.shape[1:3]
+    joined = [_by_facet(patches, parts).flatten(0, 1) for parts in zip(*found, strict=True)]
     samples, feet, met = (
-        _by_facet(patches, parts).flatten(0, 1)[seams.place_of].unflatten(2, raster)
-        for parts in zip(*found, strict=True)
+        part[seams.place_of].reshape(*seams.place_of.shape, *raster, *part.shape[2:])
+        for part in joined
     )
     return samples, feet, met.all(dim=1)
 

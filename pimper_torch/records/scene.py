@@ -193,8 +193,7 @@ class CoarseMesh(Record):
     Attributes:
         mesh: The facets, with vertex normals smoothed over the mesh.
         reference: The view that the facets were triangulated in; the frontal one.
-        is_point: True for vertices that are points of the sparse cloud; the others were
-            filled in between them.
+        is_point: True for vertices that are points of the sparse cloud.
         covariance_world: Of each vertex that is a point, scene units squared; zero for the
             others. ``None`` for a mesh that comes from elsewhere.
         points: The cloud between the vertices; ``None`` for a mesh from elsewhere.

@@ -147,7 +147,7 @@ def albedo_entropy(
     x, y, z = shading
     found = []
     # Products at a time fit a cache.
-    for some in candidates.split(max(1, 250_000 // shading.shape[1])):
+    for some in torch.split(candidates, max(1, 250_000 // shading.shape[1])):
         mu, nu, log_lam = some.mT[..., None]
         lam = log_lam.exp()
         square = (lam * x - mu * z).square() + (lam * y - nu * z).square() + z * z

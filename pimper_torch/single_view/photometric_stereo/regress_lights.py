@@ -72,8 +72,7 @@ def regress(
         found = _fit(x, given * brightness(x, seen), rows)
         for iteration in range(15):
             widen = max(1.0, _WIDEST * _NARROWING**iteration)
-            reliability, lit = reweigh(x, given, rows @ found.shading, widen)
-            found = _fit(x, reliability * lit, rows)
+            found = _fit(x, reweigh(x, given, rows @ found.shading, widen), rows)
         return found
 
 
@@ -82,8 +81,8 @@ def reweigh(
     weight: Float[Tensor, "view pixel"],
     predicted: Float[Tensor, "view pixel"],
     widen: float,
-) -> tuple[Float[Tensor, "view pixel"], Bool[Tensor, "view pixel"]]:
-    """Return the samples' weights by their residuals, and whether a light comes from the front.
+) -> Float[Tensor, "view pixel"]:
+    """Return the samples' weights by their residuals; 0 where a light comes from behind.
 
     Args:
         predicted: By a fit; below zero for lights from behind.
@@ -95,7 +94,7 @@ def reweigh(
     level = radiance[seen].abs().mean().nan_to_num(nan=1.0)
     scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
     # Far below the 4e-3 of 8-bit steps.
-    return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)), lit
+    return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)) * lit
 
 
 def brightness(
@@ -111,8 +110,8 @@ def brightness(
 
 def determined(
     weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
-) -> tuple[Bool[Tensor, " pixel"], Bool[Tensor, " pixel"]]:
-    """Find which pixels have as many samples as unknowns, and lights that span them."""
+) -> Bool[Tensor, " pixel"]:
+    """Find which pixels have as many samples as unknowns, under lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     size = lights.double().norm(dim=0)
     basis = lights.double() / torch.where(size > 0, size, 1)
@@ -120,7 +119,7 @@ def determined(
     values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
     # With less, noise of 1 % in the images is as large as the solution.
     spanned = values[:, 0] > 1e-4 * values[:, -1]
-    return count >= unknowns, spanned & (values[:, -1] > 0)
+    return (count >= unknowns) & spanned & (values[:, -1] > 0)
 
 
 def _fit(
@@ -266,8 +265,7 @@ def factorize_photographs(
             left = solved.lights[0]
             widen = max(1.0, _WIDEST * _NARROWING_FACTORED**iteration)
             predicted = left @ solved.shading[0]
-            reliability, lit = reweigh(x[:, some], given[:, some], predicted, widen)
-            heavy = reliability * lit
+            heavy = reweigh(x[:, some], given[:, some], predicted, widen)
         return regress(x, given, left, robust=robust)
 
 

@@ -151,9 +151,8 @@ def _integrable(
 ) -> tuple[Factored, bas_relief.BasRelief]:
     """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
-    enough, spanned = determined(factors.weight, factors.lights)
-    total = factors.weight.sum(dim=0)
-    reliability = torch.where(enough & spanned, total / total.amax().clamp_min(1e-300), 0)
+    total, reliable = factors.weight.sum(dim=0), determined(factors.weight, factors.lights)
+    reliability = torch.where(reliable, total / total.amax().clamp_min(1e-300), 0)
     matrix = integrable(factors.shading, reliability, mask)
     shading, lights = matrix @ factors.shading, factors.lights @ torch.linalg.inv(matrix)
     if resolve == "rounded":
@@ -193,10 +192,10 @@ def _spread_out(
     like: Tensor,
 ) -> PhotometricStereo:
     """Scatter pixels to the raster, and views with samples to all views."""
-    enough, spanned = determined(found.weight, found.lights)
     rows, (y, x) = used.nonzero(), mask.nonzero(as_tuple=True)
     valid = torch.zeros_like(mask)
-    valid[y, x] = enough & spanned & (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
+    valid[y, x] = (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
+    valid[y, x] &= determined(found.weight, found.lights)
     normals = like.new_zeros(*mask.shape, 3)
     normals[y, x] = found.normals.mT.to(like)
     albedo = like.new_zeros(*mask.shape, len(found.albedo))
