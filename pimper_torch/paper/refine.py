@@ -19,7 +19,7 @@ from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.continuation import about_mean
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.linalg.systems import solutions
-from pimper_torch.method.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
+from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.paper.paper_config import RefineConfig
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.runtime.stage import Stage
@@ -71,13 +71,15 @@ class Refine(Stage):
         radius = self.config.smoothing_radius_samples
         refined = smooth_seams(subdivision, points, blend.supported, spacing, radius)
         vertices = refined.to(points)
+        own = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
+        photometric = blend.seen & (blend.normals_world.detach().norm(dim=-1) > 0.5)
         apart = (refined - points.double())[blend.supported].detach()
         return Surface(
             vertices_world=vertices,
             faces=subdivision.faces,
             facet=subdivision.facet,
             barycentric=subdivision.barycentric,
-            normals_world=_normals(blend, vertices, subdivision),
+            normals_world=torch.where(photometric[:, None], blend.normals_world, own),
             albedo=about_mean(blend.albedo, blend.observed, face_edges(subdivision.faces)[0]),
             information=blend.normal_information,
             height_information=blend.offset_information,
@@ -122,12 +124,3 @@ def smooth_seams(
         what="the refinement",
     )
     return found
-
-
-def _normals(
-    blend: Blend, vertices: Float[Tensor, "vertex 3"], subdivision: Subdivision
-) -> Float[Tensor, "vertex 3"]:
-    """Take photometric normals where there are any, else those of the surface itself."""
-    own = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
-    photometric = blend.seen & (blend.normals_world.detach().norm(dim=-1) > 0.5)
-    return torch.where(photometric[:, None], blend.normals_world, own)

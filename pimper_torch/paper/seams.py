@@ -189,14 +189,10 @@ def curvature_along(
     """
     columns = heights.shape[-1]
     stride = max(1, columns // 4)
-    ahead, centre, behind = (
-        raster[..., start : columns - 2 * stride + start]
-        for raster, start in ((heights, 2 * stride), (heights, stride), (heights, 0))
-    )
+    centre = heights[..., stride:-stride]
+    step = heights[..., 2 * stride :] - 2 * centre + heights[..., : -2 * stride]
     known = met[..., 2 * stride :] & met[..., stride:-stride] & met[..., : -2 * stride]
-    bend = (
-        (ahead - 2 * centre + behind) * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
-    )
+    bend = step * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
     square = torch.where(known[:, None], bend, 0).square().sum(dim=(-2, -1))
     return square / known.sum(dim=(-2, -1)).clamp_min(1)[:, None]
 

@@ -151,8 +151,13 @@ class Triangulate(Stage):
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
         shown = _shown(pixels[faces], shows_object)
-        thin = _altitude(pixels[faces]) < _MIN_ALTITUDE
-        spikes = _sharp(pixels[faces], _MIN_TIP_DEG)
+        corners = pixels[faces]
+        ahead, back = corners.roll(-1, dims=1) - corners, corners.roll(1, dims=1) - corners
+        (ux, uy), (vx, vy) = ahead[:, 0].mT, back[:, 0].mT
+        square = side_lengths(corners).amax(dim=1).square().clamp_min(1e-30)
+        thin = (ux * vy - uy * vx).abs() / square < _MIN_ALTITUDE
+        cosine = (normalize(ahead, dim=-1) * normalize(back, dim=-1)).sum(dim=-1)
+        spikes = cosine > torch.deg2rad(cosine.new_tensor(_MIN_TIP_DEG)).cos()
         return peel(faces, (shown < _MIN_COVERAGE) | thin, spikes)
 
 
@@ -193,20 +198,3 @@ def _shown(
         align_corners=False,
     )
     return sampled[0, 0].mean(dim=-1)
-
-
-def _altitude(corners_px: Float[Tensor, "face 3 2"]) -> Float[Tensor, " face"]:
-    """Return the smallest height over the longest edge, in the image; 0.87 for equal sides."""
-    longest = side_lengths(corners_px).amax(dim=1)
-    a, b, c = corners_px.unbind(dim=1)
-    ab, ac = b - a, c - a
-    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs()
-    return area / longest.square().clamp_min(1e-30)
-
-
-def _sharp(corners_px: Float[Tensor, "face 3 2"], max_angle_deg: float) -> Bool[Tensor, "face 3"]:
-    """Find corners with less than an angle between their edges, in the image."""
-    ahead = normalize(corners_px.roll(-1, dims=1) - corners_px, dim=-1)
-    back = normalize(corners_px.roll(1, dims=1) - corners_px, dim=-1)
-    cosine = (ahead * back).sum(dim=-1)
-    return cosine > torch.deg2rad(cosine.new_tensor(max_angle_deg)).cos()

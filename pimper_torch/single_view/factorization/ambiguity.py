@@ -47,7 +47,7 @@ class Ambiguity(Record):
     @property
     def scale(self) -> Float[Tensor, "*batch"]:
         """The factor ``s`` on albedo."""
-        return _scale(self.matrix)
+        return torch.linalg.det(self.matrix).abs() ** 0.25
 
 
 def minkowski(like: Float[Tensor, "..."]) -> Float[Tensor, "4 4"]:
@@ -130,7 +130,7 @@ def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*bat
     not converge (the matrix is far from every Lorentz transformation) it gives the identity.
     """
     eta = minkowski(linear)
-    scale = _scale(linear)[..., None, None]
+    scale = Ambiguity(matrix=linear).scale[..., None, None]
     found = linear / scale.clamp_min(1e-30)
     for _ in range(30):
         inverse = torch.linalg.inv_ex(found).inverse
@@ -139,10 +139,6 @@ def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*bat
     bad = wrong | ~found.isfinite().all(dim=-1).all(dim=-1) | (found[..., 0, 0] < 0)
     eye = torch.eye(4, dtype=linear.dtype, device=linear.device)
     return torch.where(bad[..., None, None], eye, found) * scale
-
-
-def _scale(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
-    return torch.linalg.det(matrix).abs() ** 0.25
 
 
 def _algebra(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:

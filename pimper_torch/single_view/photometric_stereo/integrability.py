@@ -132,8 +132,9 @@ def integrable(
     Source: Yuille & Snow, CVPR 1997; the noise model, the averaging and the weights are ours.
     """
     with torch.no_grad():
-        solution = _least(curls(pseudo, weight, mask))
-        p, q = _vector(solution[:3]), _vector(solution[3:])
+        solution = _least(curls(pseudo, weight, mask)).reshape(2, 3)
+        # The vectors dual to the bivectors.
+        p, q = (torch.stack([yz, -xz, xy]) for xy, xz, yz in solution)
         third = torch.linalg.cross(p, q)
         size = third.norm().sqrt()
         p, q, third = p / size, q / size, third / size**2
@@ -165,9 +166,3 @@ def _least(equations: Curls) -> Float[Tensor, " both"]:
             "plane or a cylinder; needed: curvature in two directions. Widen the mask."
         )
     return vectors[:, 0]
-
-
-def _vector(bivector: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Return the vector dual to a bivector of space."""
-    xy, xz, yz = bivector
-    return torch.stack([yz, -xz, xy])
