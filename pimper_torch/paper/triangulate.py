@@ -150,8 +150,8 @@ class Triangulate(Stage):
         shows_object = gray > 0.12 * at_vertices.median()  # darker is background
         if views.masks is not None:
             shows_object = shows_object & views.masks[reference]
-        shown = _shown(pixels[faces], shows_object)
         corners = pixels[faces]
+        shown = _shown(corners, shows_object)
         ahead, back = corners.roll(-1, dims=1) - corners, corners.roll(1, dims=1) - corners
         (ux, uy), (vx, vy) = ahead[:, 0].mT, back[:, 0].mT
         square = side_lengths(corners).amax(dim=1).square().clamp_min(1e-30)

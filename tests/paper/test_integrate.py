@@ -1,5 +1,4 @@
 import pytest
-import scipy.fft
 import torch
 from slopes import normals_from_slopes
 from torch.testing import assert_close
@@ -8,7 +7,6 @@ from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.paper.integrate import (
     Integrate,
-    cosine_basis,
     differences,
     differences_transposed,
     fill_smoothly,
@@ -105,12 +103,6 @@ def test_the_height_field_passes_on_average_through_the_corners():
         assert found.abs().max() > 1e-3  # so that only the mean can be zero
         assert_close(found.mean(dim=1), torch.zeros_like(found[:, 0]))
         assert_close(field.transform, IDENTITY.expand(len(found), 4))
-
-
-def test_the_cosine_basis_is_the_orthonormal_cosine_transform(generator):
-    signal = random(generator, 7)
-    expected = scipy.fft.dct(signal.numpy(), type=2, norm="ortho")
-    assert_close(cosine_basis(7, signal) @ signal, torch.from_numpy(expected))
 
 
 def test_the_solution_is_that_of_the_dense_least_squares_on_steps(generator):

@@ -62,23 +62,22 @@ def test_what_the_user_can_mend_is_one_message(fixed, capsys):
 
 
 def estimate(gamma, residuals, determined=True):
-    best, linear, srgb = residuals
-    return GammaEstimate(
-        gamma=gamma,
-        standard_error=0.05,
-        determined=determined,
-        residual=best,
-        residual_linear=linear,
-        residual_srgb=srgb,
-        entries=1000,
-    )
+    names = ("residual", "residual_linear", "residual_srgb")
+    known = {"gamma": gamma, "determined": determined, **dict(zip(names, residuals, strict=True))}
+    return GammaEstimate(standard_error=0.05, entries=1000, **known)
 
 
-def test_the_curve_that_does_as_well_is_advised():
-    assert advice(estimate(1.04, (0.005, 0.0051, 0.009))).endswith(" linear")
-    assert advice(estimate(2.25, (0.005, 0.012, 0.0049))).endswith(" srgb")
-    assert advice(estimate(1.81, (0.005, 0.012, 0.009))).endswith(" 1.81")
-    assert advice(estimate(1.81, (0.005, 0.012, 0.009), determined=False)) == ""
+@pytest.mark.parametrize(
+    ("gamma", "residuals", "advised"),
+    [
+        (1.04, (0.005, 0.0051, 0.009), " linear"),
+        (2.25, (0.005, 0.012, 0.0049), " srgb"),
+        (1.81, (0.005, 0.012, 0.009), " 1.81"),
+    ],
+)
+def test_the_curve_that_does_as_well_is_advised(gamma, residuals, advised):
+    assert advice(estimate(gamma, residuals)).endswith(advised)
+    assert advice(estimate(gamma, residuals, determined=False)) == ""
 
 
 def test_an_undetermined_gamma_advises_no_option(fixed, capsys, monkeypatch):
