@@ -109,9 +109,7 @@ def test_a_model_of_photographs_as_exif_turns_them_is_taken_as_it_is(stored, spa
         found = existing_model(stored.replace(orientations=torch.tensor([3, 6] * 3)), sparse)
     assert torch.equal(found.cam_from_world, plain.cam_from_world)
     # Half turns alone are taken as made before, and a person is asked.
-    with pytest.warns(
-        PimperWarning, match=r"shapes do not show whether the COLMAP model in .*exif"
-    ):
+    with pytest.warns(PimperWarning, match=r"The COLMAP model in .*shapes do not show .*exiftool"):
         found = existing_model(turned(stored, [0, 2] * 3), sparse)
     assert torch.equal(found.cam_from_world, plain.cam_from_world)
 

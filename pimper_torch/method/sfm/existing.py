@@ -93,8 +93,8 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
         return exif
     if as_stored and any(exif):
         caution(
-            f"EXIF turns photographs, and their shapes do not show whether {_within(where)} was "
-            "made of them before or after that; it is taken as made after. If it was made of the "
+            f"{where}: EXIF turns photographs, and their shapes do not show whether the cameras "
+            "were found before or after that; they are taken as found after. If they are of the "
             "pixels that files store, remove EXIF's orientation (`exiftool -n -Orientation=1`).",
             stacklevel=4,
         )
@@ -110,10 +110,6 @@ def taken(views: Views, model: SparseModel) -> Views:
     """Take the photographs of a model, in its order."""
     number = {name: index for index, name in enumerate(views.names)}
     return views.take([number[name] for name in model.names])
-
-
-def _within(where: str) -> str:
-    return where.replace("The ", "the ", 1)
 
 
 def _model_of_file(views: Views, path: Path) -> SparseModel:
@@ -176,7 +172,7 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         turns: Clockwise quarters by which each picture is turned in its photograph.
     """
     lenses = []
-    cameras: dict[tuple[int, int, int, int], int] = {}
+    cameras: dict[tuple[int, ...], int] = {}
     fresh = 1 + max(lens.camera for lens in model.lenses)
     pixels = torch.empty_like(model.observation_pixels)
     poses = torch.empty_like(model.cam_from_world)
@@ -185,10 +181,8 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         size = turned_size(width, height, quarters)
         # Photographs of one camera that were resized or turned differently no longer share it; the
         # first of them keep its number.
-        known = {number for number, *_ in cameras}
-        if lens.camera not in known:
-            cameras[lens.camera, *size, quarters] = lens.camera
-        camera = cameras.setdefault((lens.camera, *size, quarters), fresh + len(cameras))
+        key, known = (lens.camera, *size, quarters), lens.camera in cameras.values()
+        camera = cameras.setdefault(key, fresh + len(cameras) if known else lens.camera)
         resized = rescale_lens(lens, *size).replace(camera=camera)
         lenses.append(turned_lens(resized, quarters))
         scale = pixels.new_tensor([size[0] / lens.width, size[1] / lens.height])
