@@ -32,6 +32,11 @@ def placed(scene, *priors):
     return found
 
 
+def of_one(kind, size=SIZE, name="a.png", **maps):
+    """A prior of one photograph."""
+    return kind(names=(name,), sizes_px=torch.tensor([size]), **maps)
+
+
 @pytest.mark.parametrize("size", [(60, 40), (30, 20), (90, 80)])
 def test_maps_of_any_size_move_with_the_photograph(scene, size):
     """A ramp shows where every pixel came from; both ends count in pixels of the map."""
@@ -39,12 +44,7 @@ def test_maps_of_any_size_move_with_the_photograph(scene, size):
     ramp = pixel_centers(width, height, like=torch.zeros(()))
     raster = torch.full((1, height + 3, width + 5), torch.nan)
     raster[:, :height, :width] = ramp[..., 0]
-    prior = DepthPrior(
-        names=("a.png",),
-        sizes_px=torch.tensor([size]),
-        depth=raster,
-        variance=torch.full_like(raster, 0.01),
-    )
+    prior = of_one(DepthPrior, size, depth=raster, variance=torch.full_like(raster, 0.01))
     (found,) = placed(scene, prior)
     factor = torch.tensor([60 / width, 40 / height], dtype=torch.float64)
     expected = photograph_pixels(BARREL, width, height)
@@ -68,11 +68,12 @@ def test_maps_of_any_size_move_with_the_photograph(scene, size):
 
 def test_what_looks_past_the_edge_is_unknown(scene):
     ones = torch.ones(1, 40, 60)
-    names, sizes = ("b.png",), torch.tensor([SIZE])
-    depth = DepthPrior(names=names, sizes_px=sizes, depth=ones, variance=ones)
-    inside = SilhouettePrior(names=names, sizes_px=sizes, inside=ones)
-    inlier = InlierPrior(names=names, sizes_px=sizes, probability=ones)
-    depth, inside, inlier = placed(scene, depth, inside, inlier)
+    depth, inside, inlier = placed(
+        scene,
+        of_one(DepthPrior, name="b.png", depth=ones, variance=ones),
+        of_one(SilhouettePrior, name="b.png", inside=ones),
+        of_one(InlierPrior, name="b.png", probability=ones),
+    )
     source = photograph_pixels(PINCUSHION)
     past = ~((source >= 0) & (source <= torch.tensor(SIZE))).all(-1)
     assert 0.02 < past.float().mean() < 0.5
@@ -88,12 +89,10 @@ def test_values_count_by_their_precision(scene):
     columns = torch.arange(60.0).expand(1, 40, 60)
     odd = (columns % 2 == 1) & (columns > 0)
     values = torch.where(odd, 7.0, 3.0)
-    names, sizes = ("a.png",), torch.tensor([SIZE])
 
     def resampled(variance):
         weight = torch.where(odd, variance, 0.04)
-        prior = AlbedoPrior(names=names, sizes_px=sizes, albedo=values[:, None], variance=weight)
-        (found,) = placed(scene, prior)
+        (found,) = placed(scene, of_one(AlbedoPrior, albedo=values[:, None], variance=weight))
         return found.albedo[:, 0], found.variance
 
     unknown, variance = resampled(torch.inf)
@@ -135,12 +134,7 @@ def test_normals_stay_unit_and_their_spread_counts(scene, generator):
 
 def test_a_photograph_without_distortion_keeps_its_map_bit_for_bit(reconstruction, generator):
     depth = torch.rand(1, 13, 17, generator=generator)
-    prior = DepthPrior(
-        names=("a.png",),
-        sizes_px=torch.tensor([[17, 13]]),
-        depth=depth,
-        variance=depth + 1,
-    )
+    prior = of_one(DepthPrior, (17, 13), depth=depth, variance=depth + 1)
     for lenses in (reconstruction.scene.lenses, ()):
         (found,) = placed(reconstruction.scene.replace(lenses=lenses), prior)
         assert torch.equal(found.depth, depth)
@@ -148,10 +142,7 @@ def test_a_photograph_without_distortion_keeps_its_map_bit_for_bit(reconstructio
 
 
 def test_maps_of_undistorted_photographs_and_lights_stay(scene):
-    ones = torch.ones(1, 4, 4)
-    inside = SilhouettePrior(
-        names=("a.png",), sizes_px=torch.tensor([[4, 4]]), inside=ones, undistorted=True
-    )
+    inside = of_one(SilhouettePrior, (4, 4), inside=torch.ones(1, 4, 4), undistorted=True)
     lights = LightPrior(lights=torch.ones(1, 4), variance=torch.ones(1), names=("a.png",))
     given = scene.replace(views=scene.views.replace(priors=(inside, lights)))
     assert with_undistorted_priors(given) is given
@@ -162,13 +153,7 @@ def test_gradients_reach_values_and_variances(scene):
     scene = scene.replace(lenses=(lens,) * 3)
 
     def resampled(normals, variance):
-        prior = NormalPrior(
-            names=("a.png",),
-            sizes_px=torch.tensor([[6, 5]]),
-            normals=normals,
-            variance=variance,
-        )
-        (found,) = placed(scene, prior)
+        (found,) = placed(scene, of_one(NormalPrior, (6, 5), normals=normals, variance=variance))
         known = found.variance.isfinite()
         return found.normals[known], found.variance[known]
 

@@ -182,12 +182,12 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
     release_memory()
     # The largest of several models must hold most photographs, if they are not of several series.
     min_fraction = 0.0 if found.around else 0.6
-    parts = [[space.files.index(file) for file in model.names] for model in found.models]
-    names = [tuple(views.names[number] for number in part) for part in parts]
-    chosen = choose_component(names, found.spread, views.names, min_fraction)
-    order = sorted(range(len(parts[chosen])), key=parts[chosen].__getitem__)
-    model = select_views(found.models[chosen].replace(names=names[chosen]), order)
     name_of = dict(zip(space.files, views.names, strict=True))
+    names = [tuple(name_of[file] for file in model.names) for model in found.models]
+    chosen = choose_component(names, found.spread, views.names, min_fraction)
+    model = found.models[chosen]
+    order = sorted(range(model.num_views), key=model.names.__getitem__)  # files are numbered
+    model = select_views(model.replace(names=names[chosen]), order)
     misplaced = [
         f"{name_of[file]} ({fraction:.0%} agree)"
         for file, fraction in found.misplaced.items()
