@@ -308,7 +308,8 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
     assert int(both.sum()) > 200
     assert bool((lights[:, ::2] != lights[:, 1::2]).any(dim=2)[both].all())
     names = scene.views.names
-    again = pt.load_chain(preset, {REFERENCES[preset]: {"reference": names[7]}})
+    settings = {REFERENCES[preset]: {"reference": names[7]}}
+    again = pt.load_chain(preset, settings, silhouettes=Given(step.silhouettes))
     named = next(again.steps(scene, mesh=some.replace(faces=faces[:8])))
     assert named.coarse.reference == 7
 

@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 import torch
+from scenes import each_bucket
 from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -91,12 +92,12 @@ def test_heights_alone_do_and_slopes_alone_stay_where_they_are(swept):
 
 def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     lifted, given = swept(0.5)
-    buckets = []
-    for found in given.photometric.buckets:
+
+    def tilt(found):
         wrong = found.normals_patch + torch.tensor([0.15, 0.0, 0.0]).double()
-        buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
-    photometric = given.photometric.replace(buckets=tuple(buckets))
-    tilted = given.replace(photometric=photometric)
+        return found.replace(normals_patch=normalize(wrong, dim=-1))
+
+    tilted = given.replace(photometric=each_bucket(given.photometric, tilt))
     kept = off_plane(lifted, Fuse()(tilted, FREE))
     trusting = off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(tilted, FREE))
     assert kept.std() < 0.1
@@ -105,17 +106,16 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
 
 def test_normals_at_right_angles_to_the_direction_of_heights_raise_no_fold(swept):
     lifted, given = swept(1.0)
-    buckets = []
-    for found in given.photometric.buckets:
+
+    def spoil(found):
         normals = found.normals_patch.clone()
         size = normals.shape[1] // 3
         wrong = normalize(torch.tensor([1.0, 0.0, -0.05], dtype=torch.float64), dim=0)
         normals[:, size : 2 * size, size : 2 * size] = wrong
-        buckets.append(found.replace(normals_patch=normals))
-    photometric = given.photometric.replace(buckets=tuple(buckets))
-    surface = Fuse(FuseConfig(terms=without("swept_heights")))(
-        given.replace(photometric=photometric), FREE
-    )
+        return found.replace(normals_patch=normals)
+
+    wrong = given.replace(photometric=each_bucket(given.photometric, spoil))
+    surface = Fuse(FuseConfig(terms=without("swept_heights")))(wrong, FREE)
     assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 5.6
 
 
@@ -246,10 +246,8 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
 
 def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
-    blind = tuple(
-        found.replace(information=torch.zeros_like(found.information)) for found in given.buckets
-    )
-    surface = Fuse()(unlit(given).replace(buckets=blind), FREE)
+    dark = each_bucket(unlit(given), lambda found: found.replace(information=0 * found.information))
+    surface = Fuse()(dark, FREE)
     off = off_plane(lifted, surface)
     assert off.std() < 1e-4  # as flat as the facets, and where they were
     assert abs(float(off.mean()) - lifted.height) < 0.02
@@ -269,8 +267,9 @@ def in_the_centre_of_each(found, spoiled):
 
 def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
     _, given = swept(0.8)
-    buckets = [in_the_centre_of_each(b, lambda square: None) for b in given.photometric.buckets]
-    photometric = given.photometric.replace(buckets=tuple(buckets))
+    photometric = each_bucket(
+        given.photometric, lambda found: in_the_centre_of_each(found, lambda square: None)
+    )
     whole, holed = Fuse()(given, FREE), Fuse()(given.replace(photometric=photometric), FREE)
     dark = holed.confidence == 0
     assert dark.any()
@@ -396,16 +395,10 @@ def guessed(lifted, given, lean: float, error_deg: float):
 
 
 def unlit(given):
-    return given.replace(
-        photometric=given.photometric.replace(
-            buckets=tuple(
-                found.replace(
-                    valid=torch.zeros_like(found.valid), information=0 * found.information
-                )
-                for found in given.photometric.buckets
-            )
-        )
-    )
+    def dark(found):
+        return found.replace(valid=found.valid & False, information=0 * found.information)
+
+    return given.replace(photometric=each_bucket(given.photometric, dark))
 
 
 def test_a_guess_that_the_photographs_contradict_is_not_believed_however_sure_it_is(swept):

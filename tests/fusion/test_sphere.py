@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from scenes import each_bucket
 from scipy.spatial import Delaunay
 from torch.nn.functional import normalize
 
@@ -197,11 +198,11 @@ def test_a_large_surface_has_the_same_bits_on_any_number_of_threads(cap):
 
 def test_heights_alone_bend_flat_facets_to_the_sphere(cap):
     swept = noisy(cap, 0.0, 0.2, torch.Generator().manual_seed(7))
-    dark = tuple(
-        found.replace(valid=found.valid & False, information=0 * found.information)
-        for found in cap.photometric.buckets
-    )
-    swept = swept.replace(photometric=cap.photometric.replace(buckets=dark))
+
+    def dark(found):
+        return found.replace(valid=found.valid & False, information=0 * found.information)
+
+    swept = swept.replace(photometric=each_bucket(cap.photometric, dark))
     surface = Fuse()(swept, free())
     assert (surface.information == 0).all()
     assert surface.supported.double().mean() > 0.95

@@ -49,3 +49,14 @@ def without_points(scene):
 def edge_counts(faces):
     """List edges, and how many faces each has."""
     return torch.unique(half_edges(faces).sort(dim=1).values, dim=0, return_counts=True)
+
+
+def each_bucket(record, change):
+    """Change every bucket of patches."""
+    return record.replace(buckets=tuple(map(change, record.buckets)))
+
+
+def first_bucket(record, **changes):
+    """Change fields of the first bucket of patches."""
+    first, *others = record.buckets
+    return record.replace(buckets=(first.replace(**changes), *others))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from scenes import first_bucket
 from solved import solved
 from torch.testing import assert_close
 from twins import using
@@ -106,11 +107,10 @@ def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, su
 
 def test_whole_factorizations_agree_and_nan_is_missing(scene):
     seen = scene().seen.to(torch.float32)
-    first = seen.buckets[0]
-    radiance = first.radiance.clone()
+    radiance = seen.buckets[0].radiance.clone()
     radiance[2] = torch.nan
     radiance[0, 3, :, 4:6] = torch.nan
-    seen = seen.replace(buckets=(first.replace(radiance=radiance), *seen.buckets[1:]))
+    seen = first_bucket(seen, radiance=radiance)
     results = []
     for how in ("numba", "torch"):
         with using(how), pytest.warns(PimperWarning, match="1 of 8"):

@@ -3,6 +3,7 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from scenes import each_bucket, first_bucket
 from solved import solved
 from torch.nn.functional import pad
 from torch.testing import assert_close
@@ -78,11 +79,9 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
 def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
     true = scene(bumps=0.2)
     config = FactorizeConfig(loss=loss, geometry_weight=0.0)
-    first, *others = true.seen.to(torch.float32).buckets
-    radiance = first.radiance.clone().requires_grad_()
     seen = true.seen.to(torch.float32)
-    seen = seen.replace(buckets=(first.replace(radiance=radiance), *others))
-    found = solved(Factorize(config), seen)
+    radiance = seen.buckets[0].radiance.clone().requires_grad_()
+    found = solved(Factorize(config), first_bucket(seen, radiance=radiance))
     assert median_error(found, true) < 3  # of a start 10 degrees off
     total = sum(bucket.albedo.square().sum() for bucket in found.buckets)
     (slope,) = torch.autograd.grad(total, radiance)
@@ -102,7 +101,7 @@ def test_samples_lit_by_few_have_no_say(scene):
     first = true.seen.buckets[0]
     valid = first.valid.clone()
     valid[1, 3:, 4:7] = False  # three views left in these rows
-    seen = true.seen.replace(buckets=(first.replace(valid=valid), *true.seen.buckets[1:]))
+    seen = first_bucket(true.seen, valid=valid)
     found = solved(Factorize(), seen).buckets[0]
     assert not found.valid[1, 4:7].any()
     assert (found.information[1, 4:7] == 0).all()
@@ -131,7 +130,7 @@ def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
     first = true.seen.buckets[0]
     radiance = first.radiance.clone()
     radiance[2, 3] *= 0.6  # a shadow over one patch in one view, which the field does not know
-    seen = true.seen.replace(buckets=(first.replace(radiance=radiance), *true.seen.buckets[1:]))
+    seen = first_bucket(true.seen, radiance=radiance)
     with pytest.warns(PimperWarning, match="light varies too little"):
         found = solved(Factorize(), seen)
     for bucket, templates, one in zip(
@@ -203,11 +202,8 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
     true = scene()
     colour = (0.3 * torch.randn(12, 3, generator=generator, dtype=torch.float64)).exp()
     colour = colour / colour.log().mean(dim=0).exp()
-    tinted = true.seen.replace(
-        buckets=tuple(
-            one.replace(radiance=one.radiance * colour[..., None, None])
-            for one in true.seen.buckets
-        )
+    tinted = each_bucket(
+        true.seen, lambda one: one.replace(radiance=one.radiance * colour[..., None, None])
     )
     white, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), tinted)
     gray = solved(Factorize(EXACT), tinted, colours=False)
@@ -227,11 +223,8 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
 def test_exposures_of_the_views_are_those_of_the_lights_and_leave_normals(scene):
     true = scene()
     exposure = torch.tensor([1.0, 4, 1, 0.25, 1, 1, 2, 1, 0.5, 1, 1, 1], dtype=torch.float64)
-    exposed = true.seen.replace(
-        buckets=tuple(
-            one.replace(radiance=one.radiance * exposure[:, None, None, None])
-            for one in true.seen.buckets
-        )
+    exposed = each_bucket(
+        true.seen, lambda one: one.replace(radiance=one.radiance * exposure[:, None, None, None])
     )
     plain, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), exposed)
     unlike = solved(Factorize(EXACT), exposed, colours=False)
@@ -256,7 +249,7 @@ def spoil(seen: PatchViews, how: str) -> PatchViews:
         radiance[2], valid[2] = 0, False
     else:
         radiance[2, :4], radiance[2, 4:] = math.nan, math.inf
-    return seen.replace(buckets=(first.replace(radiance=radiance, valid=valid), *seen.buckets[1:]))
+    return first_bucket(seen, radiance=radiance, valid=valid)
 
 
 @pytest.mark.parametrize("how", ["masked", "nan"])
@@ -281,12 +274,11 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
 
 def test_nothing_seen_at_all_is_told_not_raised(scene):
     true = scene()
-    buckets = tuple(
-        each.replace(radiance=0 * each.radiance, valid=torch.zeros_like(each.valid))
-        for each in true.seen.buckets
+    nothing = each_bucket(
+        true.seen, lambda one: one.replace(radiance=0 * one.radiance, valid=one.valid & False)
     )
     with pytest.warns(PimperWarning, match="8 have no valid sample in any view"):
-        found = solved(Factorize(), true.seen.replace(buckets=buckets))
+        found = solved(Factorize(), nothing)
     for bucket in found.buckets:
         assert bucket.normals_patch.isfinite().all()
         assert (bucket.albedo == 0).all()
@@ -294,15 +286,13 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
 
 def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
     true = scene(bumps=0.0)  # lights fitted to the mesh are exact but for the noise
-    buckets = tuple(
-        each.replace(
-            radiance=each.radiance
-            + 0.04 * torch.randn(each.radiance.shape, generator=generator, dtype=torch.float64)
-        )
-        for each in true.seen.buckets
-    )
+
+    def noisy(one):
+        noise = torch.randn(one.radiance.shape, generator=generator, dtype=torch.float64)
+        return one.replace(radiance=one.radiance + 0.04 * noise)
+
     alone = FactorizeConfig(loss="squares", light_prior=1e6, geometry_weight=0.0)
-    found = solved(Factorize(alone), true.seen.replace(buckets=buckets), model="soft")
+    found = solved(Factorize(alone), each_bucket(true.seen, noisy), model="soft")
     variance, square = [], []
     for bucket, normals in zip(found.buckets, true.normals, strict=True):
         variance.append(1 / bucket.information[bucket.valid])

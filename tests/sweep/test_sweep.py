@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import each_bucket
 from torch.testing import assert_close
 
 from pimper_torch.method.patches.warp import Warp
@@ -51,12 +52,10 @@ def test_without_texture_the_sweep_says_that_it_does_not_know(lift):
 
 def test_views_of_another_light_than_fitted_spoil_the_height_less_than_a_step(lift):
     lifted = lift(1.2)
-    buckets = []
-    for found in lifted.photometric.buckets:
-        lights = found.lights_patch.clone()
-        lights[:, ::4] = lights[:, ::4] * 1.6  # three of nine views are wrong
-        buckets.append(found.replace(lights_patch=lights))
-    wrong = lifted.photometric.replace(buckets=tuple(buckets))
+    gain = torch.where(torch.arange(9) % 4 == 0, 1.6, 1.0)[:, None]  # three of nine are wrong
+    wrong = each_bucket(
+        lifted.photometric, lambda found: found.replace(lights_patch=gain * found.lights_patch)
+    )
     scene = lifted.scene
     offsets, _ = told(Sweep()(scene.views, scene.cameras, lifted.seen, wrong))
     assert (offsets + lifted.height).abs().median() < 0.3
@@ -64,20 +63,16 @@ def test_views_of_another_light_than_fitted_spoil_the_height_less_than_a_step(li
 
 def test_samples_without_photometric_normals_are_swept_alike(lift):
     lifted = lift(1.2)
-    dark = lifted.photometric.replace(
-        buckets=tuple(
-            found.replace(valid=~found.valid & False, information=0 * found.information)
-            for found in lifted.photometric.buckets
-        )
+    dark = each_bucket(
+        lifted.photometric,
+        lambda found: found.replace(valid=found.valid & False, information=0 * found.information),
     )
     scene = lifted.scene
     swept = Sweep()(scene.views, scene.cameras, lifted.seen, dark)
     for mine, lit in zip(swept.buckets, sweep(lifted).buckets, strict=True):
         assert_close(mine.offset, lit.offset, rtol=0, atol=0)
         assert_close(mine.information, lit.information, rtol=0, atol=0)
-    black = dark.replace(
-        buckets=tuple(found.replace(albedo=0 * found.albedo) for found in dark.buckets)
-    )
+    black = each_bucket(dark, lambda found: found.replace(albedo=0 * found.albedo))
     unseen = Sweep()(scene.views, scene.cameras, lifted.seen, black)
     assert all((bucket.information == 0).all() for bucket in unseen.buckets)
 
@@ -119,22 +114,12 @@ def copied(lifted, copies):
     scene = lifted.scene
     views = scene.views.take(copies)
     views = views.replace(names=tuple(map(str, range(len(copies)))), poses=torch.tensor(copies))
-    seen = lifted.seen.replace(
-        buckets=tuple(
-            one.replace(
-                radiance=one.radiance[:, copies],
-                valid=one.valid[:, copies],
-                viewers=one.viewers[:, copies],
-            )
-            for one in lifted.seen.buckets
-        )
-    )
-    photometric = lifted.photometric.replace(
-        buckets=tuple(
-            one.replace(lights_patch=one.lights_patch[:, copies])
-            for one in lifted.photometric.buckets
-        )
-    )
+
+    def again(bucket, *names):
+        return bucket.replace(**{name: getattr(bucket, name)[:, copies] for name in names})
+
+    seen = each_bucket(lifted.seen, lambda one: again(one, "radiance", "valid", "viewers"))
+    photometric = each_bucket(lifted.photometric, lambda one: again(one, "lights_patch"))
     return views, scene.cameras.take(copies), seen, photometric
 
 
