@@ -15,7 +15,6 @@ from pimper_torch.method.coarse.densify import (
     choose_sources,
     push_pull,
     step_for_one_pixel,
-    sweep,
 )
 from pimper_torch.method.coarse.oriented import (
     OrientedPoints,
@@ -31,11 +30,9 @@ from pimper_torch.method.coarse.trim import (
     supported_components,
     without_small_holes,
 )
-from pimper_torch.method.coarse.window_matching import Matcher, Windows, level_of, pair
+from pimper_torch.method.coarse.window_matching import level_of, pair
 from pimper_torch.records import Support
 from tests.coarse.ball import mottled
-
-WINDOWS = Windows(radius=2, likeness=0.2, contrast=0.005, best=2)
 
 
 def ball(num_views=5):
@@ -47,38 +44,6 @@ def ball(num_views=5):
     ).double()
     scene = render_shape(Sphere(), cameras, lights, mottled)
     return scene, sparse_scene(scene, 300, torch.Generator().manual_seed(0))
-
-
-def test_windows_match_on_the_true_surface_under_any_light_and_nowhere_else():
-    truth, scene = ball()
-    level = level_of(scene, 1)
-    matcher = Matcher(level, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
-    depth = truth.depth[2].float()
-    inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.6)
-    true = torch.where(depth.isfinite(), 1 / depth, 0.25)
-    assert matcher.scores(true, [0.0])[0][inner].median() > 0.95
-    assert matcher.scores(1.1 * true, [0.0])[0][inner].median() < 0.6
-    # A photograph twice as bright, as another exposure: the same.
-    brighter = level.replace(
-        tone=level.tone * torch.tensor([1.4, 0.8, 1.0, 1.2, 0.9])[:, None, None]
-    )
-    other = Matcher(brighter, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
-    assert other.scores(true, [0.0])[0][inner].median() > 0.95
-    # Darkness matches nothing.
-    assert matcher.scores(true, [0.0])[0][:10, :10].abs().max() < 0.05
-
-
-def test_a_sweep_finds_the_offset_between_its_steps():
-    truth, scene = ball()
-    level = level_of(scene, 1)
-    matcher = Matcher(level, pair(level, 2, torch.tensor([0, 1, 3, 4])), WINDOWS)
-    depth = truth.depth[2].float()
-    inner = torch.isfinite(depth) & (truth.normals_world[2][..., 2] > 0.7)
-    true = torch.where(depth.isfinite(), 1 / depth, 0.25)
-    step = 0.004
-    found, score = sweep(matcher, true + 1.3 * step, [step * rank for rank in range(-3, 4)])
-    assert ((found - true)[inner].abs().median() / step) < 0.15
-    assert score[inner].median() > 0.9
 
 
 def test_holes_are_filled_from_around_and_the_rest_stays():

@@ -52,18 +52,6 @@ def test_only_what_known_vertices_surround_is_enclosed(square):
     assert enclosed(torch.tensor([True, False, False, False]), ball).sum() == 3
 
 
-def test_an_island_takes_what_lies_round_it_and_the_rest_is_kept(square):
-    points, faces = square
-    truth = ramp(points)
-    island = (points[:, :2] - 0.5).norm(dim=1) < 0.25
-    given = torch.where(island[:, None], 100.0, truth)
-    found = about_mean(given, ~island, face_edges(faces)[0])
-    assert torch.equal(found[~island], truth[~island])
-    assert (found - truth)[island].abs().max() < 0.02
-    # The mean would be off by a quarter at the island's edge.
-    assert (truth[~island].mean(dim=0) - truth[island]).abs().max() > 0.2
-
-
 def test_what_varies_much_from_step_to_step_is_not_transferred_far(square):
     points, faces = square
     generator = torch.Generator().manual_seed(3)

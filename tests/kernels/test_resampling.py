@@ -196,24 +196,6 @@ def test_costs_of_heights_and_their_gradients_are_those_of_torch(photographed, c
         assert off < 1e-4, name
 
 
-def test_buckets_by_themselves_give_what_all_give_together(photographed):
-    views, cameras, lifted = photographed
-    patches, warp, sweep = lifted.seen.patches, Warp(), Sweep()
-    sources = prepare(views)
-    together = warp(views, cameras, patches)
-    swept = sweep(views, cameras, lifted.seen, lifted.photometric)
-    for place, bucket in enumerate(patches.buckets):
-        part = patches.replace(buckets=(bucket,))
-        (seen,) = warp(views, cameras, part, sources).buckets
-        assert torch.equal(seen.radiance, together.buckets[place].radiance)
-        photometric = lifted.photometric.replace(
-            patches=part, buckets=(lifted.photometric.buckets[place],)
-        )
-        before = lifted.seen.replace(patches=part, buckets=(lifted.seen.buckets[0],))
-        (found,) = sweep(views, cameras, before, photometric, sources).buckets
-        assert torch.equal(found.offset, swept.buckets[place].offset)
-
-
 def test_the_photographs_are_not_copied(photographed):
     views, _, _ = photographed
     whole = views.replace(images=views.images.nan_to_num())
