@@ -3,7 +3,6 @@
 import dataclasses
 import inspect
 import io
-import os
 import re
 import shutil
 import sys
@@ -11,7 +10,7 @@ import textwrap
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -21,16 +20,25 @@ import tyro
 
 from pimper_torch.runtime.errors import ConfigError
 
+Job = TypeVar("Job")
+
 REQUIRED = inspect.Parameter.empty
-_SWITCH = get_args(tyro.conf.FlagCreatePairsOff[bool])[1]
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
+LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # typed as what it marks
+_SWITCH = get_args(Flag)[1]
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
-_WORDS: dict[object, str] = {
-    int: "INT",
-    float: "FLOAT",
-    str: "TEXT",
-    Path: "PATH",
-    types.NoneType: "",
-}
+_WORDS: dict[object, str] = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+
+OF_EVERY_COMMAND = """\
+
+of every command:
+  -q, --quiet             Nothing but warnings, errors and what was asked for.
+  --json                  Events as JSON, one a line, on standard output.
+  --log-level LEVEL       error, warning, info or debug. (default: info)
+  -h, --help              This page.
+"""
+_COLUMN, _WIDEST, _LONGEST = 26, 100, 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,41 +58,38 @@ class Option:
     meaning: str
     default: object
 
-    @property
-    def is_setting(self) -> bool:
-        """Whether it is a setting of a stage."""
-        return "." in self.names[-1]
-
 
 def options_of(
-    command: object, between: str = " ", section: str = "", path: str = ""
+    command: object, between: str = " ", section: str = "arguments", path: str = ""
 ) -> Iterator[Option]:
     """List the options of a command as tyro makes them, in their order.
 
     Args:
         command: Whose parameters are options; or settings, whose fields are.
+        between: What stands between several values of one option.
         path: Of settings: what stands before a field's name.
     """
-    said = meanings(type(command) if _is_settings(command) else command)
-    for field, annotation, default in _members(command):
-        is_marked = get_origin(annotation) is Annotated
-        kind, *marks = get_args(annotation) if is_marked else (annotation,)
+    settings = _is_settings(command)
+    documented: Any = type(command) if settings else command
+    said, hints = meanings(documented), typing.get_type_hints(documented, include_extras=True)
+    for one in inspect.signature(documented).parameters.values():
+        default = getattr(command, one.name) if settings else one.default
+        hint = hints[one.name]
+        kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
         known = next((mark for mark in marks if hasattr(mark, "aliases")), None)
-        name = field if known is None or known.name is None else known.name
-        meaning = said.get(field, "")
+        name = one.name if known is None or known.name is None else known.name
+        meaning = said.get(one.name, "")
         if _is_settings(default):
             inner = f"{path}{name}." if name else path
             title = f"{inner[:-1]}: {summary(kind)}" if inner else meaning.lower()
-            yield from options_of(default, between, title, inner)
+            yield from options_of(default, between, title.rstrip(".") or "arguments", inner)
             continue
         value = (known and known.metavar) or value_of(kind, between)
-        written = f"--{path}{name}".replace("_", "-")
-        names = (*((known and known.aliases) or ()), written)
+        stage, dot, last = f"{path}{name}".replace("_", "-").rpartition(".")
+        names = (*((known and known.aliases) or ()), f"--{stage}{dot}{last}")
         if kind is bool:
             value = ""
-            if _SWITCH not in marks:
-                stage, dot, last = written[2:].rpartition(".")
-                names = (written, f"--{stage}{dot}no-{last}")
+            names = names if _SWITCH in marks else (*names, f"--{stage}{dot}no-{last}")
         if _POSITIONAL in marks:
             names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
         yield Option(section=section, names=names, value=value, meaning=meaning, default=default)
@@ -94,35 +99,17 @@ def _is_settings(value: object) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def _members(command: Any) -> list[tuple[str, Any, Any]]:  # noqa: ANN401 - a function or settings
-    """List the name, the annotation and the default of each parameter or field."""
-    if not _is_settings(command):
-        parameters = inspect.signature(command).parameters
-        return [(name, one.annotation, one.default) for name, one in parameters.items()]
-    hints = typing.get_type_hints(type(command), include_extras=True)
-    names = [field.name for field in dataclasses.fields(command)]
-    return [(name, hints[name], getattr(command, name)) for name in names]
-
-
 def meanings(documented: object) -> dict[str, str]:
     """Read what arguments or attributes mean from a docstring in Google's form.
 
     >>> meanings(Option)["value"]
     'What follows the name; empty where nothing does.'
     """
-    classes = documented.__mro__[::-1] if isinstance(documented, type) else (documented,)
-    found: dict[str, str] = {}
-    for one in classes:
-        inside, name = False, ""
-        for line in inspect.cleandoc(one.__doc__ or "").splitlines():
-            if line and not line.startswith(" "):
-                inside = line in ("Args:", "Attributes:")
-            entry = re.match(r" {4}(\w+): (.*)", line) if inside else None
-            if entry:
-                name, found[entry[1]] = entry[1], entry[2]
-            elif inside and line.startswith(" "):
-                found[name] += f" {line.strip()}"
-    return {name: plain(text) for name, text in found.items()}
+    text = inspect.cleandoc(documented.__doc__ or "")
+    listed = re.search(r"^(?:Args|Attributes):\n((?: .*\n|\n)*)", f"{text}\n", re.MULTILINE)
+    entries = re.split(r"^ {4}(\w+): ", listed[1] if listed else "", flags=re.MULTILINE)[1:]
+    pairs = zip(entries[::2], entries[1::2], strict=True)
+    return {name: plain(" ".join(meaning.split())) for name, meaning in pairs}
 
 
 def summary(documented: object) -> str:
@@ -150,27 +137,11 @@ def value_of(kind: object, between: str = " ") -> str:
     if origin is Literal:
         return "{" + ",".join(map(str, args)) + "}"
     if origin in (Union, types.UnionType):
-        return "|".join(word for word in (value_of(one, between) for one in args) if word)
+        return "|".join(value_of(one, between) for one in args if one is not types.NoneType)
     if origin is tuple:
         word = "FLOAT" if get_args(args[0]) else value_of(args[0])
         return f"{word}{between}..." if args[-1] is Ellipsis else between.join([word] * len(args))
     return _WORDS.get(kind, "VALUE")
-
-
-Job = TypeVar("Job")
-
-# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
-LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # typed as what it marks
-Flag = tyro.conf.FlagCreatePairsOff[bool]
-
-OF_EVERY_COMMAND = """\
-of every command:
-  -q, --quiet             Nothing but warnings, errors and what was asked for.
-  --json                  Events as JSON, one a line, on standard output.
-  --log-level LEVEL       error, warning, info or debug. (default: info)
-  -h, --help              This page.
-"""
-_COLUMN, _WIDEST, _LONGEST = 26, 100, 60
 
 
 def read_arguments(
@@ -192,94 +163,38 @@ def read_arguments(
         ConfigError: Unknown or wrong arguments.
         SystemExit: ``--help`` was asked for.
     """
-    asked = {"-h", "--help", "--help-all"} & {*arguments}
-    if asked:
-        sys.stdout.write(page(command, name, "--help-all" in asked, levels, rare))
+    if {"-h", "--help", "--help-all"} & {*arguments}:
+        options = list(options_of(command, "," if levels else " "))
+        shown = [one for one in options if "." not in one.names[-1] and one.names[-1] not in rare]
+        sys.stdout.write(page(name, summary(command), options, shown, "--help-all" in arguments))
         raise SystemExit(0)
     told = io.StringIO()
     try:
-        with redirect_stderr(told), _wide():
+        with redirect_stderr(told):
             return tyro.cli(
                 command,
                 prog=f"pimper {name}",
                 args=list(arguments),
                 config=(LEVELS,) if levels else (),
             )
-    except SystemExit as ended:
-        if not ended.code:
-            raise
+    except SystemExit:
         options = options_of(command, "," if levels else " ")
         raise ConfigError(_paragraph(told.getvalue(), name, options, arguments)) from None
-
-
-def page(
-    command: Callable[..., object],
-    name: str,
-    everything: bool = False,
-    levels: bool = False,
-    rare: Collection[str] = (),
-) -> str:
-    """Write the help of a command: of what :func:`read_arguments` reads, or of ``everything``."""
-    options = list(options_of(command, "," if levels else " "))
-    shown = [one for one in options if everything or not (one.is_setting or one.names[-1] in rare)]
-    needed = [one for one in options if one.default is REQUIRED or one.names[0][0] != "-"]
-    usage = " ".join(f"{one.names[0]} {_value(one, 0)}".strip() for one in needed)
-    width = min(shutil.get_terminal_size().columns, _WIDEST)
-    lines = [f"usage: pimper {name} {usage + ' ' * bool(usage)}[options]", ""]
-    for place, paragraph in enumerate(summary(command).split("\n\n")):
-        lines += [""] * bool(place) + textwrap.wrap(" ".join(paragraph.split()), width)
-    for section in dict.fromkeys(one.section for one in shown):
-        lines += ["", *textwrap.wrap(f"{section.rstrip('.') or 'arguments'}:", width)]
-        for one in shown:
-            lines += _entry(one, width) if one.section == section else []
-    lines += ["", OF_EVERY_COMMAND.rstrip()]
-    if len(shown) < len(options):
-        hidden = len(options) - len(shown)
-        lines.append(f"  --help-all              This page with {hidden} more options.")
-    return "\n".join(lines) + "\n"
-
-
-def _entry(option: Option, width: int) -> list[str]:
-    first, *others = option.names
-    pair = bool(others) and others[-1].endswith(f"no-{first[2:].rpartition('.')[2]}")
-    written = f"--[no-]{first[2:]}" if pair else ", ".join(option.names)
-    names = f"  {written} {_value(option, _LONGEST)}".rstrip()
-    text = option.meaning
-    if _value(option, _LONGEST) != option.value:
-        text += f" One of {option.value[1:-1].replace(',', ', ')}."
-    default: object = option.default
-    if default not in (REQUIRED, None, "", ()) and default is not False:
-        default = ",".join(map(str, default)) if isinstance(default, tuple) else default
-        text += f" (default: {default})"
-    column = " " * _COLUMN
-    lines = textwrap.wrap(
-        text, width, initial_indent=column, subsequent_indent=column, break_on_hyphens=False
-    )
-    if len(names) + 2 > _COLUMN or not lines:
-        return [names, *lines]
-    return [names.ljust(_COLUMN) + lines[0].lstrip(), *lines[1:]]
-
-
-def _value(option: Option, longest: int) -> str:
-    """Return what follows an option; where its choices are too long, a word for them."""
-    if option.value.startswith("{") and len(option.value) > longest:
-        return option.names[-1].lstrip("-").upper()
-    return option.value
 
 
 def _paragraph(told: str, name: str, options: Iterator[Option], arguments: Sequence[str]) -> str:
     """Make one paragraph of what tyro says in a box."""
     # A title, then rows between bars; or without any, where the terminal has no such characters.
-    _, *rows = [row.strip(" │|") for row in told.strip().splitlines()] or [""]
-    text = " ".join(row for row in rows if not re.fullmatch(r"\W*", row))
-    text = re.split(r"For full helptext", text)[0].strip()
+    rows = [row.strip(" │|") for row in told.strip().splitlines()[1:]]
+    text = " ".join(row for row in rows if re.search(r"\w", row))
+    text = text.partition("For full helptext")[0].strip()
     text = text.replace(f"Missing from pimper {name}:", "missing:")
     wrong = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
     for option in options if wrong else ():
         if wrong and wrong[1] in option.names:  # tyro tells of its types, and of Python's
             text = f"{wrong[1]} is {_given(wrong[1], arguments)}; needed: {option.value}. "
             text += option.meaning
-    return f"{text or told.strip()} See `pimper {name} --help`."
+    return f"{text} See `pimper {name} --help`."
 
 
 def _given(option: str, arguments: Sequence[str]) -> str:
@@ -292,15 +207,48 @@ def _given(option: str, arguments: Sequence[str]) -> str:
     return "something else"
 
 
-@contextmanager
-def _wide() -> Iterator[None]:
-    """Let no line be broken."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "10000"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
+def page(
+    name: str, about: str, options: Sequence[Option], shown: Sequence[Option], everything: bool
+) -> str:
+    """Write the help of a command, of some of its options or of ``everything``."""
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    needed = [one for one in options if one.default is REQUIRED or one.names[0][0] != "-"]
+    usage = [f"{one.names[0]} {_short(one, 0)}".strip() for one in needed]
+    lines = [" ".join(["usage: pimper", name, *usage, "[options]"])]
+    for paragraph in about.split("\n\n"):
+        lines += ["", *textwrap.wrap(" ".join(paragraph.split()), width)]
+    some = options if everything else shown
+    for section in dict.fromkeys(one.section for one in some):
+        lines += ["", *textwrap.wrap(f"{section}:", width)]
+        for one in some:
+            lines += _entry(one, width) if one.section == section else []
+    lines.append(OF_EVERY_COMMAND.rstrip())
+    if hidden := len(options) - len(some):
+        lines.append(f"  --help-all              This page with {hidden} more options.")
+    return "\n".join(lines) + "\n"
+
+
+def _entry(option: Option, width: int) -> list[str]:
+    value, text = _short(option, _LONGEST), option.meaning
+    head = f"  {', '.join(option.names)} {value}".rstrip()
+    if value != option.value:
+        text += f" One of {option.value[1:-1].replace(',', ', ')}."
+    if option.default not in (REQUIRED, None, "", ()) and option.default is not False:
+        default = str(option.default)
+        if isinstance(option.default, tuple):
+            default = ",".join(map(str, option.default))
+        text += f" (default: {default})"
+    column = " " * _COLUMN
+    lines = textwrap.wrap(
+        text, width, initial_indent=column, subsequent_indent=column, break_on_hyphens=False
+    )
+    if len(head) + 2 > _COLUMN or not lines:
+        return [head, *lines]
+    return [head.ljust(_COLUMN) + lines[0].lstrip(), *lines[1:]]
+
+
+def _short(option: Option, longest: int) -> str:
+    """Return what follows an option; where its choices are too long, a word for them."""
+    if option.value.startswith("{") and len(option.value) > longest:
+        return option.names[-1].lstrip("-").upper()
+    return option.value

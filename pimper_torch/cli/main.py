@@ -14,9 +14,9 @@ import errno
 import gc
 import io
 import os
+import signal
 import sys
 import traceback
-import types
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -24,12 +24,13 @@ from importlib import import_module
 from typing import TextIO
 
 from pimper_torch.cli.commands import OF_BENCH, brought, listed
-from pimper_torch.cli.deaths import limit, write_report
+from pimper_torch.cli.deaths import write_report
 from pimper_torch.cli.output import Output, split
-from pimper_torch.cli.supervise import exit_code, stoppable
+from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
+from pimper_torch.doors.io.version import versions
 from pimper_torch.doors.outputs.files import require_name
 from pimper_torch.runtime.cores import usable_cores
-from pimper_torch.runtime.errors import InputError, PimperError, PimperWarning
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperError, PimperWarning
 
 _HELP = """\
 usage: pimper COMMAND [options]
@@ -87,12 +88,11 @@ _REFUSALS = (
 )
 
 
-def main(arguments: Sequence[str] | None = None, *, supervised: bool = False) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line in this process.
 
     Args:
         arguments: Those of the process unless given.
-        supervised: Whether another process ends this one on a second signal to stop.
 
     Returns:
         0 for success; 2 for anything the user can correct, in one paragraph; 130 when interrupted,
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None, *, supervised: bool = False) ->
         _print_anything()
     try:
         try:
-            return _main(arguments, supervised)
+            return _main(list(sys.argv[1:] if arguments is None else arguments))
         finally:
             sys.stdout.flush()
     except OSError as error:
@@ -113,32 +113,37 @@ def main(arguments: Sequence[str] | None = None, *, supervised: bool = False) ->
 
 
 def _print_anything() -> None:
-    """Let no character be one that cannot be printed."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
+    """Let no character be one that cannot be printed, and no stream be closed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - for good
+        elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _main(arguments: Sequence[str] | None, supervised: bool) -> int:
-    given = list(sys.argv[1:] if arguments is None else arguments)
+def _main(given: list[str]) -> int:
     if not given or given[0] in ("-h", "--help", "--help-all"):
         sys.stdout.write(listed(_HELP, brought()))
         return 0 if given else _BAD_INPUT
     if given[0] == "--version":
-        from pimper_torch.doors.io.version import versions
-
         sys.stdout.writelines(f"{name} {version}\n" for name, version in versions().items())
         return 0
+    output = Output()
     try:
-        output, rest = split(given[1:])
-    except PimperError as error:
-        return _failed(Output(), error)
-    home = _COMMANDS.get(given[0]) or brought().get(given[0])
-    if home is None:
-        output.error("ConfigError", _no_command(given[0]), _BAD_INPUT)
-        return _BAD_INPUT
-    with _readable_warnings(output):
-        return _run(given[0], home, rest, output, supervised)
+        output, arguments = split(given[1:])
+        home = commands().get(given[0])
+        if home is None:
+            raise ConfigError(_no_command(given[0]))
+        with _readable_warnings(output), stoppable():
+            _run(given[0], home, arguments, output)
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
+            raise error.__context__ from None
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        return _failed(output, error)
+    return 0
 
 
 def commands() -> dict[str, str]:
@@ -157,58 +162,43 @@ def _no_command(name: str) -> str:
     return f"there is no command `{name}`.{hint} See `pimper --help`."
 
 
-def _limit_arenas() -> None:
-    """Let threads share places that memory is taken from: one for each core.
+def _run(command: str, home: str, arguments: list[str], output: Output) -> None:
+    for argument in arguments:
+        require_name(argument, InputError)
+    job = import_module(_READERS.get(home, home)).checked(command, arguments)
+    output.event("start", command=command, arguments=arguments, versions=versions(), format=1)
+    _prepare_threads()
+    if command not in _LIGHT:
+        _load_torch()
+    run = import_module(home).run
+    gc.freeze()  # what was imported is out of all searches for unused memory
+    run(job, output)
 
-    The C library of Linux makes eight, and what runs leave in each adds up: from the second to the
-    fourth run in one process memory grew by 2.0 %, with two of them by 0.2.
-    """
-    with suppress(OSError, AttributeError):  # other systems have no such function
-        ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
-
-def _run(command: str, home: str, arguments: list[str], output: Output, supervised: bool) -> int:
-    # Read when torch is loaded. Threads that spin while they wait take the processor from
-    # those they wait for when the machine is busy, and many small steps then take ten times
-    # as long.
+def _prepare_threads() -> None:
+    """Set what torch and the C library read once."""
+    # Threads that spin while they wait take the processor from those they wait for when the
+    # machine is busy, and many small steps then take ten times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Pages of 2 MB where the system has them: a fifth of the demo's time went into 4 kB ones.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     if usable_cores() < (os.cpu_count() or 1):  # OpenMP knows of affinity, not of quotas
         os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
-    _limit_arenas()
-    try:
-        for argument in arguments:
-            require_name(argument, InputError)
-        job = import_module(_READERS.get(home, home)).checked(command, arguments)
-        if output.as_json:
-            from pimper_torch.doors.io.version import versions
-
-            output.event(
-                "start", command=command, arguments=arguments, versions=versions(), format=1
-            )
-        if command not in _LIGHT:
-            import torch  # noqa: F401 - before signals raise: half an import leaves odd errors
-        run = _loaded(home).run
-        with stoppable(repeat=not supervised):
-            run(job, output)
-    except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
-            raise error.__context__ from None
-        raise
-    except (Exception, KeyboardInterrupt) as error:
-        return _failed(output, error)
-    return 0
+    # Places that memory is taken from, one for each core. The C library of Linux makes eight, and
+    # what runs leave in each adds up: from the second to the fourth run in one process memory grew
+    # by 2.0 %, with two of them by 0.2.
+    with suppress(OSError, AttributeError):  # other systems have no such function
+        ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
 
-def _loaded(home: str) -> types.ModuleType:
-    """Import a module, and leave what it brings out of all searches for unused memory."""
-    gc.disable()
-    try:
-        return import_module(home)
-    finally:
-        gc.freeze()
-        gc.enable()
+def _load_torch() -> None:
+    """Import torch whole before signals are heard: half of it would end in odd errors."""
+    blockable = hasattr(signal, "pthread_sigmask")
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS) if blockable else None
+    import torch  # noqa: F401
+
+    if former is not None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
 def _failed(output: Output, error: BaseException) -> int:
@@ -232,7 +222,7 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     text = (
         f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; no result "
-        f"was written.{limit()}{notes} {report or 'Above'} is what a report needs: please send it."
+        f"was written.{notes} {report or 'Above'} is what a report needs: please send it."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED

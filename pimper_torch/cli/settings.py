@@ -1,20 +1,19 @@
 """``pimper config``: the settings of a preset as YAML, or what some of them mean."""
 
 import dataclasses
-import difflib
 import textwrap
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from pimper_torch.cli.arguments import meanings, read_arguments, summary, value_of
+from pimper_torch.cli.arguments import meanings, options_of, read_arguments, summary
 from pimper_torch.cli.output import Output
 from pimper_torch.method.chains.chain_config import Config, load_config
-from pimper_torch.runtime.config import presets, to_mapping, written
+from pimper_torch.runtime.config import nearest, presets, to_mapping, written
 from pimper_torch.runtime.errors import ConfigError
 
 
@@ -29,17 +28,19 @@ class _Job:
 
 def run(job: _Job, output: Output) -> None:
     """Carry out ``config``."""
-    value: object = job.config
-    owner = value
+    value: object = to_mapping(job.config)
     for name in job.path:
-        owner, value = value, getattr(value, name)
-    if dataclasses.is_dataclass(value):
-        lines = [f"# {job.preset}: {text}" for text in [summary(type(value))] if not job.path]
-        output.say("\n".join([*lines, *_yaml(job.config, job.path)]))
-        output.result(settings=to_mapping(value))
-    else:
-        output.say(_explained(job, owner))
-        output.result(settings={".".join(job.path): value})
+        assert isinstance(value, dict)
+        value = value[name]
+    lines = [f"# {job.preset}: {summary(type(job.config))}"] * (not job.path)
+    if not isinstance(value, dict):
+        name = f"--{'.'.join(job.path).replace('_', '-')}"
+        for one in options_of(job.config, ","):
+            if name == one.names[0]:
+                lines.append(f"# option: {', '.join(one.names)} {one.value}".rstrip())
+        value = {".".join(job.path): value}
+    output.say("\n".join([*lines, *_yaml(job.config, job.path)]).lstrip("\n"))
+    output.result(settings=value)
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
@@ -69,23 +70,20 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def _require_setting(settings: object, path: Sequence[str], name: str) -> None:
-    known = ["", *_names(settings, "")]
+    known = ["", *_names(to_mapping(settings), "")]
     if ".".join(path) not in known:
-        near = difflib.get_close_matches(name, [*known, *presets()], n=1, cutoff=0.5)
         ends = [one for one in known if one.endswith(f".{path[-1]}")]
-        hint = f" Did you mean `{(ends or near)[0]}`?" if ends or near else ""
+        hint = f" Did you mean `{ends[0]}`?" if ends else nearest(name, [*known, *presets()])
         raise ConfigError(
             f"there is no setting or preset `{name}`.{hint} `pimper config` prints all settings."
         )
 
 
-def _names(settings: object, stem: str) -> Iterator[str]:
-    assert dataclasses.is_dataclass(settings)
-    for field in dataclasses.fields(settings):
-        yield f"{stem}{field.name}"
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _names(value, f"{stem}{field.name}.")
+def _names(settings: Mapping[str, object], stem: str) -> Iterator[str]:
+    for name, value in settings.items():
+        yield stem + name
+        if isinstance(value, dict):
+            yield from _names(value, f"{stem}{name}.")
 
 
 def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str]:
@@ -108,17 +106,3 @@ def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str
 def _comment(text: str, indent: str) -> list[str]:
     start = f"{indent}# "
     return textwrap.wrap(text, 96, initial_indent=start, subsequent_indent=start)
-
-
-def _explained(job: _Job, owner: object) -> str:
-    """Report what a setting means, what it may be, and how it is set."""
-    hint = typing.get_type_hints(type(owner))[job.path[-1]]
-    name = ".".join(job.path)
-    lines = [
-        f"{name}: {written(to_mapping(owner)[job.path[-1]])}  # in {job.preset}",
-        f"needed: {'true or false' if hint is bool else value_of(hint, ', ')}",
-        f"option: --{name.replace('_', '-')}",
-        "file:",
-        *filter(None, _yaml(job.config, job.path)),
-    ]
-    return "\n".join(lines)

@@ -203,19 +203,10 @@ def told(command, capsys, page="--help-all"):
     with pytest.raises(SystemExit):
         main([command, page])
     lines = re.findall(r"^  (-.*?)(?:  .*)?$", capsys.readouterr().out, flags=re.MULTILINE)
-    written = [name for line in lines for name in re.findall(r"(?:^|, )(--?[\w.[\]-]+)", line)]
-    return {one for name in written for one in both(name)} - COMMON
+    return {name for line in lines for name in re.findall(r"(?:^|, )(--?[\w.-]+)", line)} - COMMON
 
 
 COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "--json", "--log-level"}
-
-
-def both(name):
-    """Give the two names of a switch that is written ``--[no-]x`` or ``--[no-]stage.x``."""
-    if not name.startswith("--[no-]"):
-        return [name]
-    stage, dot, last = name.removeprefix("--[no-]").rpartition(".")
-    return [f"--{stage}{dot}{no}{last}" for no in ("", "no-")]
 
 
 @pytest.mark.parametrize("command", RUNS)
@@ -276,11 +267,10 @@ def effects(preset, capsys):
     """Give what the help says of each option of a preset, without its default."""
     with pytest.raises(SystemExit):
         main(["reconstruct", "--preset", preset, "--help-all"])
-    page = re.split(r"^  (--\S+)(.*)$", capsys.readouterr().out, flags=re.MULTILINE)
+    page = re.split(r"^  (--[^\s,]+)(.*)$", capsys.readouterr().out, flags=re.MULTILINE)
     return {
         name: re.sub(r"\(default:.*", "", beside.partition("  ")[2] + below, flags=re.S)
-        for written, beside, below in zip(page[1::3], page[2::3], page[3::3], strict=True)
-        for name in both(written)
+        for name, beside, below in zip(page[1::3], page[2::3], page[3::3], strict=True)
     }
 
 

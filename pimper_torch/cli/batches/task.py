@@ -38,7 +38,7 @@ die_with(int(sys.argv[1]))
 del sys.argv[1]
 faulthandler.enable()
 from pimper_torch.cli.main import main
-sys.exit(main(supervised=True))
+sys.exit(main())
 """
 # Of errors that another worker, with more memory, may not make.
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
