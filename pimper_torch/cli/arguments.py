@@ -178,8 +178,8 @@ def read_arguments(
                 config=(LEVELS,) if levels else (),
             )
     except SystemExit:
-        options = options_of(command, "," if levels else " ")
-        raise ConfigError(_paragraph(told.getvalue(), name, options, arguments)) from None
+        known = options_of(command, "," if levels else " ")
+        raise ConfigError(_paragraph(told.getvalue(), name, known, arguments)) from None
 
 
 def _paragraph(told: str, name: str, options: Iterator[Option], arguments: Sequence[str]) -> str:

@@ -60,14 +60,13 @@ albedo and light.
 Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
 143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
 """
-# Where each of this package is carried out, and where its arguments are read if that is elsewhere.
-# `--help` ends `checked` with SystemExit; it and `run` refuse with PimperError before anything is
-# written.
+# Where each of this package is carried out. `checked` reads and checks the arguments; `--help` ends
+# it with SystemExit. It and `run` refuse with PimperError before anything is written.
 _COMMANDS = {
-    "reconstruct": "pimper_torch.cli.run",
+    "reconstruct": "pimper_torch.cli.options",
     "batch": "pimper_torch.cli.batches.cli",
     "doctor": "pimper_torch.cli.doctor_command",
-    "demo": "pimper_torch.cli.run",
+    "demo": "pimper_torch.cli.options",
     "config": "pimper_torch.cli.settings",
     "export": "pimper_torch.cli.export",
     "gamma": "pimper_torch.single_view.cli.gamma",
@@ -76,7 +75,6 @@ _COMMANDS = {
     "markers": "pimper_torch.cli.markers",
     "clean": "pimper_torch.cli.clean",
 }
-_READERS = {"pimper_torch.cli.run": "pimper_torch.cli.options"}
 _LIGHT = ("batch", "clean", "config")  # carried out without torch, too
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -165,14 +163,13 @@ def _no_command(name: str) -> str:
 def _run(command: str, home: str, arguments: list[str], output: Output) -> None:
     for argument in arguments:
         require_name(argument, InputError)
-    job = import_module(_READERS.get(home, home)).checked(command, arguments)
+    carried_out_by = import_module(home)
+    job = carried_out_by.checked(command, arguments)
     output.event("start", command=command, arguments=arguments, versions=versions(), format=1)
     _prepare_threads()
     if command not in _LIGHT:
         _load_torch()
-    run = import_module(home).run
-    gc.freeze()  # what was imported is out of all searches for unused memory
-    run(job, output)
+    carried_out_by.run(job, output)
 
 
 def _prepare_threads() -> None:
@@ -197,6 +194,7 @@ def _load_torch() -> None:
     former = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS) if blockable else None
     import torch  # noqa: F401
 
+    gc.freeze()  # what was imported is out of all searches for unused memory
     if former is not None:
         signal.pthread_sigmask(signal.SIG_SETMASK, former)
 

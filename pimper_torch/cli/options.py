@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
+from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.outputs.files import require_name
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart
@@ -30,51 +31,22 @@ from pimper_torch.runtime.errors import ConfigError, InputError
 from pimper_torch.runtime.file_names import view_named
 
 
-def _number(word: str, option: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise ConfigError(f"{option}: the length is {word!r}; needed: a number.") from None
-
-
-def _bar(words: list[str]) -> ScaleBar:
-    first, second, length = words
-    return ScaleBar(
-        first=Mark.read(first), second=Mark.read(second), length=_number(length, "--scale-bar")
-    )
-
-
-def _distance(words: list[str]) -> CameraDistance:
-    first, second, length = words
-    return CameraDistance(first=first, second=second, length=_number(length, "--camera-distance"))
-
-
-_Place = Annotated[
-    Mark,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NAME,x,y",
-        instance_from_str=lambda words: Mark.read(words[0]),
-        is_instance=lambda one: isinstance(one, Mark),
-        str_from_instance=lambda one: [str(one)],
-    ),
-]
-Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar="NAME,x,y")]
-
-
-def _three_words(read: Any, kind: type) -> Any:  # noqa: ANN401 - of tyro's marks
+def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # noqa: ANN401 - tyro's
+    """Make a type that is read from one word, in lists, too."""
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=3,
-        metavar="A B LENGTH",
-        instance_from_str=read,
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: read(words[0]),
         is_instance=lambda one: isinstance(one, kind),
-        str_from_instance=lambda one: [str(one.first), str(one.second), str(one.length)],
+        str_from_instance=lambda one: [str(one)],
     )
 
 
-_Bar = Annotated[ScaleBar, _three_words(_bar, ScaleBar)]
-_Distance = Annotated[CameraDistance, _three_words(_distance, CameraDistance)]
-
+_Place = Annotated[Mark, _word(Mark, Mark.read, "NAME,x,y")]
+_Name = Annotated[str, _word(str, str, "NAME")]
+_Bar = tuple[_Place, _Place, float]
+_Distance = tuple[_Name, _Name, float]
+Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar="NAME,x,y")]
 ScaleBars = Annotated[
     tyro.conf.UseAppendAction[tuple[_Bar, ...]], tyro.conf.arg(metavar="A,x,y B,x,y LENGTH")
 ]
@@ -196,6 +168,21 @@ class InputOptions:
             str(self.silhouettes or (*self.object_at, "")[0]),
             "none beside --masks, which are followed as they are",
         )
+        _ = self.bars, self.distances  # refused before anything is read
+
+    @property
+    def bars(self) -> tuple[ScaleBar, ...]:
+        """Places in photographs with the lengths between them."""
+        bars = self.scale_bar
+        return tuple(ScaleBar(first=one, second=two, length=length) for one, two, length in bars)
+
+    @property
+    def distances(self) -> tuple[CameraDistance, ...]:
+        """Photographs with the lengths between their cameras."""
+        pairs = self.camera_distance
+        return tuple(
+            CameraDistance(first=one, second=two, length=length) for one, two, length in pairs
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,6 +290,13 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
             )
 
 
+def run(job: Job, output: Output) -> None:
+    """Carry out ``reconstruct`` or ``demo``."""
+    from pimper_torch.cli.run import carry_out
+
+    carry_out(job, output)
+
+
 def checked(command: str, arguments: Sequence[str]) -> Job:
     """Read the arguments, and check what can be checked without reading photographs."""
     return check(parse(command, arguments))
@@ -330,7 +324,7 @@ def check(job: Job) -> Job:
     for name in _references(job.config):
         view_named(name, present)
     pointed = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
-    for name in (*measured_in(job.inputs.scale_bar, job.inputs.camera_distance), *pointed):
+    for name in (*measured_in(job.inputs.bars, job.inputs.distances), *pointed):
         number_of(name, present)
     return job
 

@@ -49,8 +49,8 @@ from pimper_torch.runtime.reporting import accounted, reported, stage
 from pimper_torch.runtime.store import Store
 
 
-def run(job: Job, output: Output) -> None:
-    """Carry out ``reconstruct`` or ``demo``."""
+def carry_out(job: Job, output: Output) -> None:
+    """Reconstruct, and write and show what the arguments ask for."""
     _check_device(job.common.device)
     with Viewer() if job.common.view else nullcontext() as viewer:
         if viewer is not None:
@@ -71,7 +71,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, observer, _store(job))
-        chain.needed = tuple(measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
+        chain.needed = tuple(measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
@@ -244,7 +244,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
     """Return scale bars as :func:`in_files`."""
     return tuple(
         replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
-        for bar in job.inputs.scale_bar
+        for bar in job.inputs.bars
     )
 
 
@@ -256,7 +256,7 @@ def sized(
     scale = find_scale(
         result,
         bars=bars,
-        camera_distances=inputs.camera_distance,
+        camera_distances=inputs.distances,
         markers=inputs.markers,
         unit=inputs.unit,
         own_frame=inputs.sparse is not None,

@@ -4,14 +4,12 @@ import math
 import os
 import shlex
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import warnings
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -22,7 +20,6 @@ from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result
 from pimper_torch.doors.io.version import installed_version
 from pimper_torch.doors.outputs.marker import MARKER
-from pimper_torch.ground.radiometry import Encoding, linear_from_srgb
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig, load_config
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.records import LeftOut, Mesh, Silhouettes
@@ -31,24 +28,6 @@ from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
 
 def run(*arguments):
     return main([str(argument) for argument in arguments])
-
-
-@pytest.fixture
-def write_profile():
-    """Write photographs anew with a linear profile, and give the pixels of the first."""
-
-    def write(folder):
-        tags, body, start = (b"kTRC", b"desc"), b"curv" + bytes(8), 132 + 24
-        entries = struct.pack(">4sII4sII", tags[0], start, 12, tags[1], start, 12)
-        head = bytearray(128)
-        head[12:24], head[36:40] = b"mntrGRAY" + b"XYZ ", b"acsp"
-        profile = bytes(head) + struct.pack(">I", 2) + entries + body
-        pictures = [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
-        for path, picture in zip(sorted(folder.iterdir()), pictures, strict=True):
-            Image.fromarray(picture).save(path, icc_profile=profile)
-        return pictures[0]
-
-    return write
 
 
 ASKED_FOR = {  # in vain
@@ -88,23 +67,6 @@ def test_a_run_closes_with_what_guards_left_out(
     assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
-
-
-def test_a_linear_profile_is_followed_unless_a_response_is_given(
-    photos, chain, tmp_path, write_profile, capsys
-):
-    picture = write_profile(photos)
-    stored = torch.from_numpy(picture / 255).movedim(-1, 0)
-    assert run("reconstruct", photos, "-o", tmp_path / "a", "--photographs.response", "auto") == 0
-    config, views, _ = chain.given
-    assert config.photographs == Encoding()
-    assert float((views.images[0].double() - stored).abs().max()) < 1e-6
-    assert "is given" not in capsys.readouterr().err
-    assert run("reconstruct", photos, "-o", tmp_path / "b", "--photographs.response", "srgb") == 0
-    assert float((chain.given[1].images[0].double() - linear_from_srgb(stored)).abs().max()) < 1e-6
-    assert "the response srgb is given, but an ICC profile says linear" in (
-        " ".join(capsys.readouterr().err.split())
-    )
 
 
 def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):

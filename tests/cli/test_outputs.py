@@ -64,27 +64,24 @@ def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, caps
     assert "lies in the folder of the result" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--images", "--mesh"])
-def test_an_input_of_convert_in_its_output_is_refused(project, capsys, option):
-    others = ["--source", "colmap", "--target", "idr", "--overwrite"]
-    assert run("convert", project, "-o", project, *others) == 2
-    assert "DATA" in capsys.readouterr().err
-    inside = project / "sparse"
-    assert run("convert", project.parent, "-o", project, option, inside, *others) == 2
-    assert option in capsys.readouterr().err
-
-
-def test_an_input_of_export_in_its_output_is_refused(project, capsys):
-    for given in ([project], [project.parent, "--photos", project / "sparse"]):
-        assert run("export", *given, "-o", project, "--format", "maps", "--overwrite") == 2
-        assert "lies in the folder of the result" in capsys.readouterr().err
-
-
-def test_an_input_of_bench_in_its_output_is_refused(project, capsys):
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("convert {own} -o {own} --source colmap --target idr", "DATA"),
+        ("convert {other} -o {own} --images {own}/sparse --source colmap --target idr", "--images"),
+        ("convert {other} -o {own} --mesh {own}/sparse --source colmap --target idr", "--mesh"),
+        ("export {own} -o {own} --format maps", "RESULT"),
+        ("export {other} -o {own} --photos {own}/sparse --format maps", "--photos"),
+        ("bench -o {own} --cache {own}/sparse", "--cache"),
+        ("bench -o {own} --methods {own}/mine.yaml", "mine.yaml"),
+    ],
+)
+def test_an_input_of_other_commands_in_their_output_is_refused(project, capsys, line, told):
     (project / "mine.yaml").write_text("seed: 3\n")
-    for given in (["--cache", project / "sparse"], ["--methods", project / "mine.yaml"]):
-        assert run("bench", "-o", project, "--overwrite", *given) == 2
-        assert "lies in the folder of the result" in capsys.readouterr().err
+    assert run(*line.format(own=project, other=project.parent).split(), "--overwrite") == 2
+    message = capsys.readouterr().err
+    assert told in message
+    assert "lies in the folder of the result" in message
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert", "export"])

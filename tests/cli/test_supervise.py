@@ -22,7 +22,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started this
 from pimper_torch.cli import main
 main._COMMANDS = {"config": "stand_in", "reconstruct": "stand_in"}
 main._LIGHT = ("config", "reconstruct")
-main._READERS = {}
 from pimper_torch.cli.supervise import main as supervised
 sys.exit(supervised())
 """

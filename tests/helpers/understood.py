@@ -12,7 +12,7 @@ from unittest import mock
 import tyro
 
 from pimper_torch.cli.arguments import REQUIRED, Option, options_of
-from pimper_torch.cli.main import _READERS, commands
+from pimper_torch.cli.main import commands
 from pimper_torch.cli.output import split
 from pimper_torch.method.chains.chain_config import load_config
 from pimper_torch.runtime.errors import ConfigError, PimperError
@@ -99,8 +99,7 @@ def options(name: str) -> Mapping[str, Option]:
 
 
 def _checker(name: str) -> Callable[[str, Sequence[str]], object]:
-    home = COMMANDS[name]
-    return import_module(_READERS.get(home, home)).checked
+    return import_module(COMMANDS[name]).checked
 
 
 @functools.cache
