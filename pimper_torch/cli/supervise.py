@@ -14,9 +14,6 @@ import time
 import types
 from contextlib import suppress
 
-from pimper_torch.cli.deaths import what_killed
-from pimper_torch.cli.main import main as carry_out
-from pimper_torch.cli.output import Output
 from pimper_torch.cli.stopping import SIGNALS
 
 _REMEDY = (
@@ -34,14 +31,12 @@ def main() -> int:
         killed.
     """
     if not hasattr(os, "fork"):
-        return carry_out()
+        return _carry_out()
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watcher, worker = os.getpid(), os.fork()
 
     def heard(number: int, frame: types.FrameType | None) -> None:
-        # In the worker, `stoppable` hears what stops it: before it, nothing is begun, and behind
-        # it the end is near.
-        if worker != 0:
+        if worker != 0:  # which `stoppable` stops; behind it, its end is near
             with suppress(ProcessLookupError):  # it has just ended
                 os.kill(worker, number)
 
@@ -50,9 +45,8 @@ def main() -> int:
             signal.signal(number, heard)
     if worker == 0:
         die_with(watcher)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         faulthandler.enable()  # a crash writes where every thread was
-        code = carry_out()
+        code = _carry_out()  # signals wait until they can be raised
         if code > 128:  # interrupted: whoever waits does not wait for libraries to tidy up
             sys.stderr.flush()
             os._exit(code)
@@ -62,10 +56,19 @@ def main() -> int:
     ended = os.waitstatus_to_exitcode(status)
     if ended >= 0:
         return ended
+    from pimper_torch.cli.deaths import what_killed
+    from pimper_torch.cli.output import Output
+
     Output(as_json="--json" in sys.argv).error(
         "Killed", f"{what_killed(ended)} {_REMEDY}", 128 - ended
     )
     return 128 - ended
+
+
+def _carry_out() -> int:
+    from pimper_torch.cli.main import main as carry_out
+
+    return carry_out()
 
 
 def die_with(watcher: int) -> None:

@@ -4,8 +4,8 @@ import torch
 from PIL import Image
 
 from pimper_torch.cli.main import main
-from pimper_torch.single_view.cli import gamma
 from pimper_torch.single_view.cli.gamma import advice
+from pimper_torch.single_view.factorization import estimate_gamma
 from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 
 
@@ -45,7 +45,7 @@ def test_the_mask_is_shrunk_with_the_photographs(fixed, capsys, monkeypatch):
         given.update(views=views, mask=mask)
         return estimate(1.81, (0.005, 0.012, 0.009))
 
-    monkeypatch.setattr(gamma, "gamma_of_photographs", stand_in)
+    monkeypatch.setattr(estimate_gamma, "gamma_of_photographs", stand_in)
     options = ["--mask", str(fixed / "mask.png"), "--max-size-px", "20"]
     assert main(["gamma", str(fixed / "photos"), *options]) == 0
     assert given["views"].images.shape[-2:] == given["mask"].shape == (20, 20)
@@ -82,7 +82,7 @@ def test_the_curve_that_does_as_well_is_advised(gamma, residuals, advised):
 
 def test_an_undetermined_gamma_advises_no_option(fixed, capsys, monkeypatch):
     undetermined = estimate(1.81, (0.2, 0.3, 0.3), determined=False)
-    monkeypatch.setattr(gamma, "gamma_of_photographs", lambda *_, **__: undetermined)
+    monkeypatch.setattr(estimate_gamma, "gamma_of_photographs", lambda *_, **__: undetermined)
     assert main(["gamma", str(fixed / "photos")]) == 0
     told = capsys.readouterr()
     assert "a camera that moved" in told.out
