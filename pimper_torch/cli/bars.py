@@ -62,7 +62,8 @@ class Bars:
     def finished(self, report: StageReport) -> None:
         """Complete the bar, and say what was found."""
         self._forecast.finished(report)
-        found = ", ".join(_figures(report)[: self._most])
+        figures = list(report.figures.items())[: self._most]
+        found = ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in figures)
         if self._task is not None:
             self._progress.update(self._task, completed=1, total=1, found=found)
         if not self.console.is_terminal:
@@ -75,10 +76,6 @@ class Bars:
     def _left(self) -> str:
         seconds = self._forecast.seconds_left()
         return "" if seconds is None else f"about {minutes(seconds)} left"
-
-
-def _figures(report: StageReport) -> list[str]:
-    return [f"{name.replace('_', ' ')} {_short(value)}" for name, value in report.figures.items()]
 
 
 def _short(value: float | int) -> str:
