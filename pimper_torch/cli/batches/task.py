@@ -42,7 +42,7 @@ sys.exit(main())
 """
 # Of errors that another worker, with more memory, may not make.
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
-_TRIES = 3
+_TRIES = 3  # a choice
 _LOOK_SECONDS = 0.5
 # A choice: a stage's step is longer in large runs, which are killed then; their stages are kept.
 _PATIENCE_SECONDS = 10.0
