@@ -118,12 +118,15 @@ def photometric_stereo(
         radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
         applied, free = None, "nothing"
         if lights is not None:
-            if int(torch.linalg.matrix_rank(lights[used], rtol=1e-6)) < 3:
+            shining = lights[used].double()
+            finite = bool(shining.isfinite().all())
+            if not finite or int(torch.linalg.matrix_rank(shining, rtol=1e-6)) < 3:
                 raise InputError(
-                    "calibrated: the lights lie in one plane through the object; needed: lights "
-                    "that span space, or normals are free across the plane. Add one from outside."
+                    "calibrated: the lights are not finite, or lie in one plane through the "
+                    "object; needed: lights that span space, or normals are free across the plane. "
+                    "Add one from outside it."
                 )
-            found = calibrated_stereo(radiance, heavy, lights[used].double(), robust=robust)
+            found = calibrated_stereo(radiance, heavy, shining, robust=robust)
         elif intrinsics is not None:
             whole = torch.zeros_like(images[used], dtype=torch.float64)
             whole[:, :, mask] = radiance
@@ -235,11 +238,6 @@ def _refuse(
             "one for each if they are known (calibrated), else none",
         ),
         (
-            lights is not None and not lights.isfinite().all(),
-            "some lights are not finite",
-            "directions times irradiances",
-        ),
-        (
             (intrinsics is not None) != (method == "perspective"),
             f"intrinsics are {'not ' if intrinsics is None else ''}given",
             "those of the camera for perspective, none for orthographic methods",
@@ -250,9 +248,14 @@ def _refuse(
             ", ".join(resolvers) or "none",
         ),
         (
-            tuple(given.shape) != (count, *size) or not ((given >= 0) & given.isfinite()).all(),
-            f"weights are {tuple(given.shape)}, some perhaps negative or not finite",
-            f"{(count, *size)}, finite and not negative",
+            tuple(given.shape) != (count, *size),
+            f"weights are {tuple(given.shape)}",
+            f"{(count, *size)}, one a sample",
+        ),
+        (
+            not ((given >= 0) & given.isfinite()).all(),
+            "some weights are negative or not finite",
+            "0 or more",
         ),
     ):
         if wrong:
