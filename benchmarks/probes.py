@@ -76,7 +76,7 @@ class Probe:
 
 
 def small_scene(
-    seed: int = 31, num_views: int = 6, width: int = 64, num_points: int = 24
+    seed: int = 31, num_views: int = 6, width: int = 64, num_points: int = 28
 ) -> tuple[SparseScene, CoarseMesh]:
     """Render a speckled sphere under wandering point lights; give its cloud and facets, too.
 

@@ -42,7 +42,7 @@ class Mine(nn.Module):
 
 def chain_on_a_sphere(preset, **stages):
     scene, coarse = (
-        each.to(torch.float32) for each in small_scene(num_views=4, width=32, num_points=12)
+        each.to(torch.float32) for each in small_scene(num_views=4, width=32, num_points=17)
     )
     given = {
         "reconstruct": Given(scene),
