@@ -308,8 +308,7 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
     assert int(both.sum()) > 200
     assert bool((lights[:, ::2] != lights[:, 1::2]).any(dim=2)[both].all())
     names = scene.views.names
-    settings = {REFERENCES[preset]: {"reference": names[7]}}
-    again = pt.load_chain(preset, settings, silhouettes=Given(step.silhouettes))
+    again = pt.load_chain(preset, {REFERENCES[preset]: {"reference": names[7]}})
     named = next(again.steps(scene, mesh=some.replace(faces=faces[:8])))
     assert named.coarse.reference == 7
 
