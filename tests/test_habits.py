@@ -124,3 +124,9 @@ def test_a_compiled_or_replicated_warp_gives_what_the_plain_one_does(wrapped):
     for one, other in zip(found.buckets, expected.buckets, strict=True):
         assert torch.equal(one.valid, other.valid)
         torch.testing.assert_close(one.radiance, other.radiance, rtol=0, atol=1e-6)
+
+
+def test_a_copy_of_a_chain_keeps_a_store(tmp_path):
+    chain = pt.load_chain("default", cache=tmp_path / "kept")
+    for again in (copy.deepcopy(chain), pickle.loads(pickle.dumps(chain))):
+        assert again.store.folder == chain.store.folder

@@ -176,3 +176,13 @@ def test_stages_give_the_same_bits_from_photographs_on_disk(photos, request):
     assert all(map(torch.equal, plain, found))
     assert all(map(is_mapped, found))
     assert again == hashed
+
+
+def test_small_tensors_and_those_of_other_devices_stay_in_memory():
+    assert not is_mapped(mapped.zeros((3, 5)))
+    assert mapped.zeros((mapped.LARGE,), torch.uint8, "meta").is_meta
+
+
+def test_a_folder_that_may_not_be_written_or_is_gone_is_passed_over(small, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    assert mapped._folder() == "/var/tmp"

@@ -180,3 +180,12 @@ def test_an_unknown_reference_is_refused_before_structure_from_motion(preset, mo
     monkeypatch.setattr(chain, "placed", lambda *given: pytest.fail("it ran"))
     with pytest.raises(pt.InputError, match=r"0 photographs are named 'nobody'; needed: one of 0"):
         chain(views)
+
+
+def test_a_chain_refuses_poses_of_another_convention():
+    cameras = cameras_on_an_arc()
+    views = photographs(cameras, lit=False)
+    poses = cameras.cam_from_world.inverse()
+    made = pt.scene_of(views.images.float(), cameras.intrinsics, poses)
+    with pytest.raises(pt.InputError, match=r"The scene: these cameras.*not its inverse"):
+        placed(made)

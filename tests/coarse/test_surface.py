@@ -189,3 +189,10 @@ def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attac
     bare = without_points(round_about)
     assert len(facets_of(mesh, bare, round_about.views.names[3]).points.facet) == 0
     assert facets_of(mesh, bare, round_about.views.names[3]).reference == 3
+
+
+def test_facets_of_a_mesh_elsewhere_are_refused(round_about):
+    vertices, faces = icosphere(2)
+    mesh = Mesh(vertices_world=1000 * vertices, faces=faces)
+    with pytest.raises(InputError, match="not where the photographs show the object"):
+        facets_of(mesh, round_about)

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels.lookup import bilinear, corners
+from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.uint8])
@@ -37,3 +37,13 @@ def test_points_that_are_no_number_are_clamped_into_the_image():
     index, right, below, across, down = corners(5, 7, math.nan, math.nan)
     assert (index, right, below, across, down) == (0, 1, 7, 0, 0)
     assert corners(5, 7, math.inf, math.inf)[:3] == (5 * 7 - 1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("area", "expected"),
+    [(0.2, (0, 0.0)), (2.0, (0, 0.5)), (4.0, (1, 0.0)), (1e9, (3, 0.0))],
+)
+def test_a_footprint_of_four_times_the_area_is_a_level_coarser(area, expected):
+    level, blend = blended_level(area, 4)
+    assert level == expected[0]
+    assert blend == pytest.approx(expected[1], abs=1e-6)

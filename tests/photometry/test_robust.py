@@ -86,3 +86,10 @@ def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(genera
     found = median_deviation(torch.where(seen, noise, 1e6), seen)
     assert_close(found, torch.tensor(3.0, dtype=torch.float64), rtol=0.01, atol=0)
     assert median_deviation(noise, torch.zeros_like(seen)) == 0
+
+
+def test_what_is_not_seen_does_not_matter_to_the_spread(generator):
+    noise = drawn(generator, 3, 400)
+    seen = torch.rand(3, 400, generator=generator) > 0.2
+    found = robust_deviation(torch.where(seen, noise, 1e6), seen)
+    assert_close(found, robust_deviation(noise, seen))
