@@ -10,6 +10,7 @@ from torch.nn.functional import pad
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.paper.seams import (
     Pulls,
@@ -226,7 +227,7 @@ def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Te
     return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
 
 
-def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, ""]:
+def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Scalar:
     square = mismatches(pulls, transforms).square().sum(dim=-1)
     return average(square[pulls.weight > 0]).sqrt()
 

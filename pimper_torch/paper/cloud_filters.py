@@ -10,12 +10,11 @@ from scipy.spatial import ConvexHull, Delaunay, cKDTree
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import barycentric_2d
+from pimper_torch.ground.shapes import Faces, Pixels, Points
 
 
 def behind_others(
-    pixels: Float[Tensor, "point 2"],
-    points_cam: Float[Tensor, "point 3"],
-    observed: Bool[Tensor, " point"],
+    pixels: Pixels, points_cam: Points, observed: Bool[Tensor, " point"]
 ) -> Bool[Tensor, " point"]:
     """Find points that a nearer surface occludes in the image, or probably does.
 
@@ -39,11 +38,7 @@ def behind_others(
 
 
 def neighbours_agree(
-    pixels: Float[Tensor, "point 2"],
-    points_cam: Float[Tensor, "point 3"],
-    *,
-    neighbours: int = 12,
-    max_slope: float = 6.0,
+    pixels: Pixels, points_cam: Points, *, neighbours: int = 12, max_slope: float = 6.0
 ) -> Bool[Tensor, " point"]:
     """Find points that lie on the same surface as those around them in the image.
 
@@ -65,7 +60,7 @@ def neighbours_agree(
     return keep
 
 
-def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor, "point near"]:
+def nearest_in_image(pixels: Pixels, count: int) -> Int[Tensor, "point near"]:
     """List every point's nearest others, ``count`` or all of them."""
     coordinates = pixels.detach().cpu().numpy()
     ranks = list(range(2, min(count, len(pixels) - 1) + 2))
@@ -73,7 +68,7 @@ def nearest_in_image(pixels: Float[Tensor, "point 2"], count: int) -> Int[Tensor
     return torch.as_tensor(index, device=pixels.device)
 
 
-def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
+def on_hull(pixels: Pixels) -> Bool[Tensor, " point"]:
     """Find the corners of the points' convex hull in the image.
 
     Chosen before all others, they let the mesh reach as far as the cloud does.
@@ -84,7 +79,7 @@ def on_hull(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
     return marked.to(pixels.device)
 
 
-def well_accompanied(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]:
+def well_accompanied(pixels: Pixels) -> Bool[Tensor, " point"]:
     """Find all points but isolated corners of the hull, one hull after another.
 
     Isolated are those farther from their third nearest point than 3 times the median of its
@@ -104,7 +99,7 @@ def well_accompanied(pixels: Float[Tensor, "point 2"]) -> Bool[Tensor, " point"]
 
 
 def spread(
-    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], distance_px: float
+    pixels: Pixels, quality: Float[Tensor, " point"], distance_px: float
 ) -> Int[Tensor, " chosen"]:
     """Choose points at least ``distance_px`` apart, the best first."""
     coordinates = pixels.detach().cpu().numpy()
@@ -119,7 +114,7 @@ def spread(
 
 
 def spread_to_count(
-    pixels: Float[Tensor, "point 2"], quality: Float[Tensor, " point"], target: int
+    pixels: Pixels, quality: Float[Tensor, " point"], target: int
 ) -> Int[Tensor, " chosen"]:
     """Choose about ``target`` well-spread points by bisecting their distance."""
     if target >= len(pixels):
@@ -139,14 +134,14 @@ def spread_to_count(
 
 
 def _steepness(
-    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+    points_cam: Points, nearest: Int[Tensor, "point neighbour"]
 ) -> Float[Tensor, "point neighbour"]:
     steps = points_cam[nearest] - points_cam[:, None]
     return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
 
 
 def _deviation(
-    points_cam: Float[Tensor, "point 3"], nearest: Int[Tensor, "point neighbour"]
+    points_cam: Points, nearest: Int[Tensor, "point neighbour"]
 ) -> Float[Tensor, " point"]:
     """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
     steps = (points_cam[nearest] - points_cam[:, None]).double()
@@ -165,7 +160,7 @@ def _deviation(
     return plane[:, 2].abs().to(points_cam.dtype)
 
 
-def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
+def delaunay(pixels: Pixels) -> Faces:
     """Triangulate points of an image, so that faces show their front to its camera."""
     simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
     faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
@@ -175,9 +170,7 @@ def delaunay(pixels: Float[Tensor, "point 2"]) -> Int[Tensor, "face 3"]:
     return torch.where(rotated[:, None], faces.flip(1), faces)
 
 
-def facets_under(
-    pixels: Float[Tensor, "point 2"], corners_px: Float[Tensor, "face 3 2"]
-) -> Int[Tensor, " point"]:
+def facets_under(pixels: Pixels, corners_px: Float[Tensor, "face 3 2"]) -> Int[Tensor, " point"]:
     """Find the facet that contains each point of an image, -1 outside all."""
     found = []
     at_once = max(1, 2_000_000 // max(1, len(corners_px)))  # some 100 MB

@@ -8,7 +8,7 @@ three right-hand sides of one system.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -19,13 +19,14 @@ from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.continuation import about_mean
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.linalg.systems import solutions
+from pimper_torch.ground.shapes import Scalars, Vectors, VertexMask, Vertices
 from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.paper.paper_config import RefineConfig
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
 from pimper_torch.runtime.stage import Stage
 
 
-def seam_weight(barycentric: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def seam_weight(barycentric: Vectors) -> Scalars:
     r"""Return G: where a facet is a seam and where it is its centre.
 
     :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
@@ -93,11 +94,11 @@ class Refine(Stage):
 
 def smooth_seams(
     subdivision: Subdivision,
-    points: Float[Tensor, "vertex 3"],
-    supported: Bool[Tensor, " vertex"],
+    points: Vertices,
+    supported: VertexMask,
     spacing: Float[Tensor, " facet"],
     radius: float,
-) -> Float[Tensor, "vertex 3"]:
+) -> Vertices:
     """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.
 
     The normal equations are ``(M + L) S = M (union)``, M the lumped mass and L the Laplacian.

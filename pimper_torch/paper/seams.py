@@ -17,6 +17,7 @@ from pimper_torch.ground.geometry.height_fields import intersect_height_field
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.topology import face_counts, face_edges
 from pimper_torch.ground.linalg.sparse import SparseCholesky
+from pimper_torch.ground.shapes import Faces
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths
 
@@ -38,7 +39,7 @@ class Seams(Record):
     directions: Float[Tensor, "seam 3"]
     normals: Float[Tensor, "seam 2 3"]
     edge_lengths: Float[Tensor, " seam"]
-    seam_of: Int[Tensor, "face 3"]
+    seam_of: Faces
     place_of: Int[Tensor, "seam 2"]
 
     @property

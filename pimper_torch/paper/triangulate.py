@@ -10,6 +10,7 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.ground.geometry.topology import face_components, face_counts, face_edges
+from pimper_torch.ground.shapes import FaceMask, Faces, Mask, Vertices
 from pimper_torch.method.coarse.reference import reference_view
 from pimper_torch.method.coarse.surface import (
     point_covariances,
@@ -128,9 +129,7 @@ class Triangulate(Stage):
         quality = observed[index].sum(dim=1).to(scene.points_world) - errors
         return index, quality + 3 * observed[index, reference].to(quality)
 
-    def _facets(
-        self, vertices: Float[Tensor, "vertex 3"], views: Views, cameras: Cameras, reference: int
-    ) -> Int[Tensor, "face 3"]:
+    def _facets(self, vertices: Vertices, views: Views, cameras: Cameras, reference: int) -> Faces:
         """Triangulate, drop bridges, and peel off the border what shows no object."""
         camera = cameras.cam_from_world[reference], cameras.intrinsics[reference]
         pixels, _ = project(vertices, *camera)
@@ -161,11 +160,7 @@ class Triangulate(Stage):
         return peel(faces, (shown < _MIN_COVERAGE) | thin, spikes)
 
 
-def peel(
-    faces: Int[Tensor, "face 3"],
-    unwanted: Bool[Tensor, " face"],
-    sharp: Bool[Tensor, "face 3"],
-) -> Int[Tensor, "kept 3"]:
+def peel(faces: Faces, unwanted: FaceMask, sharp: Bool[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
     """Drop unwanted faces on the border repeatedly; inner ones stay, so that no hole opens.
 
     Args:
@@ -184,9 +179,7 @@ def peel(
         faces, unwanted, sharp = faces[~drop], unwanted[~drop], sharp[~drop]
 
 
-def _shown(
-    corners_px: Float[Tensor, "face 3 2"], shows_object: Bool[Tensor, "height width"]
-) -> Float[Tensor, " face"]:
+def _shown(corners_px: Float[Tensor, "face 3 2"], shows_object: Mask) -> Float[Tensor, " face"]:
     """Return the fraction of each triangle's pixels that show the object."""
     steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
     weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.contours import RayConfig, contour_rays
+from pimper_torch.ground.shapes import Points
 from pimper_torch.priors.at_points import at_points, means_by, places
 from pimper_torch.priors.choice import surely_better
 from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
@@ -142,7 +143,7 @@ def _worth(
     return worth, of_other_world
 
 
-def _ways(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point neighbour 3"]:
+def _ways(points: Points) -> Float[Tensor, "point neighbour 3"]:
     """Return unit ways to the nearest neighbours among some of the points; NaN of the others."""
     ways = points.new_full((len(points), _NEIGHBOURS, 3), torch.nan)
     if len(points) <= _NEIGHBOURS:

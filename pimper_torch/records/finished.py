@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from pimper_torch.ground.shapes import FaceMask, Vertices
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import Mesh
 
@@ -20,7 +21,7 @@ class Closed(Record):
     """
 
     mesh: Mesh
-    measured: Bool[Tensor, " face"]
+    measured: FaceMask
     borders: int
 
 
@@ -88,7 +89,7 @@ class Materials(Record):
         """Metallic, roughness and specular of every cluster."""
         return torch.stack([self.metallic, self.roughness, self.specular], dim=1)
 
-    def at_vertices(self) -> Float[Tensor, "vertex 3"]:
+    def at_vertices(self) -> Vertices:
         """Return metallic, roughness and specular of every vertex."""
         return self.values[self.cluster]
 

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Faces, PerVertex, Scalars, VertexMask, Vertices
 from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
 from pimper_torch.records.value_checks import (
@@ -315,7 +316,7 @@ class PatchStatus(IntEnum):
     """The solver's answer is not finite or has no albedo anywhere."""
 
 
-def confidence_of(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def confidence_of(information: Scalars) -> Scalars:
     r"""Return a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
 
     >>> confidence_of(1 / torch.tensor([8.0, 24.0]).deg2rad().square())
@@ -658,16 +659,16 @@ class Surface(Record):
             cameras; ``None`` where unknown.
     """
 
-    vertices_world: Float[Tensor, "vertex 3"]
-    faces: Int[Tensor, "face 3"]
+    vertices_world: Vertices
+    faces: Faces
     facet: Int[Tensor, " vertex"]
-    barycentric: Float[Tensor, "vertex 3"]
-    normals_world: Float[Tensor, "vertex 3"]
+    barycentric: Vertices
+    normals_world: Vertices
     albedo: Float[Tensor, "vertex channel"]
-    information: Float[Tensor, " vertex"]
-    height_information: Float[Tensor, " vertex"]
+    information: PerVertex
+    height_information: PerVertex
     convergence: Convergence
-    expected_error: Float[Tensor, " vertex"] | None = None
+    expected_error: PerVertex | None = None
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List faces that name no vertex, vertices that are nowhere, and what is no normal."""
@@ -677,12 +678,12 @@ class Surface(Record):
             yield "normals_world", found, "unit, outward"
 
     @property
-    def supported(self) -> Bool[Tensor, " vertex"]:
+    def supported(self) -> VertexMask:
         """Where photographs determine the normal or the height."""
         return (self.information > 0) | (self.height_information > 0)
 
     @property
-    def confidence(self) -> Float[Tensor, " vertex"]:
+    def confidence(self) -> PerVertex:
         """For people: in [0, 1], a half for a standard error of 8 degrees."""
         return confidence_of(self.information)
 

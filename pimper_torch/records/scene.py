@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.record import Record
 from pimper_torch.records.value_checks import beyond, not_finite, once
 from pimper_torch.records.views import Cameras, Views
@@ -69,7 +70,7 @@ class SparseScene(Record):
 
     views: Views
     cameras: Cameras
-    points_world: Float[Tensor, "point 3"]
+    points_world: Points
     reprojection_errors_px: Float[Tensor, " point"]
     observation_point: Int[Tensor, " observation"]
     observation_view: Int[Tensor, " observation"]
@@ -142,12 +143,12 @@ class Mesh(Record):
             the cameras.
     """
 
-    vertices_world: Float[Tensor, "vertex 3"]
-    faces: Int[Tensor, "face 3"]
-    normals_world: Float[Tensor, "vertex 3"] | None = None
+    vertices_world: Vertices
+    faces: Faces
+    normals_world: Vertices | None = None
     albedo: Float[Tensor, "vertex channel"] | None = None
-    confidence: Float[Tensor, " vertex"] | None = None
-    expected_error: Float[Tensor, " vertex"] | None = None
+    confidence: PerVertex | None = None
+    expected_error: PerVertex | None = None
 
     def faults(self) -> Iterator[tuple[str, str, str]]:
         """List faces that name no vertex, and vertices that are nowhere."""
@@ -168,7 +169,7 @@ class FacetPoints(Record):
         facet: The facet each point lies on, as the reference view sees it.
     """
 
-    points_world: Float[Tensor, "point 3"]
+    points_world: Points
     covariance_world: Float[Tensor, "point 3 3"]
     facet: Int[Tensor, " point"]
 
@@ -203,7 +204,7 @@ class CoarseMesh(Record):
 
     mesh: Mesh
     reference: int
-    is_point: Bool[Tensor, " vertex"]
+    is_point: VertexMask
     covariance_world: Float[Tensor, "vertex 3 3"] | None = None
     points: FacetPoints | None = None
     support: Int[Tensor, " face"] | None = None

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Masks, Points
 from pimper_torch.records.record import Record
 from pimper_torch.records.views import Views
 from pimper_torch.runtime.mapped import by_view
@@ -36,7 +37,7 @@ class Silhouettes(Record):
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
     planes_world: Float[Tensor, "plane 4"] = field(default_factory=no_planes)
-    hidden: Bool[Tensor, "view height width"] | None = None
+    hidden: Masks | None = None
 
     @classmethod
     def everything(
@@ -56,14 +57,14 @@ class Silhouettes(Record):
         )
 
     @property
-    def shown(self) -> Bool[Tensor, "view height width"]:
+    def shown(self) -> Masks:
         """True where the pixel shows the object itself, not what hides it."""
         if self.hidden is None:
             return self.masks
         return by_view(lambda mask, hidden: mask & ~hidden, self.masks, self.hidden)
 
     @property
-    def masks(self) -> Bool[Tensor, "view height width"]:
+    def masks(self) -> Masks:
         """True where the pixel more likely shows the object than not."""
         return by_view(lambda inside: inside > 0.5, self.inside)
 
@@ -98,8 +99,8 @@ class ContourPoints(Record):
         ray: Index of its ray among the :class:`ContourRays`.
     """
 
-    points_world: Float[Tensor, "point 3"]
-    normals_world: Float[Tensor, "point 3"]
+    points_world: Points
+    normals_world: Points
     variance: Float[Tensor, " point"]
     view: Int[Tensor, " point"]
     ray: Int[Tensor, " point"]

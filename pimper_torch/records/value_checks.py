@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
+from pimper_torch.ground.shapes import Vectors
+
 _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
 
@@ -60,7 +62,7 @@ def outside(values: Float[Tensor, "..."], high: float) -> str:
     return f"has {fraction}, such as {float(values[bad][0]):.4g}"
 
 
-def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] | None) -> str:
+def not_unit(normals: Vectors, where: Bool[Tensor, "*batch"] | None) -> str:
     """State how many normals are not of unit length, and what they look like."""
     length = normals.norm(dim=-1)
     bad = ~((length - 1).abs() <= 0.02)  # NaN is bad; parts of 8 bits are 0.4 % off
@@ -80,7 +82,7 @@ def not_unit(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"] |
     )
 
 
-def turned_away(normals: Float[Tensor, "*batch 3"], where: Bool[Tensor, "*batch"]) -> str:
+def turned_away(normals: Vectors, where: Bool[Tensor, "*batch"]) -> str:
     """State how many normals of patches face away from the viewer."""
     away = where & (normals[..., 2] >= 0)
     count, among = int(away.sum()), int(where.sum())

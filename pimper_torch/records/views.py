@@ -4,9 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Masks
 from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
 from pimper_torch.records.value_checks import no_pinhole, not_rigid, once
@@ -38,7 +39,7 @@ class Views(Record):
     images: Float[Tensor, "view channel height width"]
     sizes_px: Int[Tensor, "view 2"]
     names: tuple[str, ...]
-    masks: Bool[Tensor, "view height width"] | None = None
+    masks: Masks | None = None
     focals_px: Float[Tensor, " view"]
     orientations: Int[Tensor, " view"] | None = None
     folder: str = field(default="", repr=False, compare=False)
@@ -65,7 +66,7 @@ class Views(Record):
                 yield f"priors[{index}].{name}", found, needed
 
     @property
-    def inside(self) -> Bool[Tensor, "view height width"]:
+    def inside(self) -> Masks:
         """True inside the photographs, false in the padding."""
         height, width = self.images.shape[-2:]
         columns = torch.arange(width, device=self.images.device)

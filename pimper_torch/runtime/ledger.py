@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.records.failure import LeftOut, What
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.journal import Journal, current, writing
@@ -72,7 +73,7 @@ GUARDS: dict[str, tuple[What, str]] = {
 }
 """All guards, in the order of the chain: what each leaves out or raises, and why."""
 
-Places = Float[Tensor, "place 3"] | tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
+Places = Float[Tensor, "place 3"] | tuple[Vertices, Faces]
 Listener = Callable[[LeftOut, Tensor | None, Tensor | None], None]
 """Takes an entry, the mask of what was left out, and where in the world each element is."""
 

@@ -25,11 +25,7 @@ _PATIENCE, _LEAST_S = 10.0, 3600.0
 
 
 def planned_batch(
-    objects: Sequence[Object],
-    out: Path,
-    settings: Sequence[str] = (),
-    *,
-    overwrite: bool = False,
+    objects: Sequence[Object], out: Path, settings: Sequence[str] = (), *, overwrite: bool = False
 ) -> list[Task | Outcome]:
     """Check every object as ``pimper reconstruct`` would, and estimate what it takes.
 

@@ -4,13 +4,14 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from pimper_torch.doors.io.radiance import resized_radiance
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import Map, Mask
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -19,7 +20,7 @@ from pimper_torch.runtime.parallel import side_by_side
 _FINE, _WIDE = 1.0, 2.0
 
 
-def edge_blur_px(grey: Float[Tensor, "height width"]) -> float:
+def edge_blur_px(grey: Map) -> float:
     r"""Measure the standard deviation of the blur at the strongest edges.
 
     An ideal edge under a Gaussian blur of variance :math:`s^2` has, after smoothing with variances
@@ -48,11 +49,7 @@ def edge_blur_px(grey: Float[Tensor, "height width"]) -> float:
     return max(known, default=float("nan"))
 
 
-def _blur(
-    fine: Float[Tensor, "height width"],
-    wide: Float[Tensor, "height width"],
-    edges: Bool[Tensor, "height width"],
-) -> float:
+def _blur(fine: Map, wide: Map, edges: Mask) -> float:
     strength, other = fine[edges], wide[edges]
     if len(strength) < 40:
         return float("nan")
@@ -64,9 +61,7 @@ def _blur(
     return float(variance.median().sqrt())
 
 
-def _gradient(
-    grey: Float[Tensor, "height width"], sigma: float
-) -> Float[Tensor, "2 height_in width_in"]:
+def _gradient(grey: Map, sigma: float) -> Float[Tensor, "2 height_in width_in"]:
     smooth = torch.from_numpy(gaussian_filter(grey.numpy(), sigma, mode="nearest"))
     across = (smooth[1:-1, 2:] - smooth[1:-1, :-2]) / 2
     down = (smooth[2:, 1:-1] - smooth[:-2, 1:-1]) / 2
@@ -97,9 +92,7 @@ class Photograph(Record):
 
 
 def summarize(
-    name: str,
-    radiance: Float[Tensor, "channel height width"],
-    mask: Bool[Tensor, "height width"] | None = None,
+    name: str, radiance: Float[Tensor, "channel height width"], mask: Mask | None = None
 ) -> Photograph:
     """Make the numbers and the small copy of linear radiance; saturation counts in the mask."""
     height, width = radiance.shape[-2:]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Lens, Record
 
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
@@ -42,7 +43,7 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
     ]
 
 
-def pinhole_lens(intrinsics: Float[Tensor, "3 3"], size_px: tuple[int, int]) -> Lens:
+def pinhole_lens(intrinsics: Matrix3, size_px: tuple[int, int]) -> Lens:
     """Return the lens of a pinhole's ``K``, but for its skew."""
     K = intrinsics.tolist()
     params = (K[0][0], K[1][1], K[0][2], K[1][2])
@@ -61,7 +62,7 @@ def polynomial_lens(
 
 
 def rigid_or_refuse(
-    rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], what: str, file: DataSetPath
+    rotation: Matrix3, translation: Float[Tensor, "3"], what: str, file: DataSetPath
 ) -> Float[Tensor, "4 4"]:
     """Put a file's rotation and translation together, the rotation made exact."""
     U, _, Vh = torch.linalg.svd(rotation)

@@ -12,6 +12,7 @@ from pimper_torch.doors.exchange.picture_files import write_pictures
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.doors.io.reports import write_json
 from pimper_torch.ground.geometry.pixels import indices_from_pixels
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Cameras
 from pimper_torch.result.viz.maps import albedo_scale, view_maps
 
@@ -77,9 +78,7 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
     write_json(whole, file, indent=4)
 
 
-def _intrinsic(
-    identifier: str, K: Float[Tensor, "3 3"], width: int, height: int
-) -> dict[str, object]:
+def _intrinsic(identifier: str, K: Matrix3, width: int, height: int) -> dict[str, object]:
     focal_x, focal_y = K.diagonal()[:2].tolist()
     center = indices_from_pixels(K[:2, 2]) - K.new_tensor([width, height]) / 2
     return {

@@ -12,6 +12,7 @@ from pimper_torch.doors.exchange.picture_files import refuse_skew, write_picture
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses, undistort_pixels
 from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.ground.shapes import Points
 from pimper_torch.method.sfm.colmap import write_binary
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.sparse_scene import model_of_scene, point_colors
@@ -22,11 +23,7 @@ _KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
 
 
 def write_colmap(
-    views: Views,
-    cameras: Cameras,
-    folder: Path | str,
-    *,
-    points_world: Float[Tensor, "point 3"] | None = None,
+    views: Views, cameras: Cameras, folder: Path | str, *, points_world: Points | None = None
 ) -> None:
     """Write photographs, masks and pinholes as COLMAP reads them.
 

@@ -12,6 +12,7 @@ from pimper_torch.doors.exchange.result import Result
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.reports import write_json
 from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, Mesh, Views
 
 
@@ -20,7 +21,7 @@ def write_transforms(
     cameras: Cameras,
     folder: Path | str,
     *,
-    points_world: Float[Tensor, "point 3"] | None = None,
+    points_world: Points | None = None,
     albedo: Float[Tensor, "point channel"] | None = None,
 ) -> None:
     """Write ``transforms.json`` as nerfstudio reads it, with ``images/`` and ``masks/``.

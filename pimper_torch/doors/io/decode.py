@@ -21,6 +21,7 @@ from pimper_torch.doors.io.header import Header, focal_from_exif
 from pimper_torch.doors.io.heic import read_heic, read_heic_header
 from pimper_torch.doors.io.raw import read_raw, read_raw_header
 from pimper_torch.ground.radiometry.colour import SILENT, Colour
+from pimper_torch.ground.shapes import Map
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
@@ -47,7 +48,7 @@ class Decoded(Record):
     """
 
     samples: Float[Tensor, "channel height width"]
-    alpha: Float[Tensor, "height width"] | None
+    alpha: Map | None
     lossy: bool
     full: int
     full_told: bool = False

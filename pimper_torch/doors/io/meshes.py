@@ -12,7 +12,6 @@ from typing import Any, TextIO
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -21,6 +20,7 @@ from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import corners_of
 from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
+from pimper_torch.ground.shapes import FaceMask, Vertices
 from pimper_torch.records import Mesh
 from pimper_torch.records.value_checks import beyond, not_finite
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
@@ -38,10 +38,7 @@ _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's na
 
 
 def write_ply(
-    mesh: Mesh,
-    path: Path | str,
-    offset_world: Offset = NO_OFFSET,
-    measured: Bool[Tensor, " face"] | None = None,
+    mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
     """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
 
@@ -89,7 +86,7 @@ def write_ply(
         faces.tofile(file)
 
 
-def _positions(mesh: Mesh, offset_world: Offset) -> Float[Tensor, "vertex 3"]:
+def _positions(mesh: Mesh, offset_world: Offset) -> Vertices:
     """Return positions as they are written: float32 where that tells them, else float64."""
     vertices = mesh.vertices_world.detach().double()
     placed = vertices + vertices.new_tensor(offset_world)
@@ -171,10 +168,7 @@ def read_mesh(path: Path | str) -> Mesh:
 
 
 def write_glb(
-    mesh: Mesh,
-    path: Path | str,
-    offset_world: Offset = NO_OFFSET,
-    measured: Bool[Tensor, " face"] | None = None,
+    mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
     """Write a binary glTF of the same frame, normals and colours as the PLY.
 
@@ -226,10 +220,7 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
 
 
 def write_obj(
-    mesh: Mesh,
-    path: Path | str,
-    offset_world: Offset = NO_OFFSET,
-    measured: Bool[Tensor, " face"] | None = None,
+    mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
     """Write an OBJ: vertex normals, and albedo as sRGB colour behind each position.
 
@@ -312,11 +303,11 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _colors(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+def _colors(mesh: Mesh) -> Vertices:
     return base_color(mesh).expand(-1, 3)
 
 
-def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+def _normals(mesh: Mesh) -> Vertices:
     if mesh.normals_world is None:
         return vertex_normals(mesh.vertices_world, mesh.faces)
     return mesh.normals_world

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.doors.io.decode import decode, read_header, rotated
@@ -21,6 +21,7 @@ from pimper_torch.doors.io.photograph_files import (
 from pimper_torch.doors.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.doors.io.responses import tell_cautions
 from pimper_torch.ground.radiometry import FROM_FILES, SATURATED, Encoding
+from pimper_torch.ground.shapes import Map, Mask, Masks
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.file_names import match_files
@@ -134,9 +135,7 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
     return torch.tensor([folders.index(path.parent) for path in paths])
 
 
-def _tell_alpha(
-    opaque: Sequence[Bool[Tensor, "height width"] | None], names: tuple[str, ...], folder: Path
-) -> None:
+def _tell_alpha(opaque: Sequence[Mask | None], names: tuple[str, ...], folder: Path) -> None:
     """State that transparency is taken for masks."""
     drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
     caution(
@@ -199,7 +198,7 @@ def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
     return next((by_stem[one] for one in names if one in by_stem), None)
 
 
-def read_mask(path: Path | str, max_size_px: int = 0) -> Bool[Tensor, "height width"]:
+def read_mask(path: Path | str, max_size_px: int = 0) -> Mask:
     """Read a mask by the rule of :func:`load_views`; shrunk as photographs are."""
     path = Path(path)
     drawn = _on_object([_brightness(path)])[0]
@@ -257,7 +256,7 @@ def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str
     return dark
 
 
-def _brightness(path: Path) -> Float[Tensor, "height width"]:
+def _brightness(path: Path) -> Map:
     """Read how bright a mask is; 1 on the object where labels or transparency tell it."""
     decoded = decode(path)
     brightest = decoded.samples.amax(dim=0)
@@ -280,7 +279,7 @@ def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor,
 
 def _judge(
     images: Float[Tensor, "view channel height width"],
-    drawn: Bool[Tensor, "view height width"],
+    drawn: Masks,
     sizes: Sequence[tuple[int, int]],
     names: tuple[str, ...],
     folder: Path,

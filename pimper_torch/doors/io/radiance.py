@@ -24,6 +24,7 @@ from pimper_torch.ground.radiometry import (
 )
 from pimper_torch.ground.radiometry.primaries import in_srgb_primaries
 from pimper_torch.ground.radiometry.saturation import PIXELS
+from pimper_torch.ground.shapes import Mask, Scalar
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.mapped import drop_pages, zeros
@@ -48,7 +49,7 @@ class Pictures(Record):
     """
 
     images: Float[Tensor, "view channel height width"]
-    opaque: tuple[Bool[Tensor, "height width"] | None, ...]
+    opaque: tuple[Mask | None, ...]
 
 
 class _Kind(NamedTuple):
@@ -107,7 +108,7 @@ def read_pictures(
 
 
 def radiance_of(
-    decoded: Decoded, response: Response, black: Float[Tensor, ""], white: Float[Tensor, " channel"]
+    decoded: Decoded, response: Response, black: Scalar, white: Float[Tensor, " channel"]
 ) -> Float[Tensor, "channel height width"]:
     """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
 
@@ -161,7 +162,7 @@ def _fill(
     sizes_px: Sequence[tuple[int, int]],
     encoding: Encoding,
     whites: _Whites,
-) -> tuple[tuple[Bool[Tensor, "height width"] | None, ...], dict[_Kind, _Tally]]:
+) -> tuple[tuple[Mask | None, ...], dict[_Kind, _Tally]]:
     """Write the radiance of each file into the images, and count its levels.
 
     Args:
@@ -253,7 +254,7 @@ def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> Iterator[st
 
 def _levels(
     encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
-) -> tuple[Float[Tensor, ""], Float[Tensor, " channel"]]:
+) -> tuple[Scalar, Float[Tensor, " channel"]]:
     """Return black and white of a file as fractions of its full scale."""
     full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black

@@ -23,6 +23,7 @@ from pimper_torch.doors.io.extras import load_extra
 from pimper_torch.doors.io.header import Header, focal_from_exif
 from pimper_torch.ground.radiometry import SATURATED, Linear
 from pimper_torch.ground.radiometry.colour import Colour
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.runtime.errors import InputError
 
 # EXIF's orientation of LibRaw's turns: none, half, to the left, to the right.
@@ -164,7 +165,7 @@ def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as 
     return maximum_filter(reached, size=_WINDOWS.get(len(pattern), 7))
 
 
-def _srgb_from_sensor(raw: Any) -> Float[Tensor, "3 3"] | None:  # noqa: ANN401 - as above
+def _srgb_from_sensor(raw: Any) -> Matrix3 | None:  # noqa: ANN401 - as above
     """Return the matrix from the sensor's colours to linear sRGB, by the camera's white balance."""
     matrix = torch.tensor(np.asarray(raw.color_matrix), dtype=torch.float64)[:3, :3]
     if not _keeps_white(matrix):
@@ -176,7 +177,7 @@ def _srgb_from_sensor(raw: Any) -> Float[Tensor, "3 3"] | None:  # noqa: ANN401 
     return matrix * _white_balance(raw) if _keeps_white(matrix) else None
 
 
-def _keeps_white(matrix: Float[Tensor, "3 3"]) -> bool:
+def _keeps_white(matrix: Matrix3) -> bool:
     """Return whether rows of a matrix to sRGB sum to about 1."""
     white = (matrix.sum(dim=1) - 1).abs().max()
     return bool(matrix.isfinite().all()) and float(white) < 0.1

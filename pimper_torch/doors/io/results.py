@@ -21,6 +21,7 @@ from pimper_torch.doors.io.reports import (
 from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
 from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
@@ -210,6 +211,6 @@ def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Pa
     Image.fromarray(array[..., 0] if array.shape[-1] == 1 else array).save(path)
 
 
-def _array(values: Float[Tensor, "*batch"]) -> np.ndarray:
+def _array(values: Scalars) -> np.ndarray:
     array: np.ndarray = values.detach().float().numpy()
     return array

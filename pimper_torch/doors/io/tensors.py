@@ -11,6 +11,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, local_origin, to_local
 from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
 
@@ -159,7 +160,7 @@ def _squared(poses: Tensor) -> Tensor:
 
 
 def _observations(
-    points: Float[Tensor, "point 3"], cameras: Cameras, views: Views
+    points: Points, cameras: Cameras, views: Views
 ) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "point view"]]:
     """Project the cloud, and mark where it falls into the frame, and onto the object."""
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)

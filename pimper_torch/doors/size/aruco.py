@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixels_from_indices
+from pimper_torch.ground.shapes import Map, Scalars
 from pimper_torch.records import Record
 
 # Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
@@ -71,7 +72,7 @@ _REACH, _MIN_REACH_PX = 0.6, 1.5
 
 
 def refined_corners(
-    picture: Float[Tensor, "height width"], corners: Float[Tensor, "square 4 2"]
+    picture: Map, corners: Float[Tensor, "square 4 2"]
 ) -> Float[Tensor, "square 4 2"]:
     """Intersect lines through the sides of squares.
 
@@ -93,7 +94,7 @@ def refined_corners(
 
 
 def _refined_once(
-    picture: Float[Tensor, "height width"], corners: Float[Tensor, "square 4 2"]
+    picture: Map, corners: Float[Tensor, "square 4 2"]
 ) -> Float[Tensor, "square 4 2"]:
     along = corners.roll(-1, dims=1) - corners
     length = along.norm(dim=-1, keepdim=True)
@@ -114,9 +115,7 @@ def _refined_once(
     return _crossing(first.roll(1, dims=1), second.roll(1, dims=1), first, second)
 
 
-def _looked_up(
-    picture: Float[Tensor, "height width"], places: Float[Tensor, "*batch 2"]
-) -> Float[Tensor, "*batch"]:
+def _looked_up(picture: Map, places: Float[Tensor, "*batch 2"]) -> Scalars:
     height, width = picture.shape
     grid = grid_from_pixels(places.reshape(1, 1, -1, 2), width, height)
     found = grid_sample(

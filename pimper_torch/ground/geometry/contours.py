@@ -20,6 +20,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.visual_hull import Everywhere, Hull
+from pimper_torch.ground.shapes import Map, Points
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
 from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.parallel import num_workers, side_by_side
@@ -106,9 +107,7 @@ def _nothing(cameras: Cameras) -> ContourRays:
 
 
 @torch.no_grad()
-def _of_view(
-    inside: Float[Tensor, "height width"], cameras: Cameras, view: int, config: RayConfig
-) -> ContourRays:
+def _of_view(inside: Map, cameras: Cameras, view: int, config: RayConfig) -> ContourRays:
     like, (width, height) = cameras.intrinsics, cameras.sizes_px[view].tolist()
     smooth = gaussian_filter(
         inside[:height, :width].detach().cpu().double().numpy(), config.blur_px, mode="nearest"
@@ -207,11 +206,7 @@ _NEIGHBOURS = 7
 
 @torch.no_grad()
 def contour_points(
-    rays: ContourRays,
-    cameras: Cameras,
-    hull: Hull,
-    points_world: Float[Tensor, "point 3"],
-    normals_world: Float[Tensor, "point 3"],
+    rays: ContourRays, cameras: Cameras, hull: Hull, points_world: Points, normals_world: Points
 ) -> ContourPoints:
     """Find where each contour ray touches a surface, of which points with normals are given.
 
@@ -261,7 +256,7 @@ class _SignedDistance:
     A point stands for a disc of its tangent plane that reaches to its neighbours.
     """
 
-    def __init__(self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]) -> None:
+    def __init__(self, points: Points, normals: Points) -> None:
         positions = points.detach().cpu().double().numpy()
         self._points, self._normals, self._tree = points, normals, cKDTree(positions)
 
@@ -365,9 +360,7 @@ class Contours(Record):
         """Whether the object lies in a hull that silhouettes tell."""
         return not isinstance(self.hull, Everywhere)
 
-    def touching(
-        self, points_world: Float[Tensor, "point 3"], normals_world: Float[Tensor, "point 3"]
-    ) -> ContourPoints:
+    def touching(self, points_world: Points, normals_world: Points) -> ContourPoints:
         """Find where the rays touch a surface; see :func:`.contour_points`."""
         if not self.confine:
             rays, none = self.rays, points_world.new_zeros(0)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.shapes import Faces, PerVertex, Vertices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,13 +29,13 @@ class Elements:
             other two, times twice the area: the opposite edge, turned into the face.
     """
 
-    faces: Int[Tensor, "face 3"]
+    faces: Faces
     rotated: Float[Tensor, "face 3 3"]
     area: Float[Tensor, " face"]
     count: int
 
 
-def elements(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> Elements:
+def elements(vertices: Vertices, faces: Faces) -> Elements:
     """Measure the faces of a mesh; differentiable, and in the dtype of the vertices."""
     doubled = face_normals(vertices, faces)
     corners = vertices[faces]
@@ -70,7 +71,7 @@ def cotangent_laplacian(
     return rows.flatten(), cols.flatten(), blocks.flatten()
 
 
-def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> Float[Tensor, " vertex"]:
+def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> PerVertex:
     """Assign each vertex a third of the mass of every face round it."""
     fraction = (mesh.area * density / 3)[:, None].expand(-1, 3)
     return fraction.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), fraction.flatten())

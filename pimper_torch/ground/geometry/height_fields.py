@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pimper_torch.ground.shapes import Scalars
+
 # A neighbour that carries less of the blend than this may be invalid: a point that lies on
 # a row of samples must not miss because rounding put it a hair beside the row.
 _NEGLIGIBLE_WEIGHT = 1e-4
@@ -191,9 +193,7 @@ def _cell(
     return neighbours, column - left, row - top
 
 
-def _bilinear_weights(
-    across: Float[Tensor, "*batch"], down: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 4"]:
+def _bilinear_weights(across: Scalars, down: Scalars) -> Float[Tensor, "*batch 4"]:
     left, top = 1 - across, 1 - down
     return torch.stack([left * top, across * top, left * down, across * down], dim=-1)
 

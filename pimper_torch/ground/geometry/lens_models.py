@@ -9,10 +9,11 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded
 from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Cameras, Lens, SparseScene
 
 
-def pinhole_of(lens: Lens) -> Float[Tensor, "3 3"]:
+def pinhole_of(lens: Lens) -> Matrix3:
     """Return ``K`` with the lens's focal length and principal point, in float64."""
     return torch.from_numpy(np.array(camera_of(lens).calibration_matrix(), dtype=np.float64))
 

@@ -11,15 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.shapes import Points
 
 Offset = tuple[float, float, float]
 
 NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 
 
-def local_origin(
-    cam_from_world: Float[Tensor, "view 4 4"], points_world: Float[Tensor, "point 3"]
-) -> Offset:
+def local_origin(cam_from_world: Float[Tensor, "view 4 4"], points_world: Points) -> Offset:
     """Choose the origin of a scene's own frame, a round number; zero where its own will do.
 
     It is the median of the cloud, or of the cameras where there is none, so that points far out

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import InputError
 
@@ -27,7 +28,7 @@ class Nearest(Record):
     """
 
     distance: Float[Tensor, " point"]
-    points: Float[Tensor, "point 3"]
+    points: Points
     face: Int[Tensor, " point"]
 
 
@@ -61,7 +62,7 @@ class NearestSurface:
         self._scene.set_object_triangles(np.asfortranarray(self._faces.int().numpy()), 0)
         self._scene.build(fcpw.aggregate_type.bvh_surface_area, True)
 
-    def query(self, points: Float[Tensor, "point 3"]) -> Nearest:
+    def query(self, points: Points) -> Nearest:
         """Find the nearest place of the surface for every point."""
         asked = points.detach().cpu().double()
         if len(self._faces):
@@ -76,15 +77,13 @@ class NearestSurface:
             face=face.to(points.device),
         )
 
-    def _nearest_faces(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+    def _nearest_faces(self, points: Points) -> Int[Tensor, " point"]:
         found = fcpw.interaction_3D_list()
         anywhere = np.full(len(points), np.inf, dtype=np.float32)
         self._scene.find_closest_points(self._columns(points), anywhere, found)
         return torch.tensor([one.primitive_index for one in found], dtype=torch.long)
 
-    def _columns(
-        self, points: Float[Tensor, "point 3"]
-    ) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    def _columns(self, points: Points) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         return np.asfortranarray((points - self._origin).float().numpy())
 
 

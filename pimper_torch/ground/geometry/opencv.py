@@ -6,11 +6,13 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Map, Mask, Matrix3, Pixels
+
 BACKGROUND, OBJECT = cv2.GC_BGD, cv2.GC_FGD
 PERHAPS_BACKGROUND, PERHAPS_OBJECT = cv2.GC_PR_BGD, cv2.GC_PR_FGD
 
 
-def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+def signed_distance(mask: Mask) -> Map:
     """Return each pixel's distance to the border of a mask in pixels, positive inside.
 
     The border runs midway between the centres of unlike neighbours. Where nothing is masked,
@@ -46,9 +48,7 @@ def shrunk(
 
 
 def warped(
-    picture: Float[Tensor, "height width"],
-    homography: Float[Tensor, "3 3"],
-    size_px: tuple[int, int],
+    picture: Map, homography: Matrix3, size_px: tuple[int, int]
 ) -> Float[Tensor, "high wide"]:
     """Look up a picture through a homography, bilinearly; NaN beyond its border.
 
@@ -75,7 +75,7 @@ def window_means(
 
 def grab_cut_halved(
     colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], iterations: int
-) -> Bool[Tensor, "height width"]:
+) -> Mask:
     """Cut as :func:`grab_cut`, but every other pixel each way: right to two, in a quarter of it."""
     half = grab_cut(colours[::2, ::2], labels[::2, ::2], iterations)
     height, width = labels.shape
@@ -84,7 +84,7 @@ def grab_cut_halved(
 
 def grab_cut(
     colours: UInt8[Tensor, "height width 3"], labels: UInt8[Tensor, "height width"], iterations: int
-) -> Bool[Tensor, "height width"]:
+) -> Mask:
     """Cut the object out by two mixtures of colours and a graph cut.
 
     Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004. Deterministic.
@@ -117,24 +117,22 @@ def _open_sides(
     return other.any(dim=1), other.any(dim=0)
 
 
-def opened(mask: Bool[Tensor, "height width"], radius_px: int) -> Bool[Tensor, "height width"]:
+def opened(mask: Mask, radius_px: int) -> Mask:
     """Leave out what no disc of that radius fits into."""
     return _morphed(mask, cv2.MORPH_OPEN, radius_px)
 
 
-def closed(mask: Bool[Tensor, "height width"], radius_px: int) -> Bool[Tensor, "height width"]:
+def closed(mask: Mask, radius_px: int) -> Mask:
     """Fill what no disc of that radius fits into."""
     return _morphed(mask, cv2.MORPH_CLOSE, radius_px)
 
 
-def dilated(layer: Float[Tensor, "height width"], reach_px: int) -> Float[Tensor, "height width"]:
+def dilated(layer: Map, reach_px: int) -> Map:
     """Return the largest value of the square round each pixel that reaches so far."""
     return torch.from_numpy(cv2.dilate(layer.numpy(), np.ones((2 * reach_px + 1,) * 2)))
 
 
-def convex_hull_of(
-    pixels: Float[Tensor, "point 2"], size_px: tuple[int, int]
-) -> Bool[Tensor, "height width"]:
+def convex_hull_of(pixels: Pixels, size_px: tuple[int, int]) -> Mask:
     """Fill the convex hull of pixels."""
     drawn = np.zeros(size_px[::-1], dtype=np.uint8)
     if len(pixels):
@@ -143,9 +141,7 @@ def convex_hull_of(
     return torch.from_numpy(drawn > 0)
 
 
-def discs_at(
-    pixels: Float[Tensor, "point 2"], radius_px: float, size_px: tuple[int, int]
-) -> Bool[Tensor, "height width"]:
+def discs_at(pixels: Pixels, radius_px: float, size_px: tuple[int, int]) -> Mask:
     """Find what is within a distance of pixels."""
     drawn = np.ones(size_px[::-1], dtype=np.uint8)
     column, row = pixels.floor().long().T.numpy()
@@ -156,31 +152,23 @@ def discs_at(
     return torch.from_numpy(cv2.distanceTransform(drawn, cv2.DIST_L2, 3) <= radius_px)
 
 
-def _morphed(
-    mask: Bool[Tensor, "height width"], how: int, radius_px: int
-) -> Bool[Tensor, "height width"]:
+def _morphed(mask: Mask, how: int, radius_px: int) -> Mask:
     size = 2 * radius_px + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return torch.from_numpy(cv2.morphologyEx(mask.numpy().astype(np.uint8), how, disc) > 0)
 
 
-def without_specks(
-    mask: Bool[Tensor, "height width"], kept: Bool[Tensor, "height width"], min_px: int
-) -> Bool[Tensor, "height width"]:
+def without_specks(mask: Mask, kept: Mask, min_px: int) -> Mask:
     """Drop components that are small or do not reach ``kept``, and fill small holes."""
     return ~_large(~_large(mask, kept, min_px), torch.ones_like(mask), min_px)
 
 
-def components_of(
-    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
+def components_of(mask: Mask, meeting: Mask) -> Mask:
     """Keep the components of a mask that reach ``meeting``."""
     return _large(mask, meeting, 1)
 
 
-def _large(
-    mask: Bool[Tensor, "height width"], meeting: Bool[Tensor, "height width"], min_px: int
-) -> Bool[Tensor, "height width"]:
+def _large(mask: Mask, meeting: Mask, min_px: int) -> Mask:
     drawn = mask.numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)
     met = np.bincount(labels[meeting.numpy()], minlength=count) > 0
@@ -188,9 +176,7 @@ def _large(
     return torch.from_numpy(taken[labels])
 
 
-def blind_holes(
-    mask: Bool[Tensor, "height width"], seen_through: Bool[Tensor, "height width"], fraction: float
-) -> Bool[Tensor, "height width"]:
+def blind_holes(mask: Mask, seen_through: Mask, fraction: float) -> Mask:
     """Find the holes of a mask of which less than a fraction is seen through."""
     drawn = (~mask).numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(drawn, connectivity=4)

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Vectors
+
 
 def grid_from_pixels(
     pixels: Float[Tensor, "*batch 2"], width: int, height: int
@@ -38,7 +40,7 @@ def pixels_from_indices(indices: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*b
     return indices + 0.5
 
 
-def homogeneous(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+def homogeneous(pixels: Float[Tensor, "*batch 2"]) -> Vectors:
     """Append 1 to pixels, as homographies and epipolar geometries take them; differentiable."""
     return torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -18,14 +18,13 @@ from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.surfaces import barycentric
 from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.ground.shapes import Faces, Points, Vertices
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
 
 
-def write_cloud(
-    points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"], path: Path
-) -> None:
+def write_cloud(points: Points, normals: Points, path: Path) -> None:
     """Write points with normals as binary PLY."""
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     start = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
@@ -33,7 +32,7 @@ def write_cloud(
     path.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
 
 
-def read_faces(path: Path) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+def read_faces(path: Path) -> tuple[Vertices, Faces]:
     """Read a triangle mesh that COLMAP wrote; float32."""
     import trimesh
 
@@ -48,12 +47,8 @@ _DENSE_DEPTH = 5
 
 
 def poisson_surface(
-    points: Float[Tensor, "point 3"],
-    normals: Float[Tensor, "point 3"],
-    *,
-    depth: int,
-    point_weight: float,
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    points: Points, normals: Points, *, depth: int, point_weight: float
+) -> tuple[Vertices, Faces]:
     """Put a closed surface through oriented points by screened Poisson reconstruction.
 
     Args:
@@ -129,9 +124,7 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     )
 
 
-def _nearest_values(
-    mesh: Mesh, names: list[str], points: Float[Tensor, "point 3"]
-) -> dict[str, Tensor]:
+def _nearest_values(mesh: Mesh, names: list[str], points: Points) -> dict[str, Tensor]:
     """Blend fields of a mesh at the places that are nearest to points."""
     places = mesh.vertices_world.detach().cpu().double()
     nearest = NearestSurface(mesh).query(points)
@@ -148,7 +141,7 @@ def _nearest_values(
     return found
 
 
-def _oriented(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
+def _oriented(faces: Faces) -> Int[Tensor, "kept 3"]:
     """Drop faces that run along an edge the way that an earlier face does."""
     ends = half_edges(faces)
     _, label = torch.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_inverse=True)
@@ -159,7 +152,7 @@ def _oriented(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
 
 def _made(
     path: Path, what: str, program: Callable[..., object], *arguments: object
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+) -> tuple[Vertices, Faces]:
     """Run a program of COLMAP's that writes a mesh, and read that."""
     try:
         with quiet():

@@ -7,6 +7,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.pixels import homogeneous
 from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras
 
 _POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views
@@ -46,7 +47,7 @@ def rays_through(
 
 def triangulate_rays(
     cameras: Cameras, pixels: Float[Tensor, "point view 2"], seen: Bool[Tensor, "point view"]
-) -> Float[Tensor, "point 3"]:
+) -> Points:
     """Find the points nearest to their rays in the least-squares sense.
 
     Args:
@@ -62,7 +63,7 @@ def triangulate_rays(
 
 
 def triangulation_angles(
-    points_world: Float[Tensor, "point 3"],
+    points_world: Points,
     observed: Bool[Tensor, "point view"],
     centers_world: Float[Tensor, "view 3"],
 ) -> Float[Tensor, " point"]:

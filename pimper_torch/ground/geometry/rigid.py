@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Vectors
+
 
 def transform(
     target_from_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch point 3"]
@@ -27,7 +29,7 @@ def invert_rigid(target_from_source: Float[Tensor, "*batch 4 4"]) -> Float[Tenso
 
 
 def rigid(
-    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+    rotation: Float[Tensor, "*batch 3 3"], translation: Vectors
 ) -> Float[Tensor, "*batch 4 4"]:
     """Put a rotation and a translation in one matrix."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import face_edges
+from pimper_torch.ground.shapes import Faces, PerVertex, Points, Vertices
 from pimper_torch.records import Record
 
 # Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
@@ -36,10 +37,10 @@ class Subdivision(Record):
         barycentric: Where in that facet; exactly 0 on its edges.
     """
 
-    points: Float[Tensor, "vertex 3"]
+    points: Vertices
     facet: Int[Tensor, " vertex"]
-    barycentric: Float[Tensor, "vertex 3"]
-    faces: Int[Tensor, "face 3"]
+    barycentric: Vertices
+    faces: Faces
     face_facet: Int[Tensor, " face"]
 
     def interpolate(
@@ -100,7 +101,7 @@ def subdivide(
 
 
 def transferred(
-    values: Float[Tensor, " vertex"], source: Subdivision, points: Float[Tensor, "asked 3"]
+    values: PerVertex, source: Subdivision, points: Float[Tensor, "asked 3"]
 ) -> Float[Tensor, " asked"]:
     """Return values known on a subdivided mesh at other points of the same facets.
 
@@ -253,9 +254,7 @@ def _name(
 
 
 def _barycentric(
-    free: Float[Tensor, "point 3"],
-    cut: Float[Tensor, "member point"],
-    ends: Int[Tensor, "member point 2"],
+    free: Points, cut: Float[Tensor, "member point"], ends: Int[Tensor, "member point 2"]
 ) -> Float[Tensor, "member point 3"]:
     """Return coordinates in slots: free inside, on the cut at an edge."""
     inner = (free > 0).all(dim=1)[:, None]

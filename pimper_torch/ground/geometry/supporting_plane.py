@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.ground.shapes import Points, Scalar, Scalars, Vectors
 from pimper_torch.records import Record, SparseScene
 
 
@@ -39,7 +40,7 @@ class Fixation(Record):
     """
 
     fixation_world: Float[Tensor, "3"]
-    distance: Float[Tensor, ""]
+    distance: Scalar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -52,9 +53,9 @@ class Plane(Record):
     """
 
     normal_world: Float[Tensor, "3"]
-    offset: Float[Tensor, ""]
+    offset: Scalar
 
-    def height_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def height_of(self, points_world: Vectors) -> Scalars:
         """Return the distance above the plane, on the cameras' side."""
         return points_world @ self.normal_world - self.offset
 
@@ -86,7 +87,7 @@ def well_tracked(scene: SparseScene, min_views: int = 3) -> Bool[Tensor, " point
 
 
 def supporting_plane(
-    points_world: Float[Tensor, "point 3"],
+    points_world: Points,
     eyes_world: Float[Tensor, "view 3"],
     distance: float,
     search: PlaneSearch = PlaneSearch(),
@@ -123,7 +124,7 @@ def supporting_plane(
     return plane
 
 
-def _refitted(points: Float[Tensor, "point 3"], plane: Plane) -> Plane:
+def _refitted(points: Points, plane: Plane) -> Plane:
     centre = points.mean(dim=0)
     normal = torch.linalg.svd(points - centre, full_matrices=False).Vh[2]
     normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)

@@ -1,14 +1,14 @@
 """Normals, slopes and areas of rasters and meshes."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.ground.shapes import FaceMask, Faces, Vectors, Vertices
 
-def slopes_from_normals(
-    normals: Float[Tensor, "*batch 3"], steepest: float = 10.0
-) -> Float[Tensor, "*batch 2"]:
+
+def slopes_from_normals(normals: Vectors, steepest: float = 10.0) -> Float[Tensor, "*batch 2"]:
     """Return ``(dz/dx, dz/dy)`` of the depth whose viewer-facing normals these are.
 
     Slopes are limited to ``steepest`` (about 84 degrees by default), past which a normal
@@ -18,17 +18,13 @@ def slopes_from_normals(
     return (-normals[..., :2] / nz).clamp(-steepest, steepest)
 
 
-def face_normals(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, "face 3"]:
+def face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3"]:
     """Return outward normals whose length is twice the area of the face."""
     a, b, c = vertices[faces].unbind(dim=1)
     return torch.linalg.cross(b - a, c - a)
 
 
-def unit_face_normals(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, "face 3"]:
+def unit_face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3"]:
     """Return outward unit normals, whatever the unit of length; zero for a face without area."""
     a, b, c = vertices[faces].unbind(dim=1)
     ab, ac = b - a, c - a
@@ -42,9 +38,7 @@ def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"
     return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
-def vertex_normals(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, "vertex 3"]:
+def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     """Average the face normals round each vertex by area; unit."""
     per_face = face_normals(vertices, faces)
     if len(per_face):  # areas in a large unit are too small for a length to be divided by
@@ -56,10 +50,7 @@ def vertex_normals(
 
 
 def component_areas(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    label: Int[Tensor, " face"],
-    counted: Bool[Tensor, " face"] | None = None,
+    vertices: Vertices, faces: Faces, label: Int[Tensor, " face"], counted: FaceMask | None = None
 ) -> Float[Tensor, " face"]:
     """Sum the areas of all faces of each face's component, or of those that count; float64."""
     area = face_normals(vertices, faces).norm(dim=-1).double() / 2
@@ -70,7 +61,7 @@ def component_areas(
 
 def barycentric_2d(
     points: Float[Tensor, "*#batch 2"], corners: Float[Tensor, "*#batch 3 2"]
-) -> Float[Tensor, "*batch 3"]:
+) -> Vectors:
     """Return barycentric coordinates of points in the plane of triangles."""
     a, b, c = corners.unbind(dim=-2)
     ab, ac, ap = b - a, c - a, points - a

@@ -7,6 +7,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.shapes import Vectors
 from pimper_torch.records import CoarseMesh, Templates
 
 # Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
@@ -40,7 +41,7 @@ def coarse_normals(
     return facing_viewer(torch.einsum("phwc,pcx->phwx", inner, corners.to(inner)))
 
 
-def facing_viewer(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def facing_viewer(normals: Vectors) -> Vectors:
     """Make normals unit, and rotate those that face away until they just face the viewer."""
     unit = normalize(normals, dim=-1)
     aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)

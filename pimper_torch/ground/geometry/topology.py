@@ -9,8 +9,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from pimper_torch.ground.shapes import FaceMask, Faces, VertexMask
 
-def half_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "half_edge 2"]:
+
+def half_edges(faces: Faces) -> Int[Tensor, "half_edge 2"]:
     """List the three edges of every face in its direction: opposite to corners 0, 1 and 2.
 
     >>> half_edges(torch.tensor([[4, 5, 6]]))
@@ -21,7 +23,7 @@ def half_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "half_edge 2"]:
     return faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2)
 
 
-def face_edges(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, "face 3"]]:
+def face_edges(faces: Faces) -> tuple[Int[Tensor, "edge 2"], Faces]:
     """List every edge once, its lower vertex first, and which one is opposite to each corner."""
     if len(faces) == 0:
         return faces[:, :2], faces
@@ -29,7 +31,7 @@ def face_edges(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "edge 2"], Int
     return _ends(key, faces), index
 
 
-def open_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
+def open_edges(faces: Faces) -> Int[Tensor, "edge 2"]:
     """List the edges that do not have exactly two faces, once each, their lower vertex first."""
     if len(faces) == 0:
         return faces[:, :2]
@@ -38,18 +40,18 @@ def open_edges(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
     return _ends(key[counts != 2], faces)
 
 
-def _edge_keys(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
+def _edge_keys(faces: Faces) -> Faces:
     """Number the edge opposite to each corner: rows of two would take far longer to compare."""
     ahead, behind = faces.roll(-1, dims=1), faces.roll(1, dims=1)
     return torch.minimum(ahead, behind) * (faces.max() + 1) + torch.maximum(ahead, behind)
 
 
-def _ends(key: Int[Tensor, " edge"], faces: Int[Tensor, "face 3"]) -> Int[Tensor, "edge 2"]:
+def _ends(key: Int[Tensor, " edge"], faces: Faces) -> Int[Tensor, "edge 2"]:
     size = faces.max() + 1
     return torch.stack([key // size, key % size], dim=1)
 
 
-def face_pairs(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
+def face_pairs(faces: Faces) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
     """Find which faces share an edge.
 
     Returns:
@@ -74,37 +76,31 @@ def first_of_each(rows: Int[Tensor, "row column"]) -> Int[Tensor, " kept"]:
     return first[: int(label.max()) + 1 if len(label) else 0].sort().values
 
 
-def face_counts(face_edge: Int[Tensor, "face 3"]) -> Int[Tensor, " edge"]:
+def face_counts(face_edge: Faces) -> Int[Tensor, " edge"]:
     """Count the faces at every edge, from the edges of every face of :func:`face_edges`."""
     return torch.bincount(face_edge.flatten())
 
 
-def boundary_vertices(
-    faces: Int[Tensor, "face 3"], num_vertices: int
-) -> Bool[Tensor, " {num_vertices}"]:
+def boundary_vertices(faces: Faces, num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
     """Find vertices on an edge that has one face, or more than two."""
     return _marked(open_edges(faces), num_vertices)
 
 
 def corners_of(
-    faces: Int[Tensor, "face 3"], chosen: Bool[Tensor, " face"], num_vertices: int
+    faces: Faces, chosen: FaceMask, num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
     """Find the vertices of some faces."""
     return _marked(faces[chosen], num_vertices)
 
 
-def dilated(
-    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], rings: int, num_vertices: int
-) -> Bool[Tensor, " face"]:
+def dilated(faces: Faces, some: FaceMask, rings: int, num_vertices: int) -> FaceMask:
     """Find some faces and a number of rings of faces round them."""
     for _ in range(rings):
         some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
     return some
 
 
-def connected_to(
-    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " face"], marked: Bool[Tensor, " face"]
-) -> Bool[Tensor, " face"]:
+def connected_to(faces: Faces, among: FaceMask, marked: FaceMask) -> FaceMask:
     """Find the connected components of the faces ``among`` that have a marked face."""
     pairs, _ = face_pairs(faces)
     label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
@@ -118,9 +114,7 @@ def _marked(vertices: Int[Tensor, "..."], num_vertices: int) -> Bool[Tensor, " {
     return marked
 
 
-def vertex_components(
-    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " vertex"]
-) -> Int[Tensor, " vertex"]:
+def vertex_components(faces: Faces, among: VertexMask) -> Int[Tensor, " vertex"]:
     """Label vertices that edges connect through vertices ``among`` only.
 
     Every other vertex is a component alone.
@@ -129,13 +123,13 @@ def vertex_components(
     return graph_components(edges[among[edges].all(dim=1)], len(among))
 
 
-def face_components(faces: Int[Tensor, "face 3"]) -> Int[Tensor, " face"]:
+def face_components(faces: Faces) -> Int[Tensor, " face"]:
     """Label faces connected by edges with exactly two faces; a common vertex is not enough."""
     pairs, _ = face_pairs(faces)
     return graph_components(pairs, len(faces))
 
 
-def vertex_fans(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, " fan"], Int[Tensor, "face 3"]]:
+def vertex_fans(faces: Faces) -> tuple[Int[Tensor, " fan"], Faces]:
     """Split non-manifold vertices: every fan of faces round one gets a vertex of its own.
 
     Returns:
@@ -154,7 +148,7 @@ def vertex_fans(faces: Int[Tensor, "face 3"]) -> tuple[Int[Tensor, " fan"], Int[
     return old[order], rank[label].reshape(-1, 3)
 
 
-def _fan_links(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "link 2"]:
+def _fan_links(faces: Faces) -> Int[Tensor, "link 2"]:
     """List the corners that two faces have in common, at both ends of every edge of theirs.
 
     Half as many bits as indices have elsewhere: there are six corners a vertex, and as many links.
@@ -168,9 +162,7 @@ def _fan_links(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "link 2"]:
     return links.flatten(0, 1)
 
 
-def boundary_loops(
-    faces: Int[Tensor, "face 3"],
-) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
+def boundary_loops(faces: Faces) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
     """Group the edges of a surface's border: every hole, and every outer border, is one loop.
 
     Holes that meet in a vertex are one, as the surface is not connected there. An edge of three

@@ -19,6 +19,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.shapes import Faces, Scalars, Vectors, Vertices
 from pimper_torch.records import Cameras, Mesh, Record
 
 Rows = NDArray[np.float32]
@@ -34,11 +35,11 @@ class Hits(Record):
     """
 
     face: Int[Tensor, "*batch"]
-    distance: Float[Tensor, "*batch"]
-    barycentric: Float[Tensor, "*batch 3"]
+    distance: Scalars
+    barycentric: Vectors
 
     def interpolate(
-        self, per_vertex: Float[Tensor, "vertex channel"], faces: Int[Tensor, "face 3"]
+        self, per_vertex: Float[Tensor, "vertex channel"], faces: Faces
     ) -> Float[Tensor, "*batch channel"]:
         """Blend values of the hit faces' vertices; zero for a miss."""
         corners = per_vertex[faces[self.face.clamp_min(0)]]
@@ -47,10 +48,10 @@ class Hits(Record):
 
     def refined(
         self,
-        vertices: Float[Tensor, "vertex 3"],
-        faces: Int[Tensor, "face 3"],
+        vertices: Vertices,
+        faces: Faces,
         origins: Float[Tensor, "*#batch 3"],
-        directions: Float[Tensor, "*batch 3"],
+        directions: Vectors,
     ) -> "Hits":
         """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
 
@@ -85,7 +86,7 @@ class RayCaster:
     tensor([1.])
     """
 
-    def __init__(self, vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> None:
+    def __init__(self, vertices: Vertices, faces: Faces) -> None:
         self._origin = _origin(vertices.detach())
         triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
         self._scene = rtcore_scene.EmbreeScene()
@@ -96,7 +97,7 @@ class RayCaster:
     def cast(
         self,
         origins: Float[Tensor, "*#batch 3"],
-        directions: Float[Tensor, "*batch 3"],
+        directions: Vectors,
         reach: Float[Tensor, "*#batch"] | None = None,
     ) -> Hits:
         """Find the first face each ray meets.
@@ -118,17 +119,15 @@ class RayCaster:
             barycentric=barycentric.reshape(*shape, 3).to(directions),
         )
 
-    def _near(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    def _near(self, points: Vectors) -> Vectors:
         return points if self._origin is None else points - self._origin.to(points)
 
-    def _rays(
-        self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*batch 3"]
-    ) -> tuple[Rows, Rows]:
+    def _rays(self, origins: Float[Tensor, "*#batch 3"], directions: Vectors) -> tuple[Rows, Rows]:
         return _as_rows(self._near(origins).expand_as(directions)), _as_rows(directions)
 
     def occluded(
         self,
-        points: Float[Tensor, "*batch 3"],
+        points: Vectors,
         center: Float[Tensor, " 3"],
         tolerance: float | Float[Tensor, "*#batch"],
     ) -> Bool[Tensor, "*batch"]:
@@ -146,7 +145,7 @@ class RayCaster:
     def blocked(
         self,
         origins: Float[Tensor, "*#batch 3"],
-        directions: Float[Tensor, "*batch 3"],
+        directions: Vectors,
         reach: Float[Tensor, "*#batch"],
     ) -> Bool[Tensor, "*batch"]:
         """Return whether a ray meets any face at all; several times as fast as its first one.
@@ -199,7 +198,7 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     return caster.cast(cameras.centers_world[view], rays)
 
 
-def _origin(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "3"] | None:
+def _origin(vertices: Vertices) -> Float[Tensor, "3"] | None:
     """Choose an origin for a mesh that is too far from its own for single precision, if it is."""
     if len(vertices) == 0:
         return None
@@ -215,6 +214,6 @@ def _reaches(reach: Float[Tensor, "*#batch"], shape: torch.Size) -> Rows:
     return far.clamp(0, 1e37).contiguous().numpy()
 
 
-def _as_rows(vectors: Float[Tensor, "*batch 3"]) -> Rows:
+def _as_rows(vectors: Vectors) -> Rows:
     rows = vectors.detach().to("cpu", torch.float32).reshape(-1, 3)
     return np.ascontiguousarray(rows.numpy())

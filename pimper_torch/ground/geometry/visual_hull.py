@@ -14,6 +14,7 @@ from torch.nn.functional import grid_sample, pad
 from pimper_torch.ground.geometry.opencv import signed_distance
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through, triangulate_rays
+from pimper_torch.ground.shapes import Map, Mask, Masks, Matrix3, Scalar, Scalars, Vectors
 from pimper_torch.records import Cameras, Record, Silhouettes
 from pimper_torch.runtime.mapped import parts
 from pimper_torch.runtime.parallel import side_by_side
@@ -39,7 +40,7 @@ class Hull(Record):
     """
 
     origin_world: Float[Tensor, "3"]
-    spacing: Float[Tensor, ""]
+    spacing: Scalar
     distance: Float[Tensor, "x y z"]
 
     @property
@@ -53,7 +54,7 @@ class Hull(Record):
         steps = torch.tensor(self.distance.shape).to(self.origin_world) - 1
         return torch.stack([self.origin_world, self.origin_world + self.spacing * steps])
 
-    def above(self, normal_world: Float[Tensor, "3"], offset: Float[Tensor, ""]) -> "Hull":
+    def above(self, normal_world: Float[Tensor, "3"], offset: Scalar) -> "Hull":
         """Keep what is above the plane where a normal's product with a point is ``offset``."""
         steps = [torch.arange(count).to(self.distance) for count in self.distance.shape]
         slopes = self.spacing * normal_world
@@ -65,9 +66,7 @@ class Hull(Record):
         )
         return self.replace(distance=torch.minimum(self.distance, height))
 
-    def holds(
-        self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
-    ) -> Bool[Tensor, "*batch"]:
+    def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Find points inside, or so little outside that silhouettes do not tell.
 
         Args:
@@ -75,7 +74,7 @@ class Hull(Record):
         """
         return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
 
-    def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def depth_of(self, points_world: Vectors) -> Scalars:
         """Return how deep points lie inside the hull; negative outside.
 
         Trilinear between voxels. Off the grid it is the value at its border less the distance
@@ -124,13 +123,11 @@ class Everywhere(Hull):
             offsets=-planes_world[:, 3].to(like),
         )
 
-    def depth_of(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    def depth_of(self, points_world: Vectors) -> Scalars:
         """Return infinity: a hull without bounds excludes nothing."""
         return torch.full_like(points_world[..., 0], torch.inf)
 
-    def holds(
-        self, points_world: Float[Tensor, "*batch 3"], tolerance: float = 0.0
-    ) -> Bool[Tensor, "*batch"]:
+    def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Find points above the planes; the tolerance is of silhouettes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
@@ -172,7 +169,7 @@ def visual_hull(
     num_voxels: int = 2_000_000,
     disagreeing: float = 0.03,
     min_seen: float = 0.5,
-    unknown: Bool[Tensor, "view height width"] | None = None,
+    unknown: Masks | None = None,
 ) -> Hull | None:
     """Build the hull by the vote of the reliable views.
 
@@ -216,11 +213,8 @@ def visual_hull(
 
 
 def margins(
-    hull: Hull,
-    intrinsics: Float[Tensor, "3 3"],
-    cam_from_world: Float[Tensor, "4 4"],
-    size_px: tuple[int, int],
-) -> Float[Tensor, "height width"]:
+    hull: Hull, intrinsics: Matrix3, cam_from_world: Float[Tensor, "4 4"], size_px: tuple[int, int]
+) -> Map:
     """Return how far each pixel is inside the hull's projection, in pixels; negative outside.
 
     It is how deep the ray gets into the hull, over the size of a pixel there: right to a fraction
@@ -272,7 +266,7 @@ def _deepest(
 
 
 def _framed(
-    mask: Bool[Tensor, "height width"], unknown: Bool[Tensor, "height width"], size_px: list[int]
+    mask: Mask, unknown: Mask, size_px: list[int]
 ) -> Float[Tensor, "high_and_2 wide_and_2"]:
     """Measure distances to the silhouette where it is known inside the photograph."""
     width, height = size_px

@@ -6,15 +6,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_torch.ground.geometry.topology import first_of_each, graph_components
+from pimper_torch.ground.shapes import Faces, Vertices
 
 # Of the diagonal: the widest distance of vertices that are one. A choice: rounding in single
 # precision and in text of seven digits is below, edges of any mesh of an object are far above.
 TOLERANCE = 1e-6
 
 
-def welded(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> tuple[Float[Tensor, "kept 3"], Int[Tensor, "face 3"]]:
+def welded(vertices: Vertices, faces: Faces) -> tuple[Float[Tensor, "kept 3"], Faces]:
     """Merge vertices that are closer than a millionth of the diagonal; drop those without faces.
 
     Returns:
@@ -36,7 +35,7 @@ def welded(
     return vertices[first], rank[label][faces]
 
 
-def _places(vertices: Float[Tensor, "vertex 3"]) -> Int[Tensor, " vertex"]:
+def _places(vertices: Vertices) -> Int[Tensor, " vertex"]:
     """Label vertices by place: those of one cell of a grid, and cells whose vertices are close."""
     low = vertices.amin(dim=0)
     tolerance = TOLERANCE * float((vertices.amax(dim=0) - low).norm())

@@ -10,20 +10,21 @@ what is known from elsewhere.
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.topology import boundary_vertices, vertex_components
 from pimper_torch.ground.linalg.sums import average, total
 from pimper_torch.ground.linalg.systems import solutions
+from pimper_torch.ground.shapes import Faces, PerVertex, VertexMask
 
 
 def continued(
     values: Float[Tensor, "vertex channel"],
-    known: Bool[Tensor, " vertex"],
+    known: VertexMask,
     edges: Int[Tensor, "edge 2"],
     otherwise: Float[Tensor, "vertex channel"],
-    damping: Float[Tensor, " vertex"],
+    damping: PerVertex,
 ) -> Float[Tensor, "vertex channel"]:
     """Continue values smoothly from where they are known.
 
@@ -65,9 +66,7 @@ def continued(
 
 
 def about_mean(
-    values: Float[Tensor, "vertex channel"],
-    known: Bool[Tensor, " vertex"],
-    edges: Int[Tensor, "edge 2"],
+    values: Float[Tensor, "vertex channel"], known: VertexMask, edges: Int[Tensor, "edge 2"]
 ) -> Float[Tensor, "vertex channel"]:
     """Continue values from where they are known; far from there, they are the mean of these.
 
@@ -86,11 +85,7 @@ def about_mean(
     return continued(values, known, edges, mean.expand_as(values), damping)
 
 
-def enclosed(
-    known: Bool[Tensor, " vertex"],
-    faces: Int[Tensor, "face 3"],
-    border: Bool[Tensor, " vertex"] | None = None,
-) -> Bool[Tensor, " vertex"]:
+def enclosed(known: VertexMask, faces: Faces, border: VertexMask | None = None) -> VertexMask:
     """Find what known vertices enclose: groups of others that do not reach the border.
 
     A group without any known vertex beside it is not enclosed.

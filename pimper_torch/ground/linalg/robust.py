@@ -22,6 +22,7 @@ from pimper_torch.ground.kernels.twin_constants import (
 )
 from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
 from pimper_torch.ground.linalg.sums import along_last
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.runtime.config import Range, require_ranges
 
 Scale = Annotated[float, Range(above=0, most=1e12)]
@@ -44,26 +45,22 @@ class Loss(ABC):
         require_ranges(self)
 
     @abstractmethod
-    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def rho(self, square: Scalars) -> Scalars:
         """Return the loss of squared residuals, both in units of the squared scale."""
 
     @abstractmethod
-    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def weight(self, square: Scalars) -> Scalars:
         """Return the derivative of :meth:`rho`, the weight of iteratively reweighted squares."""
 
-    def slope(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def slope(self, square: Scalars) -> Scalars:
         """Return the derivative of :meth:`weight`, by autograd."""
         return with_slope(self.weight, square)[1]
 
-    def weights(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
+    def weights(self, residual: Scalars, deviation: Float[Tensor, "*#batch"]) -> Scalars:
         """Return the weight of each residual; that of a zero residual where the deviation is 0."""
         return self.weight(_relative_square(residual, self.scale * deviation))
 
-    def curvatures(
-        self, residual: Float[Tensor, "*batch"], deviation: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*batch"]:
+    def curvatures(self, residual: Scalars, deviation: Float[Tensor, "*#batch"]) -> Scalars:
         """Return the second derivative of the loss by the residual, negative for some outliers."""
         square = _relative_square(residual, self.scale * deviation)
         return self.weight(square) + 2 * square * self.slope(square)
@@ -76,11 +73,11 @@ class Squares(Loss):
     code: ClassVar[int | None] = SQUARES
     scale: Scale = 1.0
 
-    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def rho(self, square: Scalars) -> Scalars:
         """Return the squares themselves."""
         return square
 
-    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def weight(self, square: Scalars) -> Scalars:
         """Return 1."""
         return torch.ones_like(square)
 
@@ -92,11 +89,11 @@ class Cauchy(Loss):
     code: ClassVar[int | None] = CAUCHY
     scale: Scale = CAUCHY_TUNING
 
-    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def rho(self, square: Scalars) -> Scalars:
         """Return the logarithm."""
         return square.log1p()
 
-    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def weight(self, square: Scalars) -> Scalars:
         r"""Return :math:`1 / (1 + u)`."""
         return 1 / (1 + square)
 
@@ -111,11 +108,11 @@ class GemanMcClure(Loss):
     code: ClassVar[int | None] = GEMAN_MCCLURE
     scale: Scale = GEMAN_MCCLURE_TUNING
 
-    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def rho(self, square: Scalars) -> Scalars:
         r"""Return :math:`u / (1 + u)`."""
         return square / (1 + square)
 
-    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def weight(self, square: Scalars) -> Scalars:
         r"""Return :math:`1 / (1 + u)^2`."""
         return 1 / (1 + square).square()
 
@@ -130,19 +127,18 @@ class Huber(Loss):
     code: ClassVar[int | None] = HUBER
     scale: Scale = HUBER_TUNING
 
-    def rho(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def rho(self, square: Scalars) -> Scalars:
         """Return squares of small residuals, and sizes of large ones."""
         return torch.where(square <= 1, square, 2 * square.clamp_min(1).sqrt() - 1)
 
-    def weight(self, square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def weight(self, square: Scalars) -> Scalars:
         r"""Return 1, and :math:`1 / \sqrt u` beyond."""
         return square.clamp_min(1).rsqrt()
 
 
 def with_slope(
-    function: Callable[[Float[Tensor, "*batch"]], Float[Tensor, "..."]],
-    at: Float[Tensor, "*batch"],
-) -> tuple[Float[Tensor, "..."], Float[Tensor, "*batch"]]:
+    function: Callable[[Scalars], Float[Tensor, "..."]], at: Scalars
+) -> tuple[Float[Tensor, "..."], Scalars]:
     """Return a function's values and the derivative of their sum, both constant to autograd."""
     with torch.enable_grad():
         at = at.detach().requires_grad_()
@@ -155,7 +151,7 @@ def with_slope(
 
 def median_deviation(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Float[Tensor, "*batch"]:
+) -> Scalars:
     """Estimate residuals' standard deviation by their median absolute value; 0 if none is seen.
 
     The factor 1.4826 makes it consistent for Gaussian noise. Where most residuals are close to
@@ -167,7 +163,7 @@ def median_deviation(
 
 def robust_deviation(
     residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Float[Tensor, "*batch"]:
+) -> Scalars:
     r"""Estimate the standard deviation of residuals, robustly and differentiably.
 
     An M-estimate of scale, of which the median absolute value is the limit of high powers: the
@@ -198,7 +194,7 @@ def robust_deviation(
 
 def robust_variance(
     square: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Float[Tensor, "*batch"]:
+) -> Scalars:
     """Estimate the variance from squared residuals; see :func:`robust_deviation`.
 
     Args:
@@ -217,9 +213,7 @@ def robust_variance(
 
 
 @torch.no_grad()
-def _scale_of_squares(
-    square: Float[Tensor, "*batch item"], half: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch"]:
+def _scale_of_squares(square: Float[Tensor, "*batch item"], half: Scalars) -> Scalars:
     """Find the squared scale by Newton's method for its logarithm, from the mean square down."""
     scale = along_last(square) / square.shape[-1]
     scale = torch.where(scale > 0, scale, 1)
@@ -241,9 +235,7 @@ def _fractions(
     return ratio / (1 + ratio)
 
 
-def cauchy_weights(
-    residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch"]:
+def cauchy_weights(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalars:
     """Return the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
 
     Iteratively reweighted least squares with them minimizes the sum of
@@ -254,9 +246,7 @@ def cauchy_weights(
     return 1 / (1 + _relative_square(residual, scale))
 
 
-def _relative_square(
-    residual: Float[Tensor, "*batch"], scale: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch"]:
+def _relative_square(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalars:
     """Return squared residuals in units of the squared scale; 0 where the scale is 0."""
     relative = torch.where(scale > 0, residual / torch.where(scale > 0, scale, 1), 0)
     return relative * relative

@@ -8,11 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pimper_torch.ground.shapes import Scalar, Scalars
+
 # Values of a block: a row, which one thread sums; and so many rows are summed by one thread, too.
 _BLOCK = 4096
 
 
-def total(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+def total(values: Float[Tensor, "*shape"]) -> Scalar:
     """Sum all values, block by block. Differentiable.
 
     >>> import torch
@@ -25,11 +27,11 @@ def total(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     return flat.sum()
 
 
-def along_last(values: Float[Tensor, "*batch item"]) -> Float[Tensor, "*batch"]:
+def along_last(values: Float[Tensor, "*batch item"]) -> Scalars:
     """Sum along the last dimension; a single row as by :func:`total`."""
     return total(values) if values.dim() == 1 else values.sum(dim=-1)
 
 
-def average(values: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+def average(values: Float[Tensor, "*shape"]) -> Scalar:
     """Return the mean of all values, summed as by :func:`total`; NaN where there are none."""
     return total(values) / values.numel()

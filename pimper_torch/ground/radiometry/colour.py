@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.radiometry.response import Curve, Gamma, Linear, Response, Srgb
+from pimper_torch.ground.shapes import Matrix3
 
 _LEVELS = torch.linspace(0, 1, 1025, dtype=torch.float64)
 
@@ -25,7 +26,7 @@ class Colour:
 
     source: str = ""
     response: Response | None = None
-    srgb_from_file: Float[Tensor, "3 3"] | None = None
+    srgb_from_file: Matrix3 | None = None
     trouble: str = ""
 
 

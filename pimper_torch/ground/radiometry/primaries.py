@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.radiometry.encoding import SATURATED
+from pimper_torch.ground.shapes import Matrix3
 
 # Columns are the primaries of sRGB in XYZ, adapted to D50 as profiles hold them (ICC, "sRGB").
 _SRGB_D50 = torch.tensor(
@@ -35,7 +36,7 @@ REC_2020: Chromaticities = ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046), _D65
 DISPLAY_P3: Chromaticities = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), _D65)
 
 
-def srgb_from_primaries(primaries_xyz: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"] | None:
+def srgb_from_primaries(primaries_xyz: Matrix3) -> Matrix3 | None:
     """Return the matrix from linear values of some primaries to linear sRGB; white stays white.
 
     Args:
@@ -56,7 +57,7 @@ def srgb_from_primaries(primaries_xyz: Float[Tensor, "3 3"]) -> Float[Tensor, "3
     return same if float((matrix - same).abs().max()) < 0.02 else matrix
 
 
-def primaries_of(chromaticities: Chromaticities) -> Float[Tensor, "3 3"] | None:
+def primaries_of(chromaticities: Chromaticities) -> Matrix3 | None:
     """Return primaries in XYZ adapted to D50 from x and y of red, green, blue and white.
 
     Adapted by Bradford's cone responses. ``None`` where they span no colours.
@@ -74,7 +75,7 @@ def primaries_of(chromaticities: Chromaticities) -> Float[Tensor, "3 3"] | None:
 
 
 def in_srgb_primaries(
-    radiance: Float[Tensor, "3 height width"], srgb_from_file: Float[Tensor, "3 3"]
+    radiance: Float[Tensor, "3 height width"], srgb_from_file: Matrix3
 ) -> Float[Tensor, "3 height width"]:
     r"""Express radiance in the primaries of sRGB, up to one factor.
 

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.runtime.errors import InputError
 
 
-def linear_from_srgb(encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def linear_from_srgb(encoded: Scalars) -> Scalars:
     """Turn sRGB values in [0, 1], as files hold them, into linear radiance.
 
     Piecewise as IEC 61966-2-1 defines it: a straight piece below 0.04045, a power of 2.4
@@ -22,7 +23,7 @@ def linear_from_srgb(encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"
     return torch.where(encoded <= 0.04045, encoded / 12.92, curved)
 
 
-def srgb_from_linear(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def srgb_from_linear(radiance: Scalars) -> Scalars:
     """Encode linear radiance in [0, 1] with the sRGB curve; undoes :func:`linear_from_srgb`."""
     light = radiance.clamp(0, 1)
     return torch.where(
@@ -30,7 +31,7 @@ def srgb_from_linear(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch
     )
 
 
-def to_bytes(radiance: Float[Tensor, "*batch"]) -> UInt8[Tensor, "*batch"]:
+def to_bytes(radiance: Scalars) -> UInt8[Tensor, "*batch"]:
     """Encode linear radiance as 8-bit sRGB."""
     return (255 * srgb_from_linear(radiance)).round().to(torch.uint8)
 
@@ -44,11 +45,11 @@ _FULL_SCALE = {8: 255, 16: 65535}
 class Linear:
     """The file's values are proportional to radiance."""
 
-    def linear_from_encoded(self, encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def linear_from_encoded(self, encoded: Scalars) -> Scalars:
         """Leave the values as they are."""
         return encoded
 
-    def encoded_from_linear(self, radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def encoded_from_linear(self, radiance: Scalars) -> Scalars:
         """Leave radiance as it is, cut off at full scale."""
         return radiance.clamp(0, 1)
 
@@ -57,11 +58,11 @@ class Linear:
 class Srgb:
     """The curve of sRGB, as most cameras and programs write."""
 
-    def linear_from_encoded(self, encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def linear_from_encoded(self, encoded: Scalars) -> Scalars:
         """See :func:`linear_from_srgb`."""
         return linear_from_srgb(encoded)
 
-    def encoded_from_linear(self, radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def encoded_from_linear(self, radiance: Scalars) -> Scalars:
         """See :func:`~pimper_torch.ground.radiometry.response.srgb_from_linear`."""
         return srgb_from_linear(radiance)
 
@@ -83,11 +84,11 @@ class Gamma:
                 "as 2.2."
             )
 
-    def linear_from_encoded(self, encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def linear_from_encoded(self, encoded: Scalars) -> Scalars:
         """Raise to the power. Differentiable; at 0 only for exponents of 1 or more."""
         return encoded.clamp_min(0) ** self.exponent
 
-    def encoded_from_linear(self, radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def encoded_from_linear(self, radiance: Scalars) -> Scalars:
         """Take the root, cut off at full scale. Steep at 0 for exponents above 1."""
         return radiance.clamp(0, 1) ** (1 / self.exponent)
 
@@ -110,7 +111,7 @@ class Curve:
     radiance: Float[Tensor, "channel entry"]
     bits: int | None = None
 
-    def linear_from_encoded(self, encoded: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def linear_from_encoded(self, encoded: Scalars) -> Scalars:
         """Interpolate; differentiable but for kinks at the entries.
 
         Args:
@@ -119,11 +120,11 @@ class Curve:
         """
         return self._through(encoded, inverse=False)
 
-    def encoded_from_linear(self, radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def encoded_from_linear(self, radiance: Scalars) -> Scalars:
         """Undo :meth:`linear_from_encoded`, within the table's range."""
         return self._through(radiance, inverse=True)
 
-    def _through(self, values: Float[Tensor, "*batch"], inverse: bool) -> Float[Tensor, "*batch"]:
+    def _through(self, values: Scalars, inverse: bool) -> Scalars:
         found = []
         rows = len(self.radiance)
         parts = (values,) if rows == 1 else values.unbind(dim=-3)
@@ -198,8 +199,8 @@ def _require_rising(
 
 
 def _interpolate(
-    values: Float[Tensor, "*batch"], given: Float[Tensor, " entry"], wanted: Float[Tensor, " entry"]
-) -> Float[Tensor, "*batch"]:
+    values: Scalars, given: Float[Tensor, " entry"], wanted: Float[Tensor, " entry"]
+) -> Scalars:
     inside = values.clamp(given[0], given[-1])
     upper = torch.searchsorted(given, inside.detach().contiguous()).clamp(1, len(given) - 1)
     slope = wanted.diff() / given.diff()

@@ -6,12 +6,13 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, normalize
 
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.shapes import Map, Mask, Masks, Pixels
 from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.window_matching import (
     Matcher,
@@ -64,7 +65,7 @@ class DepthMaps(Record):
     level: MatchingLevel
     inverse_depth: Float[Tensor, "view height width"]
     agreed: Int[Tensor, "view height width"]
-    valid: Bool[Tensor, "view height width"]
+    valid: Masks
     step: Float[Tensor, " view"]
     sources: Int[Tensor, "view source"]
 
@@ -97,8 +98,8 @@ def depth_maps(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Found(Record):
-    inverse_depth: Float[Tensor, "height width"]
-    score: Float[Tensor, "height width"]
+    inverse_depth: Map
+    score: Map
     step: float
     sources: Int[Tensor, " source"]
 
@@ -137,12 +138,12 @@ def _search(
 
 def _whole_range(
     matcher: Matcher,
-    pixels: Float[Tensor, "point 2"],
+    pixels: Pixels,
     known: Float[Tensor, " point"],
-    blank: Float[Tensor, "height width"],
+    blank: Map,
     step: float,
     max_hypotheses: int,
-) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+) -> tuple[Map, Map]:
     """Search planes parallel to the image, then offsets of a smooth surface through the points."""
     low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
     low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
@@ -157,9 +158,7 @@ def _whole_range(
     return torch.where(better > score, again, found), torch.maximum(better, score)
 
 
-def _near(
-    matcher: Matcher, field: Float[Tensor, "height width"], step: float
-) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+def _near(matcher: Matcher, field: Map, step: float) -> tuple[Map, Map]:
     """Search near a field, and near the larger and smaller depths on either side of its steps."""
     offsets = [_NEAR_STEP * step * rank for rank in range(-3, 4)]
     found, score = sweep(matcher, field, offsets)
@@ -170,9 +169,7 @@ def _near(
     return found, score
 
 
-def sweep(
-    matcher: Matcher, field: Float[Tensor, "height width"], offsets: Sequence[float]
-) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, Map]:
     """Find the best of some evenly spaced offsets of a field at every pixel.
 
     Returns:
@@ -223,7 +220,7 @@ def _checked(
 def agreeing(
     level: MatchingLevel,
     inverse_depth: Float[Tensor, "view height width"],
-    good: Bool[Tensor, "view height width"],
+    good: Masks,
     view: int,
     others: Int[Tensor, " other"],
     max_error_px: float,
@@ -272,7 +269,7 @@ def _pixels_per_inverse_depth(
     return torch.hypot(rate[:, 0], rate[:, 1])
 
 
-def filled(maps: DepthMaps, view: int) -> Float[Tensor, "height width"]:
+def filled(maps: DepthMaps, view: int) -> Map:
     """Fill a view's inverse depths where they are not valid.
 
     First by the nearest of its sources' points, then smoothly from the neighbours.
@@ -286,7 +283,7 @@ def filled(maps: DepthMaps, view: int) -> Float[Tensor, "height width"]:
     return push_pull(field, known | (splat > 0))
 
 
-def splatted(maps: DepthMaps, source: int, view: int) -> Float[Tensor, "height width"]:
+def splatted(maps: DepthMaps, source: int, view: int) -> Map:
     """Project one view's valid depths into another: the nearest of each pixel, 0 for none."""
     one = torch.tensor([view], device=maps.valid.device)
     pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
@@ -300,9 +297,7 @@ def splatted(maps: DepthMaps, source: int, view: int) -> Float[Tensor, "height w
     return flat.scatter_reduce(0, index, value[inside], "amax").reshape(height, width)
 
 
-def push_pull(
-    values: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
-) -> Float[Tensor, "height width"]:
+def push_pull(values: Map, known: Mask) -> Map:
     """Fill holes smoothly from a pyramid of averages; known values stay.
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.3.
@@ -317,11 +312,7 @@ def push_pull(
     return torch.where(known, values, up[0, 0])
 
 
-def spanned(
-    pixels: Float[Tensor, "point 2"],
-    values: Float[Tensor, " point"],
-    like: Float[Tensor, "height width"],
-) -> Float[Tensor, "height width"]:
+def spanned(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
     """Interpolate values smoothly from some pixels of an image to all."""
     height, width = like.shape
     column = pixels[:, 0].long().clamp(0, width - 1)
@@ -332,14 +323,12 @@ def spanned(
     return push_pull(known, known > 0)
 
 
-def median3(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+def median3(values: Map) -> Map:
     """Take the median of every pixel and its eight neighbours."""
     return torch.stack(shifted(values, 1, "replicate")).median(dim=0).values
 
 
-def _largest_around(
-    field: Float[Tensor, "height width"], radius: int
-) -> Float[Tensor, "height width"]:
+def _largest_around(field: Map, radius: int) -> Map:
     return max_pool2d(field[None, None], 2 * radius + 1, 1, radius)[0, 0]
 
 
@@ -372,7 +361,7 @@ def choose_sources(
 
 
 def step_for_one_pixel(
-    pairing: Pairing, pixels: Float[Tensor, "point 2"], inverse_depth: Float[Tensor, " point"]
+    pairing: Pairing, pixels: Pixels, inverse_depth: Float[Tensor, " point"]
 ) -> float:
     """Return the change of inverse depth that moves points by one pixel in the sources.
 

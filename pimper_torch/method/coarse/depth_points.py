@@ -16,6 +16,7 @@ from pimper_torch.ground.geometry.lens_models import photographed
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.ground.geometry.supporting_plane import fixation
+from pimper_torch.ground.shapes import Mask, Pixels, Points, Scalar
 from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.densify import DepthMaps, agreeing, depth_maps, nearest_pixels
 from pimper_torch.method.coarse.window_matching import Matcher, Windows, pair
@@ -112,7 +113,7 @@ def _room(scene: SparseScene) -> SparseScene:
     )
 
 
-def _along_rays(cameras: Cameras, views: Views, view: int) -> Float[Tensor, "point 3"]:
+def _along_rays(cameras: Cameras, views: Views, view: int) -> Points:
     """Put points on a view's rays, evenly in inverse depth."""
     width, height = cameras.sizes_px[view].tolist()
     step = math.sqrt(width * height * cameras.num_views * _STEPS / _ROOM)
@@ -128,7 +129,7 @@ def _along_rays(cameras: Cameras, views: Views, view: int) -> Float[Tensor, "poi
     return (center + rays[:, None] / inverse[:, None]).reshape(-1, 3)
 
 
-def _distance(cameras: Cameras, view: int) -> Float[Tensor, ""]:
+def _distance(cameras: Cameras, view: int) -> Scalar:
     """Return distance to the point nearest to all optical axes, or else to the other cameras."""
     poses, centers = cameras.cam_from_world, cameras.centers_world
     ahead = (fixation(poses).fixation_world - centers[view]) @ poses[view, 2, :3]
@@ -136,7 +137,7 @@ def _distance(cameras: Cameras, view: int) -> Float[Tensor, ""]:
 
 
 def _framed(
-    points: Float[Tensor, "point 3"], cameras: Cameras, views: Views
+    points: Points, cameras: Cameras, views: Views
 ) -> tuple[Bool[Tensor, "point view"], Bool[Tensor, "point view"]]:
     """Find which views have points in their frames, and which show them in their masks."""
     framed, shown = [], []
@@ -172,8 +173,8 @@ def _points_of(
 
 
 def _in_source(
-    maps: DepthMaps, view: int, source: int, chosen: Bool[Tensor, "height width"]
-) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
+    maps: DepthMaps, view: int, source: int, chosen: Mask
+) -> tuple[Pixels, Bool[Tensor, " point"]]:
     """Return where a source shows the points of a view's pixels, and whether it does."""
     one = torch.tensor([source], device=chosen.device)
     pairing = pair(maps.level, view, one)
@@ -191,7 +192,7 @@ def _in_source(
     return pixels[0].mT, agrees | alike
 
 
-def _spread(valid: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def _spread(valid: Mask) -> Mask:
     """Keep pixels of a coarser raster, so that about so many are left."""
     step = max(1, math.ceil(math.sqrt(int(valid.sum()) / _MOST)))
     kept = torch.zeros_like(valid)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -14,6 +14,7 @@ from pimper_torch.ground.geometry.pixels import crop_intrinsics
 from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.shapes import Faces, VertexMask, Vertices
 from pimper_torch.method.coarse import trim
 from pimper_torch.method.coarse.coarse_config import DensifyConfig, FineSurfaceConfig
 from pimper_torch.method.coarse.oriented import (
@@ -47,8 +48,8 @@ class FineSurface(Record):
         pixel: Size of a pixel of the finest depth maps there, scene units.
     """
 
-    vertices_world: Float[Tensor, "vertex 3"]
-    faces: Int[Tensor, "face 3"]
+    vertices_world: Vertices
+    faces: Faces
     support: Int[Tensor, " face"]
     pixel: float
 
@@ -120,7 +121,7 @@ def fine_surface(
 
 def closed_surface(
     cloud: OrientedPoints, contours: Contours, pixel: float
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"], ContourPoints]:
+) -> tuple[Vertices, Faces, ContourPoints]:
     """Put a closed surface through points, tangent to the rays through the silhouettes.
 
     Where each ray touches it follows from the surface, and the surface from where rays touch
@@ -158,12 +159,8 @@ def closed_surface(
 
 
 def visible_vertices(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    normals: Float[Tensor, "vertex 3"],
-    cameras: Cameras,
-    tolerance: float,
-) -> Bool[Tensor, " vertex"]:
+    vertices: Vertices, faces: Faces, normals: Vertices, cameras: Cameras, tolerance: float
+) -> VertexMask:
     """Find the vertices that face a camera and are not occluded.
 
     Args:
@@ -177,9 +174,7 @@ def visible_vertices(
     return found
 
 
-def poisson(
-    cloud: OrientedPoints, cell: float
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+def poisson(cloud: OrientedPoints, cell: float) -> tuple[Vertices, Faces]:
     """Put a closed surface through points with outward normals.
 
     Args:

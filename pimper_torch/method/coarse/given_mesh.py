@@ -2,8 +2,6 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from pimper_torch.ground.geometry.mesh_frame import compare_with_scene
 from pimper_torch.ground.geometry.pixels import pixel_centers
@@ -12,6 +10,7 @@ from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.ground.geometry.topology import face_components, first_of_each
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.geometry.welding import welded
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 
@@ -63,9 +62,7 @@ def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
     return Mesh(vertices_world=vertices[used], faces=faces), dropped
 
 
-def oriented_outward(
-    mesh: Mesh, cameras: Cameras
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+def oriented_outward(mesh: Mesh, cameras: Cameras) -> tuple[Vertices, Faces]:
     """Wind the faces of a mesh consistently, with the front of each component to the cameras.
 
     Vertices at the same place become one first, see :func:`cleaned`.
@@ -87,9 +84,7 @@ def oriented_outward(
     return vertices, _fronts_outward(vertices, faces, cameras)
 
 
-def _fronts_outward(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], cameras: Cameras
-) -> Int[Tensor, "face 3"]:
+def _fronts_outward(vertices: Vertices, faces: Faces, cameras: Cameras) -> Faces:
     """Flip components of which the cameras see more back than front."""
     caster, normals = RayCaster(vertices, faces), face_normals(vertices, faces)
     balance, num_hits = torch.zeros_like(normals[:, 0]), 0

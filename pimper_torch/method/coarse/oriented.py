@@ -12,6 +12,7 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.shapes import Map, Mask, Points
 from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.densify import DepthMaps, depth_maps
 from pimper_torch.method.coarse.window_matching import shifted
@@ -49,8 +50,8 @@ class OrientedPoints(Record):
         noise: Standard deviation along the normal, scene units.
     """
 
-    points_world: Float[Tensor, "point 3"]
-    normals_world: Float[Tensor, "point 3"]
+    points_world: Points
+    normals_world: Points
     noise: Float[Tensor, " point"]
 
 
@@ -88,18 +89,14 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
     return OrientedPoints(points_world=points, normals_world=normals, noise=noise[:, 0])
 
 
-def _covered(
-    finer: Bool[Tensor, "fine_height fine_width"], like: Bool[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
+def _covered(finer: Bool[Tensor, "fine_height fine_width"], like: Mask) -> Mask:
     """Find coarse pixels on or beside which a finer one is valid."""
     height, width = like.shape
     fraction = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
     return max_pool2d(fraction, 3, 1, 1)[0, 0] > 0
 
 
-def _of_view(
-    maps: DepthMaps, view: int, wanted: Bool[Tensor, "height width"]
-) -> tuple[OrientedPoints, Bool[Tensor, "height width"]]:
+def _of_view(maps: DepthMaps, view: int, wanted: Mask) -> tuple[OrientedPoints, Mask]:
     """Return a view's points at wanted pixels, and the mask of pixels with these or finer ones."""
     intrinsics = maps.level.cameras.intrinsics[view]
     frame = maps.level.cameras.cam_from_world[view]
@@ -128,12 +125,12 @@ def _of_view(
 
 
 def fitted_planes(
-    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
+    inverse_depth: Map, valid: Mask, step: float
 ) -> tuple[
-    Float[Tensor, "height width"],
+    Map,
     Float[Tensor, "height width 2"],
-    Float[Tensor, "height width"],
-    Bool[Tensor, "height width"],
+    Map,
+    Mask,
 ]:
     """Fit a plane to the inverse depths round every pixel; a plane's are affine in the pixel.
 
@@ -152,9 +149,7 @@ def fitted_planes(
     return inverse_depth + step * offset, step * torch.stack([across, down], dim=-1), spread, fitted
 
 
-def _fits(
-    inverse_depth: Float[Tensor, "height width"], valid: Bool[Tensor, "height width"], step: float
-) -> Float[Tensor, "5 height width"]:
+def _fits(inverse_depth: Map, valid: Mask, step: float) -> Float[Tensor, "5 height width"]:
     """Return offset, slopes, variance and mean weight of planes, in steps; 0 where not valid."""
     side = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
     v, u = (one.reshape(-1) for one in torch.meshgrid(side, side, indexing="ij"))
@@ -162,7 +157,7 @@ def _fits(
     squares = (basis[:, None] * basis).flatten(0, 1)
     ridge = _RIDGE * torch.eye(3).to(basis)[..., None]
 
-    def around(values: Float[Tensor, "height width"]) -> Float[Tensor, "entry pixel"]:
+    def around(values: Map) -> Float[Tensor, "entry pixel"]:
         return torch.stack([one[valid] for one in shifted(values, _RADIUS, "constant")])
 
     differences = (around(inverse_depth) - inverse_depth[valid]) * (1 / step)
@@ -184,7 +179,7 @@ def _fits(
     return results
 
 
-def denied(maps: DepthMaps, view: int, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+def denied(maps: DepthMaps, view: int, points: Points) -> Int[Tensor, " point"]:
     """Count the views whose depth maps lie behind the points, and so contradict them."""
     cameras, count = maps.level.cameras, torch.zeros_like(points[:, 0], dtype=torch.long)
     pixels_from_world = cameras.intrinsics @ cameras.cam_from_world[:, :3]

@@ -9,6 +9,7 @@ from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, un
 from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
 from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.shapes import FaceMask, Faces, Vertices
 from pimper_torch.method.coarse import splitting
 from pimper_torch.method.coarse.coarse_config import RemeshConfig
 from pimper_torch.method.coarse.trim import enclosed_holes
@@ -143,12 +144,12 @@ def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]
 
 
 def _on_surface(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices,
+    faces: Faces,
     edges: Int[Tensor, "edge 2"],
-    face_edge: Int[Tensor, "face 3"],
+    face_edge: Faces,
     surface: Surface,
-) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "edge 3"]]:
+) -> tuple[Vertices, Float[Tensor, "edge 3"]]:
     """Find vertices and midpoints of edges on the surface; these interpolate along the edge."""
     zeros = surface.barycentric < _ON_EDGE
     count = zeros.sum(dim=1)
@@ -176,12 +177,8 @@ def _on_surface(
 
 
 def _with_data(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    surface: Surface,
-    seen: Bool[Tensor, " face"] | None,
-    max_hole: float,
-) -> Bool[Tensor, " face"]:
+    vertices: Vertices, faces: Faces, surface: Surface, seen: FaceMask | None, max_hole: float
+) -> FaceMask:
     """Find facets with data, and small holes that those enclose."""
     everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
     supported = surface.supported
@@ -205,8 +202,8 @@ def _with_data(
 
 
 def _severity(
-    corners: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    corners: Vertices,
+    faces: Faces,
     surface: Surface,
     spacing: float,
     residual: Float[Tensor, " face"] | None,
@@ -224,9 +221,7 @@ def _severity(
     return worst
 
 
-def departures(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], surface: Surface
-) -> Float[Tensor, " face"]:
+def departures(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
     """Return the 90th percentile of the surface's distances from each facet's plane."""
     normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)
@@ -251,19 +246,17 @@ def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
 
 
-def _side(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, " face"]:
+def _side(vertices: Vertices, faces: Faces) -> Float[Tensor, " face"]:
     """Return the side of the equilateral triangle of each facet's area."""
     return (2 / 3**0.5 * face_normals(vertices, faces).norm(dim=1)).sqrt()
 
 
 def _worst_first(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices,
+    faces: Faces,
     severity: Float[Tensor, " face"],
-    small: Bool[Tensor, " face"],
-    kept: Bool[Tensor, " face"],
+    small: FaceMask,
+    kept: FaceMask,
     max_facets: int,
 ) -> Bool[Tensor, " edge"]:
     """Find the edges of as many of the worst facets as the limit allows, by bisection."""
@@ -289,9 +282,7 @@ def _worst_first(
     return marks(least)
 
 
-def _without_folds(
-    flat: Float[Tensor, "vertex 3"], onto: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, "vertex 3"]:
+def _without_folds(flat: Vertices, onto: Vertices, faces: Faces) -> Vertices:
     """Move vertices onto the surface, except where that folds, flattens or stretches facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)

@@ -20,6 +20,7 @@ from pimper_torch.ground.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Points, Vertices
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Record, Surface
 
 # Barycentric coordinates of a face's corners, and of the midpoints of the opposite edges.
@@ -44,8 +45,8 @@ class Split(Record):
     corners: Float[Tensor, "child 3 3"]
 
     def relocate(
-        self, parent: Int[Tensor, " point"], barycentric: Float[Tensor, "point 3"]
-    ) -> tuple[Int[Tensor, " point"], Float[Tensor, "point 3"]]:
+        self, parent: Int[Tensor, " point"], barycentric: Points
+    ) -> tuple[Int[Tensor, " point"], Points]:
         """Return the child that each point of a face lies in or nearest to, and its coordinates."""
         inverse = torch.linalg.inv(self.corners).to(barycentric)
         first = torch.searchsorted(self.parent, parent)
@@ -62,10 +63,7 @@ class Split(Record):
 
 
 def mark_edges(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    wanted: Bool[Tensor, " face"],
-    forbidden: Bool[Tensor, " face"],
+    vertices: Vertices, faces: Faces, wanted: FaceMask, forbidden: FaceMask
 ) -> Bool[Tensor, " edge"]:
     """Choose the edges to halve, in the order of :func:`face_edges`.
 
@@ -93,9 +91,7 @@ def mark_edges(
         marked = grown
 
 
-def split_edges(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], marked: Bool[Tensor, " edge"]
-) -> Split:
+def split_edges(vertices: Vertices, faces: Faces, marked: Bool[Tensor, " edge"]) -> Split:
     """Halve the marked edges, in the order of :func:`face_edges`; faces keep their orientation."""
     _, face_edge = face_edges(faces)
     halved = marked.nonzero()[:, 0]
@@ -154,7 +150,7 @@ def _cases(
 _MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
 
 
-def normal_weights(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
+def normal_weights(information: PerVertex) -> PerVertex:
     """Return inverse variances of normals about those that facets blend, relative to the best.
 
     Args:
@@ -166,7 +162,7 @@ def normal_weights(information: Float[Tensor, " vertex"]) -> Float[Tensor, " ver
 
 def fitted_normals(
     mesh: Mesh, surface: Surface, split: Split, index: Int[Tensor, " child"]
-) -> Float[Tensor, "vertex 3"]:
+) -> Vertices:
     """Fit vertex normals whose blend over the facets is nearest to the surface's normals.
 
     Least squares over the subdivided mesh, weighted by inverse variances; where that has no

@@ -12,6 +12,7 @@ from pimper_torch.ground.geometry.projection import triangulation_angles
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_edges
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.method.coarse.coarse_config import (
     CoarseSurfaceConfig,
     DensifyConfig,
@@ -136,9 +137,7 @@ def reliable_points(scene: SparseScene) -> Int[Tensor, " reliable"]:
     return reliable.nonzero()[:, 0]
 
 
-def smoothed_normals(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Float[Tensor, "vertex 3"]:
+def smoothed_normals(vertices: Vertices, faces: Faces) -> Vertices:
     """Average each vertex normal with the mean of those of its neighbours; unit."""
     normals = vertex_normals(vertices, faces)
     source = half_edges(faces[:, [2, 0, 1]])  # summed from each face's first edge on
@@ -147,9 +146,7 @@ def smoothed_normals(
     return normalize(normals + normalize(total, dim=-1), dim=-1)
 
 
-def two_faces_an_edge(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
-) -> Int[Tensor, "kept 3"]:
+def two_faces_an_edge(vertices: Vertices, faces: Faces) -> Int[Tensor, "kept 3"]:
     """Drop the smallest face of edges with three or more until each has two at most."""
     while True:
         _, face_edge = face_edges(faces)
@@ -166,8 +163,8 @@ def _with_points(
     scene: SparseScene,
     reliable: Int[Tensor, " reliable"],
     reference: int,
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices,
+    faces: Faces,
     max_distance: float,
 ) -> CoarseMesh:
     """Put the reliable points of the cloud that lie near a facet beside the facets."""
@@ -188,7 +185,7 @@ def _with_points(
 
 
 def _facets(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], count: int
+    vertices: Vertices, faces: Faces, count: int
 ) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
     few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
     return few.vertices_world, few.faces

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import reduce
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -14,6 +14,7 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.shapes import FaceMask, Faces, Points, Vertices
 from pimper_torch.method.coarse.coarse_config import FineSurfaceConfig
 from pimper_torch.method.coarse.densify import DepthMaps
 from pimper_torch.method.coarse.oriented import OrientedPoints
@@ -59,11 +60,11 @@ class ViewCounts(Record):
 
 
 def view_counts(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices,
+    faces: Faces,
     level: MatchingLevel,
     maps: DepthMaps | None,
-    matched_world: Float[Tensor, "point 3"],
+    matched_world: Points,
     reach: float,
 ) -> ViewCounts:
     """Count the views that see the centre of each face, see it lit, and see through it.
@@ -113,9 +114,7 @@ def view_counts(
     return ViewCounts(seen=seen, lit=lit, behind=behind)
 
 
-def point_distances(
-    queries: Float[Tensor, "query 3"], points: Float[Tensor, "point 3"]
-) -> Float[Tensor, " query"]:
+def point_distances(queries: Float[Tensor, "query 3"], points: Points) -> Float[Tensor, " query"]:
     """Measure the distance of each query to the nearest point."""
     tree = cKDTree(points.detach().cpu().numpy())
     distance, _ = tree.query(queries.detach().cpu().numpy(), workers=num_workers())
@@ -123,11 +122,8 @@ def point_distances(
 
 
 def without_small_holes(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    kept: Bool[Tensor, " face"],
-    largest: float,
-) -> Bool[Tensor, " face"]:
+    vertices: Vertices, faces: Faces, kept: FaceMask, largest: float
+) -> FaceMask:
     """Keep connected components of dropped faces too whose area is small, in scene units."""
     pairs, _ = topology.face_pairs(faces)
     dropped = pairs[~kept[pairs].any(dim=1)]
@@ -137,12 +133,7 @@ def without_small_holes(
     return kept | (~kept & (areas < largest))
 
 
-def enclosed_holes(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    kept: Bool[Tensor, " face"],
-    largest: float,
-) -> Bool[Tensor, " face"]:
+def enclosed_holes(vertices: Vertices, faces: Faces, kept: FaceMask, largest: float) -> FaceMask:
     """Find connected components of dropped faces, up to an area, that kept faces enclose.
 
     A component that reaches the border of the surface is not enclosed.
@@ -160,13 +151,13 @@ def enclosed_holes(
 
 
 def fringes(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    kept: Bool[Tensor, " face"],
-    supported: Bool[Tensor, " face"],
+    vertices: Vertices,
+    faces: Faces,
+    kept: FaceMask,
+    supported: FaceMask,
     smallest: float,
     rings: int,
-) -> Bool[Tensor, " face"]:
+) -> FaceMask:
     """Find narrow strips and spurs beside dropped faces that are small or hardly supported.
 
     Narrow is what a morphological opening removes: erosion by some rings of faces, then
@@ -188,11 +179,8 @@ def fringes(
 
 
 def supported_components(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    supported: Bool[Tensor, " face"],
-    fraction: float,
-) -> Bool[Tensor, " face"]:
+    vertices: Vertices, faces: Faces, supported: FaceMask, fraction: float
+) -> FaceMask:
     """Find components with at least a fraction of the supported area of all."""
     everything = torch.zeros_like(faces[:, 0])
     own, total = (
@@ -226,13 +214,13 @@ def supports(
 
 
 def near_points(
-    faces: Int[Tensor, "face 3"],
+    faces: Faces,
     centre: Float[Tensor, "face 3"],
     cloud: OrientedPoints,
     support: Int[Tensor, " face"],
     counts: ViewCounts,
     pixel: float,
-) -> Bool[Tensor, " face"]:
+) -> FaceMask:
     """Find faces with points, and illuminated faces between points that are near to some.
 
     A component of faces further than the margin from all points is not marked if one of them is
@@ -248,15 +236,15 @@ def near_points(
 
 
 def seen_surface(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices,
+    faces: Faces,
     support: Int[Tensor, " face"],
     counts: ViewCounts,
-    inside: Bool[Tensor, " face"],
+    inside: FaceMask,
     pixel: float,
     config: FineSurfaceConfig,
     fraction: float = 0.01,
-) -> Bool[Tensor, " face"]:
+) -> FaceMask:
     """Find the faces that stay: in the visual hull, and seen or supported.
 
     Surface without points that views see through is dropped: it closes an opening, or floats in
@@ -295,9 +283,7 @@ def seen_surface(
     return kept
 
 
-def regions_seen_through(
-    faces: Int[Tensor, "face 3"], some: Bool[Tensor, " face"], through: Bool[Tensor, " face"]
-) -> Bool[Tensor, " face"]:
+def regions_seen_through(faces: Faces, some: FaceMask, through: FaceMask) -> FaceMask:
     """Find the connected regions of some faces that views see through over enough of them.
 
     Args:

@@ -11,12 +11,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.ground.kernels.arrays import as_array
+from pimper_torch.ground.shapes import Map, Masks
 from pimper_torch.records import Cameras, Record, SparseScene
 from pimper_torch.runtime.mapped import by_view, each
 
@@ -32,7 +33,7 @@ class MatchingLevel(Record):
     """
 
     tone: Float[Tensor, "view height width"]
-    usable: Bool[Tensor, "view height width"]
+    usable: Masks
     cameras: Cameras
 
 
@@ -156,9 +157,7 @@ class Matcher:
         self._weight, self._deviation, self._power = map(as_array, (weight, deviation, power))
         self._windows = windows
 
-    def scores(
-        self, field: Float[Tensor, "height width"], offsets: Sequence[float]
-    ) -> Float[Tensor, "offset height width"]:
+    def scores(self, field: Map, offsets: Sequence[float]) -> Float[Tensor, "offset height width"]:
         """Score a field of inverse depths moved by each of some offsets.
 
         The score is the mean correlation of the best sources, 0 where none sees the pixel:
@@ -185,9 +184,7 @@ class Matcher:
         return found.to(field)
 
 
-def shifted(
-    values: Float[Tensor, "height width"], radius: int, padding: Literal["replicate", "constant"]
-) -> list[Float[Tensor, "height width"]]:
+def shifted(values: Map, radius: int, padding: Literal["replicate", "constant"]) -> list[Map]:
     """Return a map for each pixel of a window: the values shifted by its offset."""
     height, width = values.shape
     wide = pad(values[None, None], (radius,) * 4, mode=padding)[0, 0]

@@ -20,6 +20,7 @@ from pimper_torch.ground.geometry.height_fields import intersect_height_field, s
 from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.ground.shapes import PerVertex, VertexMask, Vertices
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
@@ -65,22 +66,22 @@ class Blend(Record):
         prior_offsets: Like ``offsets``, that were guessed.
     """
 
-    heights: Float[Tensor, " vertex"]
-    supported: Bool[Tensor, " vertex"]
-    normals_world: Float[Tensor, "vertex 3"]
+    heights: PerVertex
+    supported: VertexMask
+    normals_world: Vertices
     albedo: Float[Tensor, "vertex channel"]
-    seen: Bool[Tensor, " vertex"]
-    observed: Bool[Tensor, " vertex"]
-    normal_information: Float[Tensor, " vertex"]
-    offsets: Float[Tensor, " vertex"]
-    offset_information: Float[Tensor, " vertex"]
-    prior_normals_world: Float[Tensor, "vertex 3"]
-    prior_normal_information: Float[Tensor, " vertex"]
-    prior_offsets: Float[Tensor, " vertex"]
-    prior_offset_information: Float[Tensor, " vertex"]
+    seen: VertexMask
+    observed: VertexMask
+    normal_information: PerVertex
+    offsets: PerVertex
+    offset_information: PerVertex
+    prior_normals_world: Vertices
+    prior_normal_information: PerVertex
+    prior_offsets: PerVertex
+    prior_offset_information: PerVertex
 
 
-def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Float[Tensor, "vertex 3"]:
+def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Vertices:
     """Return the vertices' rays: smoothed normals of the coarse mesh, interpolated."""
     mesh = coarse.mesh
     normals = mesh.normals_world
@@ -99,7 +100,7 @@ def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor
 def blend_patches(
     depths: DepthPatches,
     subdivision: Subdivision,
-    directions: Float[Tensor, "vertex 3"],
+    directions: Vertices,
     outlier_samples: float,
     swept: Sequence[Heights] | None = None,
 ) -> Blend:
@@ -169,7 +170,7 @@ def _estimates(
     photometry: Photometry,
     swept: Heights | None,
     subdivision: Subdivision,
-    directions: Float[Tensor, "vertex 3"],
+    directions: Vertices,
     around: "_Lists",
     vertices: "_Lists",
 ) -> _Estimates:
@@ -247,7 +248,7 @@ def _rays_near(
     corners: Float[Tensor, "patch 3 2"],
     bands: Float[Tensor, "patch 3"],
     subdivision: Subdivision,
-    directions: Float[Tensor, "vertex 3"],
+    directions: Vertices,
     around: "_Lists",
     vertices: "_Lists",
 ) -> tuple[Int[Tensor, "patch ray"], Bool[Tensor, "patch ray"]]:
@@ -360,17 +361,13 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     )
 
 
-def _beside_unknown(
-    information: Float[Tensor, " vertex"], known: Float[Tensor, " vertex"]
-) -> Float[Tensor, " vertex"]:
+def _beside_unknown(information: PerVertex, known: PerVertex) -> PerVertex:
     """Lower the information of mean normals where they are known for a fraction of the weight."""
     unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
     return information / (1 + information * math.radians(_UNKNOWN_NORMAL_DEG) ** 2 * unknown)
 
 
-def _split(
-    sums: Float[Tensor, "vertex layer"],
-) -> tuple[Float[Tensor, " vertex"], Float[Tensor, "vertex value"]]:
+def _split(sums: Float[Tensor, "vertex layer"]) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:
     """Return the summed information and the mean by it of what follows; 0 where there is none."""
     information = sums[:, 0]
     some = information > 0

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.subdivision import Subdivision, transferred
 from pimper_torch.ground.geometry.topology import corners_of, dilated
+from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask
 from pimper_torch.records import Mesh, Record
 
 # Rings of facets round those of a block: the first is blended with its neighbours.
@@ -26,7 +27,7 @@ _RINGS = 2
 # Values that all blocks have in common, by name: the factor of a kind of terms by the number of
 # the term and that of the kind among the term's.
 Key = str | tuple[int, int]
-Typical = Mapping[Key, Float[Tensor, ""]]
+Typical = Mapping[Key, Scalar]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -42,10 +43,10 @@ class Coarse(Record):
     """
 
     subdivision: Subdivision
-    expected: Float[Tensor, " vertex"] | None = None
-    detail: Float[Tensor, " vertex"] | None = None
-    shape: Float[Tensor, " vertex"] | None = None
-    exposed: Float[Tensor, " vertex"] | None = None
+    expected: PerVertex | None = None
+    detail: PerVertex | None = None
+    shape: PerVertex | None = None
+    exposed: PerVertex | None = None
     noise: Typical = field(default_factory=dict)
     typical: Typical = field(default_factory=dict)
 
@@ -69,12 +70,12 @@ class Block(Record):
     subdivision: Subdivision
     facets: Bool[Tensor, " facet"]
     vertex: Int[Tensor, " vertex"]
-    own: Bool[Tensor, " vertex"]
-    weight: Float[Tensor, " vertex"]
-    held: Bool[Tensor, " vertex"]
-    detail: Float[Tensor, " vertex"]
-    shape: Float[Tensor, " vertex"]
-    exposed: Bool[Tensor, " vertex"]
+    own: VertexMask
+    weight: PerVertex
+    held: VertexMask
+    detail: PerVertex
+    shape: PerVertex
+    exposed: VertexMask
 
     @classmethod
     def whole(cls, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> "Block":
@@ -141,7 +142,7 @@ def block_of(
     )
 
 
-def pooled(samples: Iterable[Mapping[Key, tuple[int, Float[Tensor, ""]]]]) -> Typical:
+def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
     """Return the means of values that blocks have found, by the number each was found from."""
     count: Counter[Key] = Counter()
     total: dict[Key, Tensor] = {}

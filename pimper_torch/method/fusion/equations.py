@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
+from pimper_torch.ground.shapes import Faces, PerVertex, Points, Scalar, VertexMask, Vertices
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
 # A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
@@ -32,8 +33,8 @@ class Common(Record):
         count: Of the neighbours that have it, for each vertex.
     """
 
-    variance: Float[Tensor, ""]
-    count: Float[Tensor, " vertex"]
+    variance: Scalar
+    count: PerVertex
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -56,17 +57,17 @@ class Equations(Record):
     correlated: Float[Tensor, " equation"]
     evaluated: bool = True
 
-    def residual(self, heights: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+    def residual(self, heights: PerVertex) -> Float[Tensor, " equation"]:
         """Return the residual: target less sum."""
         return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
 
 
 def slopes(
     edges: Int[Tensor, "edge 2"],
-    flat: Float[Tensor, "vertex 3"],
-    directions: Float[Tensor, "vertex 3"],
-    normals: Float[Tensor, "vertex 3"],
-    variance: Float[Tensor, " vertex"],
+    flat: Vertices,
+    directions: Vertices,
+    normals: Vertices,
+    variance: PerVertex,
     common: Common | None = None,
 ) -> Equations:
     r"""State that edges are at right angles to the normals at their ends.
@@ -103,9 +104,7 @@ def slopes(
 
 
 def upright(
-    edges: Int[Tensor, "edge 2"],
-    directions: Float[Tensor, "vertex 3"],
-    normals: Float[Tensor, "vertex 3"],
+    edges: Int[Tensor, "edge 2"], directions: Vertices, normals: Vertices
 ) -> Bool[Tensor, " edge"]:
     """Find edges whose slope heights can follow.
 
@@ -118,11 +117,11 @@ def upright(
 
 def kept_slopes(
     edges: Int[Tensor, "edge 2"],
-    flat: Float[Tensor, "vertex 3"],
-    directions: Float[Tensor, "vertex 3"],
-    shape: Float[Tensor, "vertex 3"],
-    transferred: Float[Tensor, " vertex"],
-    variance: Float[Tensor, " vertex"],
+    flat: Vertices,
+    directions: Vertices,
+    shape: Vertices,
+    transferred: PerVertex,
+    variance: PerVertex,
 ) -> Equations:
     """State that edges lie as they do on the surface that there is, where light tells nothing.
 
@@ -137,10 +136,7 @@ def kept_slopes(
 
 
 def kept_steps(
-    edges: Int[Tensor, "edge 2"],
-    flat: Float[Tensor, "vertex 3"],
-    transferred: Float[Tensor, " vertex"],
-    variance: float | Float[Tensor, ""],
+    edges: Int[Tensor, "edge 2"], flat: Vertices, transferred: PerVertex, variance: float | Scalar
 ) -> Equations:
     """State that heights go on differing as they do, where edges are not upright.
 
@@ -161,10 +157,10 @@ def kept_steps(
 
 
 def swept_heights(
-    transferred: Float[Tensor, " vertex"],
-    offsets: Float[Tensor, " vertex"],
-    information: Float[Tensor, " vertex"],
-    facing: Float[Tensor, " vertex"],
+    transferred: PerVertex,
+    offsets: PerVertex,
+    information: PerVertex,
+    facing: PerVertex,
     correlated: float,
     common: Common | None = None,
 ) -> Equations:
@@ -193,9 +189,7 @@ def swept_heights(
     )
 
 
-def upright_heights(
-    information: Float[Tensor, " vertex"], facing: Float[Tensor, " vertex"]
-) -> Bool[Tensor, " vertex"]:
+def upright_heights(information: PerVertex, facing: PerVertex) -> VertexMask:
     """Find vertices whose swept offsets tell heights."""
     return (information > 0) & (facing > MIN_FACING)
 
@@ -209,8 +203,8 @@ class Contacts(Record):
         variance: Of where they are along these; scene units squared.
     """
 
-    points: Float[Tensor, "point 3"]
-    lines: Float[Tensor, "point 3"]
+    points: Points
+    lines: Points
     variance: Float[Tensor, " point"]
     facet: Int[Tensor, " point"]
 
@@ -225,15 +219,15 @@ class BaseSurface(Record):
         finest: Least standard error of a point, as the surface is flat between its vertices.
     """
 
-    points: Float[Tensor, "vertex 3"]
-    faces: Int[Tensor, "face 3"]
+    points: Vertices
+    faces: Faces
     facet: Int[Tensor, " vertex"]
-    heights: Float[Tensor, " vertex"]
-    directions: Float[Tensor, "vertex 3"]
+    heights: PerVertex
+    directions: Vertices
     reach: float
-    finest: float | Float[Tensor, ""]
+    finest: float | Scalar
 
-    def nearest(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+    def nearest(self, points: Points) -> Int[Tensor, " point"]:
         """Return the vertex nearest to each point; a constant."""
         tree = cKDTree(self.points.detach().cpu().numpy())
         _, nearest = tree.query(points.detach().cpu().numpy())
@@ -299,12 +293,7 @@ def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equa
     )
 
 
-def _above_or_below(
-    caster: RayCaster,
-    surface: BaseSurface,
-    points: Float[Tensor, "point 3"],
-    line: Float[Tensor, "point 3"],
-) -> Hits:
+def _above_or_below(caster: RayCaster, surface: BaseSurface, points: Points, line: Points) -> Hits:
     """Find where the line through each point meets the nearer of the faces on both sides."""
     ahead, behind = caster.cast(points, line), caster.cast(points, -line)
     first = ahead.distance <= behind.distance

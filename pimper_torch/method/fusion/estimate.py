@@ -24,6 +24,7 @@ from pimper_torch.ground.linalg.prepared import SingularSystemError
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, robust_variance
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.linalg.systems import solutions, solve_compressed
+from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.records import Record
 from pimper_torch.runtime.failures import skipped_solver
@@ -47,11 +48,11 @@ class Fused(Record):
         damping: Information of the heights that vertices start at.
     """
 
-    heights: Float[Tensor, " vertex"]
-    factors: tuple[Float[Tensor, ""], ...]
+    heights: PerVertex
+    factors: tuple[Scalar, ...]
     kinds: tuple[Equations, ...]
     weights: tuple[Float[Tensor, " _"], ...]
-    damping: Float[Tensor, " vertex"]
+    damping: PerVertex
 
     def matrix(
         self,
@@ -63,10 +64,10 @@ class Fused(Record):
 
 def fuse_terms(
     kinds: Sequence[Equations],
-    start: Float[Tensor, " vertex"],
-    damping: Float[Tensor, " vertex"],
+    start: PerVertex,
+    damping: PerVertex,
     iterations: int,
-    factors: Sequence[Float[Tensor, ""]] | None = None,
+    factors: Sequence[Scalar] | None = None,
 ) -> Fused:
     """Solve, estimate the noise, and solve again.
 
@@ -119,7 +120,7 @@ def fuse_terms(
     )
 
 
-def fuse_like(fused: Fused, kinds: Sequence[Equations], start: Float[Tensor, " vertex"]) -> Fused:
+def fuse_like(fused: Fused, kinds: Sequence[Equations], start: PerVertex) -> Fused:
     """Solve once more, for terms with common errors, with the weights that a solve has found.
 
     Residuals from vertex to vertex do not show what normals err by together: slopes seem to have
@@ -156,13 +157,13 @@ def _kept(error: SingularSystemError) -> None:
 def _solved(
     kinds: Sequence[Equations],
     weights: Sequence[Float[Tensor, " _"]],
-    factors: Sequence[Float[Tensor, ""]],
-    start: Float[Tensor, " vertex"],
-    damping: Float[Tensor, " vertex"],
-    *more: Float[Tensor, " vertex"],
-    guess: Float[Tensor, " vertex"] | None,
+    factors: Sequence[Scalar],
+    start: PerVertex,
+    damping: PerVertex,
+    *more: PerVertex,
+    guess: PerVertex | None,
     tolerance: float,
-) -> tuple[Float[Tensor, " vertex"], ...]:
+) -> tuple[PerVertex, ...]:
     """Solve for the heights, and for more right-hand sides of the same matrix."""
     parts = [part for kind in kinds for part in (kind.coefficients, kind.targets, kind.information)]
     if not compiled_for(start, damping, *parts, *weights, *factors):
@@ -184,10 +185,10 @@ def _solved(
 def _evaluated(
     kind: Equations,
     weight: Float[Tensor, " equation"],
-    heights: Float[Tensor, " vertex"],
-    probe: Float[Tensor, " vertex"],
-    answer: Float[Tensor, " vertex"],
-) -> tuple[Float[Tensor, " equation"], Float[Tensor, ""]]:
+    heights: PerVertex,
+    probe: PerVertex,
+    answer: PerVertex,
+) -> tuple[Float[Tensor, " equation"], Scalar]:
     """Return squared residuals over the claimed variance, and the number of equations used up."""
     parts = kind.coefficients, kind.targets, kind.information, kind.correlated
     if compiled_for(*parts, weight, heights, answer):
@@ -204,7 +205,7 @@ def _evaluated(
     return square, total(used)
 
 
-def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
+def noise_factor(square: Float[Tensor, " equation"]) -> Scalar:
     """Estimate the variance of Gaussian noise from its squares, robustly. Differentiable.
 
     Args:
@@ -219,19 +220,19 @@ def noise_factor(square: Float[Tensor, " equation"]) -> Float[Tensor, ""]:
     return robust_variance(square, everything).clamp_min(_MIN_FACTOR)
 
 
-def _sum(kind: Equations, values: Float[Tensor, " vertex"]) -> Float[Tensor, " equation"]:
+def _sum(kind: Equations, values: PerVertex) -> Float[Tensor, " equation"]:
     return (kind.coefficients * values[kind.unknowns]).sum(dim=1)
 
 
 def _system(
     kinds: Sequence[Equations],
     weights: Sequence[Float[Tensor, " _"]],
-    factors: Sequence[Float[Tensor, ""]],
-    start: Float[Tensor, " vertex"],
-    damping: Float[Tensor, " vertex"],
+    factors: Sequence[Scalar],
+    start: PerVertex,
+    damping: PerVertex,
 ) -> tuple[
     tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
-    Float[Tensor, " vertex"],
+    PerVertex,
 ]:
     """Return rows, columns and values of the matrix, and the right-hand side."""
     everything = torch.arange(len(start), device=start.device)

@@ -25,6 +25,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.linalg.systems import prepare
+from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.method.fusion.estimate import Fused
 from pimper_torch.method.fusion.normal_bias import CoarsePart
@@ -39,7 +40,7 @@ _REGION = 2.5
 @torch.no_grad()
 def expected_error(
     fine: Fused, coarse: Fused, subdivision: Subdivision, facets: Int[Tensor, "facet 3"], draws: int
-) -> Float[Tensor, " vertex"]:
+) -> PerVertex:
     """Return the standard error of every height of the fused surface.
 
     Args:
@@ -72,7 +73,7 @@ def expected_error(
     return off.square().mean(dim=1).sqrt()
 
 
-def _answers(fused: Fused, sides: list[Float[Tensor, " vertex"]]) -> Float[Tensor, "vertex draw"]:
+def _answers(fused: Fused, sides: list[PerVertex]) -> Float[Tensor, "vertex draw"]:
     """Return the heights' answers to errors of the targets, all draws at once."""
     rows, cols, values = fused.matrix()
     what = "the expected error"
@@ -98,7 +99,7 @@ def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
 def _noise(
     kind: Equations,
     weight: Float[Tensor, " equation"],
-    factor: Float[Tensor, ""],
+    factor: Scalar,
     subdivision: Subdivision,
     region: Int[Tensor, " facet"],
     generator: torch.Generator,
@@ -128,9 +129,7 @@ def _noise(
     return each.sqrt() * ((1 - together).sqrt() * own + together.sqrt() * shared)
 
 
-def _answerable(
-    fused: Fused, noise: list[Float[Tensor, " _"]], starts: Float[Tensor, " vertex"]
-) -> Float[Tensor, " vertex"]:
+def _answerable(fused: Fused, noise: list[Float[Tensor, " _"]], starts: PerVertex) -> PerVertex:
     """Return the right-hand side that errors of the targets make."""
     rhs = fused.damping.double() * starts
     for kind, weight, factor, off in zip(

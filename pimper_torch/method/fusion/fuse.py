@@ -22,6 +22,7 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.continuation import about_mean, enclosed
 from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.blend import Blend, ray_directions, vertex_spacing
 from pimper_torch.method.fusion.blocks import (
     Coarse,
@@ -71,7 +72,7 @@ class _Shared(Record):
     """
 
     tilt: NormalBias | None
-    tilt_variance: Float[Tensor, ""]
+    tilt_variance: Scalar
     terms: tuple[Term, ...]
     coarse: Coarse
 
@@ -146,7 +147,7 @@ class Fuse(Stage):
         leave_out("fuse.albedo", ~blend.observed, at=points)
         vertices = subdivision.points + heights[:, None] * directions
         normals = vertex_normals(vertices, subdivision.faces)
-        error: Float[Tensor, " vertex"] | None = None
+        error: PerVertex | None = None
         coarse = shared.coarse
         if coarse.expected is not None:
             along = transferred(coarse.expected, coarse.subdivision, subdivision.points).to(normals)
@@ -173,7 +174,7 @@ class Fuse(Stage):
 
     def _blended(
         self, swept: SweptPatches, whole: Subdivision, shared: _Shared, most: float
-    ) -> tuple[Blend, Float[Tensor, " vertex"], Float[Tensor, "vertex channel"]]:
+    ) -> tuple[Blend, PerVertex, Float[Tensor, "vertex channel"]]:
         """Return all vertices' patches, heights and albedo, block by block where memory asks."""
         mesh, coarse = swept.patches.coarse.mesh, shared.coarse
         parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
@@ -220,7 +221,7 @@ class Fuse(Stage):
 
     def _noise(
         self, swept: SweptPatches, whole: Subdivision, mine: Bool[Tensor, " facet"], shared: _Shared
-    ) -> dict[Key, tuple[int, Float[Tensor, ""]]]:
+    ) -> dict[Key, tuple[int, Scalar]]:
         """Return the noise factors of a block, each with the number of equations that show it."""
         problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)
         made = _Made.of(shared.terms, problem)
@@ -292,7 +293,7 @@ class Fuse(Stage):
         made: "_Made",
         expected: bool,
         several: bool,
-        tilt_variance: Float[Tensor, ""] | None = None,
+        tilt_variance: Scalar | None = None,
     ) -> Coarse:
         """Solve as at full size, if anything of it is needed."""
         subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
@@ -329,7 +330,7 @@ class Fuse(Stage):
             )
         )
 
-    def _solve(self, problem: Problem, shared: _Shared) -> Float[Tensor, " vertex"]:
+    def _solve(self, problem: Problem, shared: _Shared) -> PerVertex:
         """Solve at full size, for the detail and once more for the coarse shape.
 
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
@@ -343,7 +344,7 @@ class Fuse(Stage):
             return detail
         common = made.again(problem.replace(tilt_variance=shared.tilt_variance)).equations()
 
-        def with_coarse_shape() -> Float[Tensor, " vertex"]:
+        def with_coarse_shape() -> PerVertex:
             shape = fuse_like(fused, common, problem.start_of_shape).heights
             return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
 
@@ -402,7 +403,7 @@ class _Made:
     def evaluated(
         self,
         problem: Problem,
-        heights: Float[Tensor, " vertex"],
+        heights: PerVertex,
         firm: Int[Tensor, " known"],
         doubted: Callable[[Term], bool],
     ) -> tuple["_Made", Problem]:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.linalg.systems import prepare
+from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask, Vertices
 from pimper_torch.method.fusion.equations import Common, Equations
 from pimper_torch.records import Record
 
@@ -38,13 +39,11 @@ class NormalBias(Record):
     count: Float[Tensor, " facet"]
     known: Bool[Tensor, " facet"]
 
-    def variance(self) -> Float[Tensor, ""]:
+    def variance(self) -> Scalar:
         """Return the variance of a tilt, robustly, for normals that still have theirs."""
         return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
 
-    def at(
-        self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]
-    ) -> Float[Tensor, "vertex 3"]:
+    def at(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> Vertices:
         """Blend the tilts over the subdivided mesh, continuous across facets."""
         size = int(facets.max()) + 1
         corner = facets.flatten()
@@ -59,9 +58,9 @@ class NormalBias(Record):
 def normal_bias(
     subdivision: Subdivision,
     facets: Int[Tensor, "facet 3"],
-    normals: Float[Tensor, "vertex 3"],
-    shape: Float[Tensor, "vertex 3"],
-    known: Bool[Tensor, " vertex"],
+    normals: Vertices,
+    shape: Vertices,
+    known: VertexMask,
     most: float = 0.25,
 ) -> NormalBias:
     """Compare normals with those of a shape, facet by facet.
@@ -85,10 +84,10 @@ def normal_bias(
 
 def common_variance(
     found: Equations,
-    heights: Float[Tensor, " vertex"],
+    heights: PerVertex,
     facet: Int[Tensor, " vertex"],
     otherwise: Int[Tensor, " term"],
-) -> Float[Tensor, ""]:
+) -> Scalar:
     """Return the variance of the error that swept heights of one facet have in common.
 
     Args:
@@ -110,9 +109,7 @@ def common_variance(
     return square.median() / 0.4549 if len(square) > 0 else off.new_zeros(())
 
 
-def common(
-    variance: Float[Tensor, ""], facet: Int[Tensor, " vertex"], known: Bool[Tensor, " vertex"]
-) -> Common:
+def common(variance: Scalar, facet: Int[Tensor, " vertex"], known: VertexMask) -> Common:
     """Return the error that the known vertices of each facet have in common."""
     count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
     return Common(variance=variance, count=count[facet].to(variance))

@@ -3,13 +3,14 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.topology import boundary_vertices, face_edges
 from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask, Vertices
 from pimper_torch.method.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.method.fusion.blocks import Block, Typical
 from pimper_torch.method.fusion.equations import BaseSurface, upright
@@ -45,20 +46,20 @@ class Problem(Record):
 
     subdivision: Subdivision
     facets: Int[Tensor, "facet 3"]
-    directions: Float[Tensor, "vertex 3"]
+    directions: Vertices
     blend: Blend
-    points: Float[Tensor, "vertex 3"]
-    normals: Float[Tensor, "vertex 3"]
+    points: Vertices
+    normals: Vertices
     edges: Int[Tensor, "edge 2"]
     lit: Bool[Tensor, " edge"]
-    known: Bool[Tensor, " vertex"]
+    known: VertexMask
     sloped: Bool[Tensor, " edge"]
-    spacing: Float[Tensor, ""]
+    spacing: Scalar
     correlated: float
     cloud: FacetPoints | None
-    photometric: Float[Tensor, "vertex 3"]
+    photometric: Vertices
     block: Block
-    tilt_variance: Float[Tensor, ""] | None = None
+    tilt_variance: Scalar | None = None
     caster: RayCaster | None = None
     typical: Typical = field(default_factory=dict)
 
@@ -68,12 +69,12 @@ class Problem(Record):
         return self.subdivision.facet
 
     @property
-    def facing(self) -> Float[Tensor, " vertex"]:
+    def facing(self) -> PerVertex:
         """Cosine between the surface's normals and the directions."""
         return (self.normals * self.directions).sum(dim=-1)
 
     @property
-    def border(self) -> Bool[Tensor, " vertex"]:
+    def border(self) -> VertexMask:
         """Where the surface ends, or goes on beyond the block to where it does."""
         ends = boundary_vertices(self.subdivision.faces, len(self.points))
         return ends & ~self.block.held | self.block.exposed
@@ -92,18 +93,18 @@ class Problem(Record):
         )
 
     @property
-    def damping(self) -> Float[Tensor, " vertex"]:
+    def damping(self) -> PerVertex:
         """Information of every vertex's present height, and of one that is held."""
         square = self.spacing**2
         return torch.where(self.block.held, 1e7 / square, 1e-4 / square)
 
     @property
-    def start(self) -> Float[Tensor, " vertex"]:
+    def start(self) -> PerVertex:
         """Heights that vertices keep without other terms."""
         return self.blend.heights + self.block.detail.to(self.blend.heights)
 
     @property
-    def start_of_shape(self) -> Float[Tensor, " vertex"]:
+    def start_of_shape(self) -> PerVertex:
         """The same, with the errors that facets have in common."""
         return self.blend.heights + self.block.shape.to(self.blend.heights)
 

@@ -8,7 +8,7 @@ import math
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -17,6 +17,7 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.continuation import continued, enclosed
 from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.equations import (
     Contacts,
     Equations,
@@ -97,7 +98,7 @@ class Term(nn.Module):
         raise NotImplementedError
 
     def evaluated(
-        self, problem: Problem, heights: Float[Tensor, " vertex"], firm: Int[Tensor, " known"]
+        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
     ) -> "Term":
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
@@ -148,7 +149,7 @@ class SweptHeights(Term):
 
     position, loose = True, True
 
-    def __init__(self, variance: Float[Tensor, ""] | None = None) -> None:
+    def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
         self.variance = variance
 
@@ -166,11 +167,7 @@ class SweptHeights(Term):
         ]
 
     def _stated(
-        self,
-        problem: Problem,
-        offsets: Float[Tensor, " vertex"],
-        information: Float[Tensor, " vertex"],
-        correlated: float,
+        self, problem: Problem, offsets: PerVertex, information: PerVertex, correlated: float
     ) -> Equations:
         facing, together = problem.facing, None
         if self.variance is not None:
@@ -180,7 +177,7 @@ class SweptHeights(Term):
         return swept_heights(start, offsets, information, facing, correlated, together)
 
     def evaluated(
-        self, problem: Problem, heights: Float[Tensor, " vertex"], firm: Int[Tensor, " known"]
+        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
     ) -> "SweptHeights":
         """Return the term with the variance of the error that a facet's heights share."""
         plain, facet = type(self)().equations(problem), problem.facet
@@ -199,7 +196,7 @@ class PriorNormals(Term):
 
     loose, guessed = True, True
 
-    def __init__(self, variance: Float[Tensor, ""] | None = None) -> None:
+    def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
         self.variance = variance
 
@@ -234,7 +231,7 @@ class PriorNormals(Term):
         return [slopes(edges, flat, problem.directions, normals, variance, together)]
 
     def evaluated(
-        self, problem: Problem, heights: Float[Tensor, " vertex"], firm: Int[Tensor, " known"]
+        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
     ) -> "PriorNormals":
         """Return the term with the variance of its tilt against the photometric normals.
 
@@ -375,9 +372,7 @@ TERMS: dict[str, type[Term]] = {
 """The chain's own, by their names among settings, in the order that they are summed up."""
 
 
-def own_slope_variance(
-    problem: Problem, unknown_deg: float = UNKNOWN_SLOPE_DEG
-) -> Float[Tensor, ""]:
+def own_slope_variance(problem: Problem, unknown_deg: float = UNKNOWN_SLOPE_DEG) -> Scalar:
     """Estimate the variance of the surface's own slopes from the photometric normals."""
     if SLOPES in problem.typical:
         return problem.typical[SLOPES]
@@ -388,13 +383,13 @@ def own_slope_variance(
     return (square.median() / MEDIAN_OF_TILT).clamp_min(_MIN_SLOPE_VARIANCE)
 
 
-def slope_variance(information: Float[Tensor, " vertex"]) -> Float[Tensor, " vertex"]:
+def slope_variance(information: PerVertex) -> PerVertex:
     """Return the variance of a normal's angle along an edge, half that of both of its angles."""
     low, high = (math.radians(error) ** 2 for error in _NORMAL_ERROR_DEG)
     return 0.5 / information.clamp(1 / high, 1 / low)
 
 
-def rotation(problem: Problem) -> Float[Tensor, ""]:
+def rotation(problem: Problem) -> Scalar:
     """Return the mean squared angle between normals along lit edges, folds cut; squared radians."""
     if ROTATION in problem.typical:
         return problem.typical[ROTATION]

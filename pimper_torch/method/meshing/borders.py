@@ -20,6 +20,7 @@ from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, el
 from pimper_torch.ground.geometry.surfaces import side_lengths
 from pimper_torch.ground.geometry.topology import boundary_loops, corners_of
 from pimper_torch.ground.linalg.conjugate_gradients import conjugate_gradients
+from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Points, VertexMask, Vertices
 
 # Lengths round faces that may go: with 5, the rounding of a right angle creeps along the border.
 _REACH = 8.0
@@ -32,12 +33,7 @@ _STRAIGHT = 0.75
 _TOLERANCE, _MOST_STEPS = 3e-4, 1000
 
 
-def protruding(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    length: float,
-    unsure: Bool[Tensor, " face"],
-) -> Bool[Tensor, " face"]:
+def protruding(vertices: Vertices, faces: Faces, length: float, unsure: FaceMask) -> FaceMask:
     """Find what sticks out of the borders of a surface and is not determined.
 
     Borders shorter than a circle of that radius are small holes, which do not count, and faces that
@@ -65,12 +61,8 @@ def protruding(
 
 
 def _repeatedly(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    inner: Bool[Tensor, " vertex"],
-    length: float,
-    unsure: Bool[Tensor, " face"],
-) -> Bool[Tensor, " face"]:
+    vertices: Vertices, faces: Faces, inner: VertexMask, length: float, unsure: FaceMask
+) -> FaceMask:
     """Cut off what sticks out until nothing does; borders along inner vertices are none.
 
     Only faces near a border can go, and after the first time only those near what was cut.
@@ -103,25 +95,21 @@ def _repeatedly(
 
 
 def _distance(
-    points: Float[Tensor, "point 3"], border: Float[Tensor, "border 3"], most: float
+    points: Points, border: Float[Tensor, "border 3"], most: float
 ) -> Float[Tensor, " point"]:
     """Return the distance to the nearest point of a border; infinite where it is more than most."""
     tree = cKDTree(border.numpy())
     return torch.from_numpy(tree.query(points.numpy(), distance_upper_bound=most, workers=-1)[0])
 
 
-def _near(
-    points: Float[Tensor, "point 3"], others: Float[Tensor, "other 3"], reach: float
-) -> Bool[Tensor, " point"]:
+def _near(points: Points, others: Float[Tensor, "other 3"], reach: float) -> Bool[Tensor, " point"]:
     """Find points about as near to others as that: others of a cell stand at its centre."""
     cell = reach / 8
     centres = cell * (torch.unique((others / cell).floor(), dim=0) + 0.5)
     return _distance(points, centres, reach).isfinite()
 
 
-def _long_borders(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], length: float
-) -> Int[Tensor, " border"]:
+def _long_borders(vertices: Vertices, faces: Faces, length: float) -> Int[Tensor, " border"]:
     """List the vertices of borders that are no small holes."""
     edges, loop = boundary_loops(faces)
     if len(loop) == 0:
@@ -132,12 +120,8 @@ def _long_borders(
 
 
 def _smoothed(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    values: Float[Tensor, " vertex"],
-    length: float,
-    start: Float[Tensor, " vertex"],
-) -> Float[Tensor, " vertex"]:
+    vertices: Vertices, faces: Faces, values: PerVertex, length: float, start: PerVertex
+) -> PerVertex:
     """Smooth values on a surface, reflected at its borders: a step of implicit diffusion.
 
     Vertices without faces keep their values.

@@ -3,12 +3,13 @@
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
 from pimper_torch.ground.linalg.continuation import continued
+from pimper_torch.ground.shapes import Faces
 from pimper_torch.method.meshing.faults import diagonal
 from pimper_torch.records import Closed, Mesh
 from pimper_torch.runtime.errors import InputError
@@ -78,7 +79,7 @@ def _known(albedo: Float[Tensor, "vertex channel"]) -> Float[Tensor, "vertex cha
     return torch.where(known, albedo, mean)
 
 
-def border_cycles(faces: Int[Tensor, "face 3"]) -> list[list[int]]:
+def border_cycles(faces: Faces) -> list[list[int]]:
     """Order the border of an oriented manifold: every one a cycle, its faces on the right.
 
     A face on the other side of an edge runs the way of the cycle.
@@ -104,7 +105,7 @@ def border_cycles(faces: Int[Tensor, "face 3"]) -> list[list[int]]:
     return cycles
 
 
-def _disk(cycle: list[int], first: int) -> Int[Tensor, "face 3"]:
+def _disk(cycle: list[int], first: int) -> Faces:
     """Triangulate a disk in rings; its inner vertices are numbered from ``first``."""
     if len(cycle) == 3:
         return torch.tensor([cycle])

@@ -1,12 +1,11 @@
 """Extraction: the joined surface in, one connected mesh out."""
 
 import torch
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.surfaces import component_areas
 from pimper_torch.ground.geometry.topology import face_components, vertex_fans
+from pimper_torch.ground.shapes import FaceMask, Faces, Vertices
 from pimper_torch.method.meshing.borders import protruding
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.method.meshing.meshing_config import ExtractConfig
@@ -91,9 +90,7 @@ class Extract(Stage):
             expected_error=None if error is None else error[source],
         )
 
-    def _long_and_overturned(
-        self, surface: Surface
-    ) -> tuple[Bool[Tensor, " face"], Bool[Tensor, " face"]]:
+    def _long_and_overturned(self, surface: Surface) -> tuple[FaceMask, FaceMask]:
         vertices = surface.vertices_world.detach()
         found = faults(vertices, surface.faces, surface.facet, self.config.max_stretch)
         long = found.stretched(vertices)
@@ -111,9 +108,7 @@ def facet_side(surface: Surface) -> float:
     return edges * float(sides.median())
 
 
-def large_components(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], fraction: float
-) -> Bool[Tensor, " face"]:
+def large_components(vertices: Vertices, faces: Faces, fraction: float) -> FaceMask:
     """Find the components, connected by edges, with a fraction of the largest one's area.
 
     With a fraction of 1 only the first of the largest is marked.

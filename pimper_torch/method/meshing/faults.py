@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry import topology
@@ -14,6 +14,7 @@ from pimper_torch.ground.geometry.surfaces import (
     unit_face_normals,
     vertex_normals,
 )
+from pimper_torch.ground.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at
 # edges of a box or of thin bones it is a right angle, give or take the noise of small faces.
@@ -32,32 +33,32 @@ class Faults:
         longest: Longest side of a sound face, scene units.
     """
 
-    faces: Int[Tensor, "face 3"]
+    faces: Faces
     along: Float[Tensor, "face 3"]
-    longest: Float[Tensor, ""]
+    longest: Scalar
 
-    def broken(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def broken(self, vertices: Vertices) -> FaceMask:
         """Find faces stretched, on both sides of a fold, or overturned where a fold bounds them."""
         return self.stretched(vertices) | self._folded(vertices)
 
-    def part(self, chosen: Bool[Tensor, " face"]) -> tuple["Faults", Int[Tensor, " used"]]:
+    def part(self, chosen: FaceMask) -> tuple["Faults", Int[Tensor, " used"]]:
         """Restrict to some of the faces; also list their vertices, which they index from 0."""
         used, corners = torch.unique(self.faces[chosen], return_inverse=True)
         return Faults(faces=corners, along=self.along[chosen], longest=self.longest), used
 
-    def stretched(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def stretched(self, vertices: Vertices) -> FaceMask:
         """Find faces with a side that is too long."""
         return side_lengths(vertices[self.faces]).amax(dim=1) > self.longest
 
-    def overturned(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def overturned(self, vertices: Vertices) -> FaceMask:
         """Find faces turned by more than 90 degrees from the mean normal of their facet."""
         return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
 
-    def folded_over(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def folded_over(self, vertices: Vertices) -> FaceMask:
         """Find overturned faces where a fold bounds their component."""
         return self._folded(vertices) & self.overturned(vertices)
 
-    def _folded(self, vertices: Float[Tensor, "vertex 3"]) -> Bool[Tensor, " face"]:
+    def _folded(self, vertices: Vertices) -> FaceMask:
         normals, overturned = unit_face_normals(vertices, self.faces), self.overturned(vertices)
         near = self._near_folds(vertices, normals, overturned).nonzero()[:, 0]
         pairs = near[topology.face_pairs(self.faces[near])[0]]
@@ -74,11 +75,8 @@ class Faults:
         return found
 
     def _near_folds(
-        self,
-        vertices: Float[Tensor, "vertex 3"],
-        normals: Float[Tensor, "face 3"],
-        overturned: Bool[Tensor, " face"],
-    ) -> Bool[Tensor, " face"]:
+        self, vertices: Vertices, normals: Float[Tensor, "face 3"], overturned: FaceMask
+    ) -> FaceMask:
         """Find the faces round vertices of overturned faces, and round those that may have a fold.
 
         Two faces whose normals are within half a fold of any axis have no fold between them, so
@@ -94,10 +92,7 @@ class Faults:
 
 
 def faults(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    facet: Int[Tensor, " vertex"],
-    max_stretch: float,
+    vertices: Vertices, faces: Faces, facet: Int[Tensor, " vertex"], max_stretch: float
 ) -> Faults:
     """Take the criteria for defective faces from a surface as it is.
 
@@ -113,7 +108,7 @@ def faults(
 
 
 def facet_means(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], facet: Int[Tensor, " vertex"]
+    vertices: Vertices, faces: Faces, facet: Int[Tensor, " vertex"]
 ) -> Float[Tensor, "face 3"]:
     """Assign each face the mean normal of its facet, weighted by area, of any length."""
     one, other, last = facet[faces].unbind(dim=1)
@@ -123,11 +118,8 @@ def facet_means(
 
 
 def small_groups(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    among: Bool[Tensor, " vertex"],
-    max_extent: Float[Tensor, ""],
-) -> Bool[Tensor, " vertex"]:
+    vertices: Vertices, faces: Faces, among: VertexMask, max_extent: Scalar
+) -> VertexMask:
     """Find the vertices ``among`` whose connected component is small.
 
     Args:
@@ -143,6 +135,6 @@ def small_groups(
     return among & small[label]
 
 
-def diagonal(vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, ""]:
+def diagonal(vertices: Vertices) -> Scalar:
     """Return the diagonal of the points' bounding box."""
     return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

@@ -6,13 +6,12 @@ The faces stay as they are, so that a closed surface stays closed.
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
-from torch import Tensor
 
 from pimper_torch.ground.geometry import topology
 from pimper_torch.ground.geometry.surfaces import side_lengths, vertex_normals
 from pimper_torch.ground.linalg.systems import solutions
+from pimper_torch.ground.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.method.meshing.meshing_config import RepairConfig
 from pimper_torch.records import Surface
@@ -20,9 +19,7 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
 
-def least_bent(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], free: Bool[Tensor, " vertex"]
-) -> Float[Tensor, "vertex 3"]:
+def least_bent(vertices: Vertices, faces: Faces, free: VertexMask) -> Vertices:
     r"""Move some vertices to where the surface bends least, as a thin plate clamped all round.
 
     Minimizes the sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over
@@ -110,11 +107,8 @@ class Repair(Stage):
 
 
 def repair(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    broken: Callable[[Float[Tensor, "vertex 3"]], Bool[Tensor, " face"]],
-    max_extent: Float[Tensor, ""],
-) -> tuple[Float[Tensor, "vertex 3"], Bool[Tensor, " vertex"]]:
+    vertices: Vertices, faces: Faces, broken: Callable[[Vertices], FaceMask], max_extent: Scalar
+) -> tuple[Vertices, VertexMask]:
     """Move the vertices of defective faces that sound ones enclose, until none is defective.
 
     A connected component of such vertices moves to where the surface bends least; while some
@@ -149,9 +143,7 @@ def repair(
     return least_bent(vertices, faces, free), free
 
 
-def surroundings(
-    faces: Int[Tensor, "face 3"], broken: Bool[Tensor, " face"], num_vertices: int
-) -> Bool[Tensor, " face"]:
+def surroundings(faces: Faces, broken: FaceMask, num_vertices: int) -> FaceMask:
     """Find the faces round defective ones that :func:`repair` may use: it needs no others."""
     near = broken
     for _ in range(_RINGS + 3):  # two rings clamp the plate, and one shows the border
@@ -159,9 +151,7 @@ def surroundings(
     return near
 
 
-def _components_with(
-    faces: Int[Tensor, "face 3"], among: Bool[Tensor, " vertex"], some: Bool[Tensor, " vertex"]
-) -> Bool[Tensor, " vertex"]:
+def _components_with(faces: Faces, among: VertexMask, some: VertexMask) -> VertexMask:
     """Find the connected components of vertices ``among`` that have some of others."""
     label = topology.vertex_components(faces, among)
     named = torch.zeros_like(among)
@@ -169,9 +159,7 @@ def _components_with(
     return among & named[label]
 
 
-def _with_neighbours(
-    faces: Int[Tensor, "face 3"], free: Bool[Tensor, " vertex"]
-) -> Bool[Tensor, " vertex"]:
+def _with_neighbours(faces: Faces, free: VertexMask) -> VertexMask:
     """Leave out connected components without a neighbour that is not free."""
     of_face = free[faces]
     mixed = of_face.any(dim=1) & ~of_face.all(dim=1)

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -144,7 +145,7 @@ def _rows(values: Float[Tensor, "vertex channel"]) -> np.ndarray:
     return rows
 
 
-def _median_edge(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]) -> float:
+def _median_edge(vertices: Vertices, faces: Faces) -> float:
     some = faces[:: max(1, len(faces) // _EDGES)]
     return float((vertices[some[:, 0]] - vertices[some[:, 1]]).norm(dim=1).median())
 

@@ -9,6 +9,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
+from pimper_torch.ground.shapes import Faces, Scalar, Vertices
 from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.transfer import transfer
 from pimper_torch.method.patches.view_choice import view_blocks
@@ -104,9 +105,7 @@ def with_area(coarse: CoarseMesh) -> CoarseMesh:
 
 
 def facet_frames(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int[Tensor, "face 3"],
-    cam_from_world: Float[Tensor, "4 4"],
+    vertices: Vertices, faces: Faces, cam_from_world: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "face 4 4"]:
     """Return ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
 
@@ -124,8 +123,8 @@ def facet_frames(
 
 
 def sample_spacing(
-    vertices: Float[Tensor, "vertex 3"], cameras: Cameras, reference: int, samples_per_pixel: float
-) -> Float[Tensor, ""]:
+    vertices: Vertices, cameras: Cameras, reference: int, samples_per_pixel: float
+) -> Scalar:
     """Return the scene units that one sample spans: 1/zeta."""
     intrinsics = cameras.intrinsics[reference]
     _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
@@ -133,9 +132,7 @@ def sample_spacing(
     return depth.median() / focal / samples_per_pixel
 
 
-def views_facing(
-    vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"], cameras: Cameras
-) -> Int[Tensor, " face"]:
+def views_facing(vertices: Vertices, faces: Faces, cameras: Cameras) -> Int[Tensor, " face"]:
     """Count, for each facet, the views that it faces and that have its centre in their frame."""
     centre, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
     pixels, depth = project(centre[None], cameras.cam_from_world, cameras.intrinsics)
@@ -144,9 +141,7 @@ def views_facing(
     return (framed & ((towards * normals).sum(dim=-1) > 0)).sum(dim=0)
 
 
-def enlarge(
-    corners: Float[Tensor, "patch 3 2"], distance: Float[Tensor, ""]
-) -> Float[Tensor, "patch 3 2"]:
+def enlarge(corners: Float[Tensor, "patch 3 2"], distance: Scalar) -> Float[Tensor, "patch 3 2"]:
     """Move every edge outward by ``distance``, parallel to itself.
 
     The new triangle is the old one scaled about its incentre by ``1 + distance / inradius``.
@@ -198,7 +193,7 @@ def _templates(
     corners: Float[Tensor, "face 3 2"],
     enlarged: Float[Tensor, "face 3 2"],
     low: Float[Tensor, "face 2"],
-    spacing: Float[Tensor, ""],
+    spacing: Scalar,
 ) -> Templates:
     height, width = raster
     grid = spacing * (pixel_centers(width, height, like=low) - 0.5)

@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.pyramids import PriorMaps
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Cameras, LightPrior, Observations, PatchPriors, Templates
 
 
@@ -79,11 +80,7 @@ def merged(
     )
 
 
-def _scattered(
-    information: Float[Tensor, "*batch"],
-    scatter: Float[Tensor, "*batch"],
-    count: Float[Tensor, "*batch"],
-) -> Float[Tensor, "*batch"]:
+def _scattered(information: Scalars, scatter: Scalars, count: Scalars) -> Scalars:
     """Lower information by the Birge ratio, where it is above 1.
 
     Args:

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster, ray_caster
+from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import Mesh, PatchSet, Templates
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
@@ -34,7 +35,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
 
 
 def _transferred(
-    surface: Mesh, normals: Float[Tensor, "vertex 3"], caster: RayCaster, templates: Templates
+    surface: Mesh, normals: Vertices, caster: RayCaster, templates: Templates
 ) -> Templates:
     with torch.no_grad():
         # A little further, so that rounding does not decide.
@@ -58,7 +59,7 @@ def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
 
 def _on_surface(
     surface: Mesh,
-    normals: Float[Tensor, "vertex 3"],
+    normals: Vertices,
     templates: Templates,
     hits: Hits,
     met: Bool[Tensor, "patch sample"],

@@ -8,12 +8,13 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.runtime.parallel import side_by_side
 
 
 def view_blocks(
-    mesh: Mesh, cameras: Cameras, spacing: Float[Tensor, ""], count: int
+    mesh: Mesh, cameras: Cameras, spacing: Scalar, count: int
 ) -> list[tuple[Int[Tensor, " facet"], Bool[Tensor, " view"]]]:
     """Divide facets into blocks of like place and direction, and choose the views of each.
 
@@ -62,7 +63,7 @@ def view_weights(
     centres: Float[Tensor, "facet 3"],
     normals: Float[Tensor, "facet 3"],
     cameras: Cameras,
-    spacing: Float[Tensor, ""],
+    spacing: Scalar,
     caster: RayCaster,
 ) -> Float[Tensor, "facet view"]:
     """Return the pixels that each view has on a sample of each facet, 1 at most.

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalars, Vectors
 from pimper_torch.method.photometry.light_field import harmonics
 
 
@@ -50,9 +51,7 @@ def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     return _vectors([albedo, *(torch.where(directed, part, 0) * ratio for part in vector)])
 
 
-def split_shading(
-    shading: Float[Tensor, "*batch 4"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+def split_shading(shading: Float[Tensor, "*batch 4"]) -> tuple[Scalars, Vectors]:
     """Read albedo and unit normal off vectors on the cone.
 
     A vector without direction gives the normal zero. Differentiable away from the apex.
@@ -62,9 +61,7 @@ def split_shading(
     return albedo, _vectors([torch.where(directed, part / length, 0) for part in vector])
 
 
-def tangents(
-    normals: Float[Tensor, "*batch 3"],
-) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+def tangents(normals: Vectors) -> tuple[Vectors, Vectors]:
     """Return two unit vectors that span, with each unit normal, a right-handed frame.
 
     Continuous except where ``n_z`` changes sign, which viewer-facing normals never do.
@@ -97,7 +94,7 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
     ]
 
 
-def _length(vector: list[Tensor]) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+def _length(vector: list[Tensor]) -> tuple[Scalars, Bool[Tensor, "*batch"]]:
     """Return lengths, 1 for zero vectors, and which vectors are not zero.
 
     So are vectors whose directions have no derivative in the dtype's range: of 3e-10 and less in
@@ -142,9 +139,7 @@ class Manifold(Protocol):
         It is the manifold's part of the second derivatives of a function with gradient ``g``.
         """
 
-    def split(
-        self, shading: Float[Tensor, "*batch rank"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    def split(self, shading: Float[Tensor, "*batch rank"]) -> tuple[Scalars, Vectors]:
         """Return albedo and unit normal of the vectors."""
 
 
@@ -173,9 +168,7 @@ class Cone:
         matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
         return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
 
-    def join(
-        self, albedo: Float[Tensor, "*batch"], normals: Float[Tensor, "*batch 3"]
-    ) -> Float[Tensor, "*batch 4"]:
+    def join(self, albedo: Scalars, normals: Vectors) -> Float[Tensor, "*batch 4"]:
         """Return the vectors of albedo and normal."""
         return albedo[..., None] * harmonics(normals)
 

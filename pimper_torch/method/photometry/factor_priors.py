@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Record
 
 # Standard deviation of residuals over the radiance of albedo 1: a choice, in the middle of rendered
@@ -168,7 +169,7 @@ def _guessed_lights(
     return factor[..., None] * lights, torch.where(known, 0.01 / torch.where(known, variance, 1), 0)
 
 
-def views_worth(information: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def views_worth(information: Scalars) -> Scalars:
     """Return the views that tell as much of an angle or of relative albedo; one at most.
 
     So photographs overrule guesses.

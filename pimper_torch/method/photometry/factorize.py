@@ -14,6 +14,7 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.photometry.balm import solve_balm
 from pimper_torch.method.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.method.photometry.cone import Cone
@@ -260,7 +261,7 @@ class Factorize(Stage):
         refused: Bool[Tensor, " patch"],
         raster: int,
         registered: Observations,
-        variance: Float[Tensor, ""],
+        variance: Scalar,
     ) -> Bilinear:
         config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
@@ -358,7 +359,7 @@ def _samples(
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
     registered: Observations,
-    variance: Float[Tensor, ""],
+    variance: Scalar,
 ) -> PatchSamples:
     """Lay out what priors are asked about."""
     guessed = registered.priors

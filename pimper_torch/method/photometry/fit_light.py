@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate
 from pimper_torch.ground.geometry.template_normals import transferred_normals
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.photometry.factor_priors import RELATIVE_NOISE
 from pimper_torch.method.photometry.light_field import LightField, harmonics, rotate_lights
 from pimper_torch.method.photometry.lights import light_of_mesh
@@ -40,7 +41,7 @@ class Illumination(Record):
 
     field: LightField
     shadows: bool
-    guess_variance: Float[Tensor, ""]
+    guess_variance: Scalar
 
 
 class FitLight(Stage):
@@ -111,7 +112,7 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
 
 def _excess_variance(
     normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
-) -> Float[Tensor, ""]:
+) -> Scalar:
     """Return the variance of guessed normals about the surface's, beyond what both claim."""
     square, claimed = [], []
     for own, guess in zip(normals, guesses, strict=True):

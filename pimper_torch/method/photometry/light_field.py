@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Points, Vectors
 from pimper_torch.records import Record
 
 
-def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+def harmonics(normals: Vectors) -> Float[Tensor, "*batch 4"]:
     """Return ``(1, n)``, the basis in which shading is linear in the light.
 
     >>> harmonics(torch.tensor([0.0, 0.0, -1.0]))
@@ -26,15 +27,13 @@ def harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     return torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
 
 
-def second_harmonics(normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 5"]:
+def second_harmonics(normals: Vectors) -> Float[Tensor, "*batch 5"]:
     """Return the harmonics of second order, ``(xy, yz, xz, x^2 - y^2, 3 z^2 - 1)``."""
     x, y, z = normals.unbind(dim=-1)
     return torch.stack([x * y, y * z, x * z, x**2 - y**2, 3 * z**2 - 1], dim=-1)
 
 
-def linearized(
-    lights: Float[Tensor, "view 9"], normals: Float[Tensor, "point 3"]
-) -> Float[Tensor, "point view 4"]:
+def linearized(lights: Float[Tensor, "view 9"], normals: Points) -> Float[Tensor, "point view 4"]:
     r"""Return first-order lights that shade as second-order ones do near given normals.
 
     The harmonics of second order are quadratic forms: :math:`n^\top Q n` is
@@ -95,7 +94,7 @@ class LightField(Record):
     gain: Float[Tensor, "view channel"] | None = None
     exposure: Float[Tensor, " view"] | None = None
 
-    def point_light_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 3"]:
+    def point_light_at(self, points: Points) -> Float[Tensor, "point view 3"]:
         """Return ``E``, the direction to the point light times its irradiance."""
         strength = self.point_light.norm(dim=1)
         direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
@@ -103,13 +102,11 @@ class LightField(Record):
         distance = away.norm(dim=-1, keepdim=True)
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
-    def soft_at(self, normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point view 4"]:
+    def soft_at(self, normals: Points) -> Float[Tensor, "point view 4"]:
         """Return first-order light that is soft light near given normals; world frame."""
         return linearized(self.soft, normals)
 
-    def lights_at(
-        self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, "point view 4"]:
+    def lights_at(self, points: Points, normals: Points) -> Float[Tensor, "point view 4"]:
         """Return first-order light near normals that face the point light; world frame."""
         point_light, soft = self.point_light_at(points), self.soft_at(normals)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)

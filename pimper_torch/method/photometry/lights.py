@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.photometry.light_colour import exposures, light_colours
 from pimper_torch.method.photometry.light_field import LightField, harmonics, second_harmonics
 from pimper_torch.method.photometry.light_fit import LightFit, fit_lights, with_gradients
@@ -181,9 +182,7 @@ def fit_light_field(
     )
 
 
-def _ratio(
-    albedo: Float[Tensor, " sample"], other: Float[Tensor, " sample"]
-) -> Float[Tensor, ""] | float:
+def _ratio(albedo: Float[Tensor, " sample"], other: Float[Tensor, " sample"]) -> Scalar | float:
     """Return the median ratio of two albedos where both are known; 1 where none is."""
     both = (albedo > 0) & (other > 0)
     return (albedo[both] / other[both]).median() if bool(both.any()) else 1.0
@@ -288,13 +287,13 @@ def _selected(
     return best
 
 
-def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Float[Tensor, ""]:
+def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Scalar:
     """Return the mean distance of points from the origin; 1 if all are there."""
     offsets = positions[(positions != 0).any(dim=1)]
     return offsets.norm(dim=1).sum() / len(positions) if len(offsets) else positions.new_ones(())
 
 
-def _median_length(square: Float[Tensor, " view"]) -> Float[Tensor, ""]:
+def _median_length(square: Float[Tensor, " view"]) -> Scalar:
     """Return the median length of the lights that are not zero, from their squares."""
     shining = square[square > 0]
     return shining.sqrt().median() if len(shining) else square.new_ones(())

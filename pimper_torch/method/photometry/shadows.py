@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.shapes import Scalars, Vectors
 from pimper_torch.method.photometry.light_field import LightField
 from pimper_torch.records import Record
 
@@ -30,8 +31,8 @@ class Shadows(Record):
 def cast_shadows(
     field: LightField,
     caster: RayCaster,
-    points: Float[Tensor, "*batch 3"],
-    normals: Float[Tensor, "*batch 3"],
+    points: Vectors,
+    normals: Vectors,
     tolerance: float | Float[Tensor, "*#batch"],
     guard: float | Float[Tensor, "*#batch"] = 0.0,
     mask: Bool[Tensor, "*batch view"] | None = None,
@@ -131,8 +132,8 @@ def cast_shadows_on_rasters(
 
 
 def _direction_to_light(
-    field: LightField, view: Int[Tensor, "*#batch"], points: Float[Tensor, "*batch 3"]
-) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+    field: LightField, view: Int[Tensor, "*#batch"], points: Vectors
+) -> tuple[Vectors, Scalars]:
     """Return the unit direction to the point light, and its distance, infinite if distant."""
     direction = normalize(field.point_light, dim=1).to(points)[view]
     closeness = field.closeness.to(points)[view]
@@ -146,8 +147,8 @@ def _unblocked(
     field: LightField,
     view: Int[Tensor, "*#batch"],
     caster: RayCaster,
-    points: Float[Tensor, "*batch 3"],
-    normals: Float[Tensor, "*batch 3"],
+    points: Vectors,
+    normals: Vectors,
     offset: Float[Tensor, "*#batch"],
 ) -> Bool[Tensor, "*batch"]:
     lifted = points + offset[..., None] * normals

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.ground.shapes import Matrix3
 
 # Zoom, and roll in radians, of a touched tripod or of a cropped picture: a choice.
 _MAX_ZOOM, _MAX_ROLL = 1.3, 0.35
@@ -68,10 +69,8 @@ def follows_camera_in_place(
 
 
 def least_squares_map(
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
-    centre: Float[Tensor, " 2"],
-) -> Float[Tensor, "3 3"]:
+    first: Float[Tensor, "match 2"], second: Float[Tensor, "match 2"], centre: Float[Tensor, " 2"]
+) -> Matrix3:
     """Fit a similarity with a perspective row about a centre; float64.
 
     The residuals are multiplied by the denominators, which are about 1 for small turns.
@@ -92,9 +91,7 @@ def least_squares_map(
     return torch.linalg.solve(between, elements.reshape(3, 3) @ between)
 
 
-def mapped(
-    matrix: Float[Tensor, "3 3"], pixels: Float[Tensor, "pixel 2"]
-) -> Float[Tensor, "pixel 2"]:
+def mapped(matrix: Matrix3, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
     """Map pixels by a homography; float64."""
     found = homogeneous(pixels.double()) @ matrix.mT
     return found[:, :2] / found[:, 2:]

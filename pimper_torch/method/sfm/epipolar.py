@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.lens_models import pinhole_of, undistort_pixels
 from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.method.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.records import Cameras
@@ -22,9 +23,7 @@ Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two p
 
 
 def sampson_errors(
-    geometry: Float[Tensor, "3 3"],
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
+    geometry: Matrix3, first: Float[Tensor, "match 2"], second: Float[Tensor, "match 2"]
 ) -> Float[Tensor, " match"]:
     """Return the first-order distance of matches from an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
@@ -36,7 +35,7 @@ def fundamental_matrix(
     first: Float[Tensor, "match 2"],
     second: Float[Tensor, "match 2"],
     weight: Float[Tensor, " match"],
-) -> Float[Tensor, "3 3"]:
+) -> Matrix3:
     """Fit ``F``, with ``second^T F first = 0``, by weighted least squares; float64.
 
     kornia's ``find_fundamental`` weighs the normalization of the pixels, too: reweighted, still and
@@ -54,7 +53,7 @@ def fundamental_matrix(
     return from_second.mT @ (u * s) @ v @ from_first
 
 
-def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Float[Tensor, "3 3"]:
+def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Matrix3:
     """Fit the fundamental matrix that explains still and moving matches best; float64.
 
     The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
@@ -85,7 +84,7 @@ def pinholes_of(model: SparseModel) -> Cameras:
     )
 
 
-def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Float[Tensor, "3 3"]:
+def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:
     """Return ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
     poses = (cameras.cam_from_world[view] for view in views)
     motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.method.sfm.features import Workspace, image_ids
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.records import Record
@@ -144,7 +145,7 @@ class Near(NamedTuple):
         max_error_px: Sampson's distance from the epipolar line, or that from the mapped point.
     """
 
-    matrix: Float[Tensor, "3 3"]
+    matrix: Matrix3
     max_error_px: float
     planar: bool = False
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps, no_series
 from pimper_torch.runtime.errors import InputError, some
@@ -31,9 +32,7 @@ class SparseModel(Record):
     names: tuple[str, ...]
     lenses: tuple[Lens, ...]
     cam_from_world: Float[Tensor, "view 4 4"]
-    points_world: Float[Tensor, "point 3"] = field(
-        default_factory=lambda: torch.zeros(0, 3).double()
-    )
+    points_world: Points = field(default_factory=lambda: torch.zeros(0, 3).double())
     observation_point: Int[Tensor, " observation"] = field(default_factory=no_series)
     observation_view: Int[Tensor, " observation"] = field(default_factory=no_series)
     observation_pixels: Float[Tensor, "observation 2"] = field(

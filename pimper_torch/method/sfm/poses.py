@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
 from pimper_torch.records.scene_parts import OneAPose, with_views
@@ -119,7 +120,7 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
 def _texture(views: Views) -> Float[Tensor, " view"]:
     """Compute the mean step of the square root of radiance between neighbouring pixels."""
 
-    def of_view(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Float[Tensor, ""]:
+    def of_view(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Scalar:
         wide, high = size.tolist()
         one = image.detach().mean(dim=0).clamp(0, 1).sqrt()
         return one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()

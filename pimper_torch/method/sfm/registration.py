@@ -11,10 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
-from jaxtyping import Float
-from torch import Tensor
-
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.method.sfm.colmap import model_of
 from pimper_torch.method.sfm.doubt import FEWEST_VIEWS, MOVE, count_views_with_depth, doubt, judged
 from pimper_torch.method.sfm.features import Workspace
@@ -112,7 +110,7 @@ class Registration:
     missing: tuple[str, ...]
     misplaced: Mapping[str, float]
     explained: float
-    background: tuple[Float[Tensor, "3 3"], ...] = ()
+    background: tuple[Matrix3, ...] = ()
     around: tuple[VerifiedPair, ...] = ()
 
     @property

@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.method.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.method.sfm.matching import (
     Keypoints,
@@ -72,7 +73,7 @@ class StaticBackground(Record):
         return self.violating_fraction > _CONTRADICTION
 
     @property
-    def maps(self) -> list[Float[Tensor, "3 3"]]:
+    def maps(self) -> list[Matrix3]:
         """Maps from the pixels of each photograph to those where the room is at rest.
 
         The identity; NaN where a photograph shows too little of it. None without a room.

@@ -25,6 +25,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import Map, Pixels, Points
 from pimper_torch.method.sfm.matching import MOST_PAIRED
 from pimper_torch.records import Cameras, Record
 from pimper_torch.runtime.mapped import drop_pages, zeros
@@ -51,14 +52,14 @@ class Tangents(Record):
             reference.
     """
 
-    points_world: Float[Tensor, "point 3"]
+    points_world: Points
     steps_world: Float[Tensor, "point 2 3"]
     reference: Int[Tensor, " point"]
     candidates: Bool[Tensor, "point view"]
 
 
 def tangents(
-    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
+    points_world: Points, observed: Bool[Tensor, "point view"], cameras: Cameras
 ) -> Tangents:
     """Lay a plane through every point and choose the views to look for it in."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
@@ -70,18 +71,15 @@ def tangents(
 
 
 def _towards(
-    points_world: Float[Tensor, "point 3"], observed: Bool[Tensor, "point view"], cameras: Cameras
-) -> Float[Tensor, "point 3"]:
+    points_world: Points, observed: Bool[Tensor, "point view"], cameras: Cameras
+) -> Points:
     """Return the mean directions to the views that see points."""
     rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
     return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
 
 
 def _laid(
-    points_world: Float[Tensor, "point 3"],
-    observed: Bool[Tensor, "point view"],
-    normals: Float[Tensor, "point 3"],
-    cameras: Cameras,
+    points_world: Points, observed: Bool[Tensor, "point view"], normals: Points, cameras: Cameras
 ) -> Tangents:
     rays = cameras.centers_world - points_world[:, None]
     distance = rays.norm(dim=-1)
@@ -119,9 +117,7 @@ def evenly(
     return candidates & (place // count > (place - most) // count)
 
 
-def plane_normals(
-    points: Float[Tensor, "point 3"], towards: Float[Tensor, "point 3"]
-) -> Float[Tensor, "point 3"]:
+def plane_normals(points: Points, towards: Points) -> Points:
     """Return the unit normals of the planes that points and their nearest ones lie on.
 
     Args:
@@ -148,7 +144,7 @@ def plane_homographies(
     return cameras.intrinsics[view] @ torch.cat([rotated, centre[:, None]], dim=1).mT
 
 
-def _along(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 2 3"]:
+def _along(normals: Points) -> Float[Tensor, "point 2 3"]:
     """Return two unit vectors at right angles to each normal and to one another."""
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first = normalize(torch.linalg.cross(normals, axis), dim=-1)
@@ -324,7 +320,7 @@ def _aligned(
     templates: _Templates,
     window: _Window,
     max_shift_px: float,
-) -> tuple[Bool[Tensor, " point"], Float[Tensor, "point 2"]]:
+) -> tuple[Bool[Tensor, " point"], Pixels]:
     """Align one view's patches; return which were found, and their pixels."""
     from pimper_torch.ground.kernels.patch_alignment import align
 
@@ -352,15 +348,13 @@ def _aligned(
     return found, final[:, :2, 2] / final[:, 2:, 2]
 
 
-def _shifted(
-    homographies: Float[Tensor, "point 3 3"], shift: Float[Tensor, "point 2"]
-) -> Float[Tensor, "point 3 3"]:
+def _shifted(homographies: Float[Tensor, "point 3 3"], shift: Pixels) -> Float[Tensor, "point 3 3"]:
     """Begin the plane's steps elsewhere."""
     centre = homographies[:, :, 2] + (homographies[:, :, :2] @ shift[..., None])[..., 0]
     return torch.cat([homographies[:, :, :2], centre[..., None]], dim=2)
 
 
-def _reference_pixels(tangents: Tangents, cameras: Cameras) -> Float[Tensor, "point 2"]:
+def _reference_pixels(tangents: Tangents, cameras: Cameras) -> Pixels:
     frames = cameras.cam_from_world[tangents.reference]
     points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
     homogeneous = (cameras.intrinsics[tangents.reference] @ points[..., None])[..., 0]
@@ -379,7 +373,7 @@ def _complete(
 
 
 def _look_up(
-    picture: Float[Tensor, "height width"],
+    picture: Map,
     homographies: Float[Tensor, "point 3 3"],
     window: _Window,
     mode: str = "bilinear",

@@ -100,10 +100,7 @@ _MIN_AGREEMENT, _DOUBTFUL = 0.5, 0.9
 
 
 def require_agreement(
-    model: SparseModel,
-    verified: Sequence[matching.VerifiedPair],
-    max_error_px: float,
-    where: str,
+    model: SparseModel, verified: Sequence[matching.VerifiedPair], max_error_px: float, where: str
 ) -> None:
     """Refuse cameras that explain too few of the matches, and warn of doubtful ones.
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -16,6 +16,7 @@ from pimper_torch.ground.geometry.lens_models import (
 )
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import Mask, Matrix3
 from pimper_torch.records import (
     AlbedoPrior,
     DepthPrior,
@@ -63,7 +64,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
 
 def undistorted(
     views: Views, lenses: tuple[Lens, ...]
-) -> Iterator[tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]]:
+) -> Iterator[tuple[Float[Tensor, "channel height width"], Mask]]:
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     alike = len(set(lenses)) == 1
     shared = source_grid(lenses[0], like=views.images) if alike else None
@@ -84,7 +85,7 @@ def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
     return torch.stack([found[lens] for lens in lenses])
 
 
-_Grid = tuple[Float[Tensor, "1 height width 2"], Bool[Tensor, "height width"]]
+_Grid = tuple[Float[Tensor, "1 height width 2"], Mask]
 
 
 def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _Grid | None:
@@ -110,7 +111,7 @@ def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _G
 
 def _undistort_image(
     views: Views, index: int, lens: Lens, grid: _Grid | None
-) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
+) -> tuple[Float[Tensor, "channel height width"], Mask]:
     """Undistort one photograph, without padding; no grid for a lens without distortion."""
     image = views.images[index, :, : lens.height, : lens.width]
     mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
@@ -133,7 +134,7 @@ def _sampled(
     return grid_sample(raster[None], grid, mode="bilinear", align_corners=False)[0]
 
 
-def pinhole_for(lens: Lens) -> Float[Tensor, "3 3"]:
+def pinhole_for(lens: Lens) -> Matrix3:
     """Choose the pinhole that a photograph is undistorted to; ``K`` in float64.
 
     It keeps the lens's principal point and, for a lens that bulges (barrel), its focal
@@ -260,7 +261,7 @@ def _weighted(
     values: _Raster,
     variance: Float[Tensor, "1 height width"],
     places: Float[Tensor, "1 height width 2"],
-    inside: Bool[Tensor, "height width"],
+    inside: Mask,
 ) -> tuple[_Raster, Float[Tensor, "1 height width"], _Raster]:
     """Return means by precision, one over the mean precision, and variances about the means."""
     known = variance.isfinite()

@@ -21,6 +21,7 @@ from pimper_torch.ground.geometry.supporting_plane import (
     well_tracked,
 )
 from pimper_torch.ground.geometry.visual_hull import Hull
+from pimper_torch.ground.shapes import Masks
 from pimper_torch.method.silhouettes import parallax
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
@@ -81,7 +82,7 @@ class SoftMasks(Record):
         return any(len(pixels) for pixels in self.seeds_px)
 
     @property
-    def masks(self) -> Bool[Tensor, "view height width"]:
+    def masks(self) -> Masks:
         """True where a pixel more likely shows the object than not."""
         return self.inside > 0.5
 
@@ -192,14 +193,14 @@ class Cues(Record):
         """Whether backgrounds that are known are all round: a room, and the plane before it."""
         return self.plane is not None and len(self.background_from_view) > 0
 
-    def surrounded(self) -> Bool[Tensor, "view height width"]:
+    def surrounded(self) -> Masks:
         """Find what the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
         return parallax.of_views(
             lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
         )
 
-    def relearned(self, masks: Bool[Tensor, "view height width"]) -> "Cues":
+    def relearned(self, masks: Masks) -> "Cues":
         """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere."""
         found = self._agreement(masks)
         if found is None or self.agreement is None:
@@ -240,9 +241,7 @@ class Cues(Record):
         """Learn the backgrounds' texture, if there are any."""
         return self.replace(agreement=self._agreement(None))
 
-    def _agreement(
-        self, hidden: Bool[Tensor, "view height width"] | None
-    ) -> Float[Tensor, "view height width"] | None:
+    def _agreement(self, hidden: Masks | None) -> Float[Tensor, "view height width"] | None:
         """Compare views with what they see through homographies; ``None`` without any."""
         found = []
         if self.plane is not None:

@@ -27,6 +27,7 @@ from pimper_torch.ground.geometry.opencv import (
     without_specks,
 )
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
+from pimper_torch.ground.shapes import Map, Mask, Masks, Pixels, Scalar
 from pimper_torch.method.silhouettes.cues import (
     FEW,
     MIN_POINTS,
@@ -70,13 +71,13 @@ class Cuts(Record):
         hidden: Pixels of the cuts that show something before the object; ``None`` where none do.
     """
 
-    masks: Bool[Tensor, "view height width"]
+    masks: Masks
     margins_px: Float[Tensor, "view height width"]
     exposed: Float[Tensor, " view"]
     held: Float[Tensor, " view"]
     on_plane: bool
     doubted: Bool[Tensor, " view"]
-    hidden: Bool[Tensor, "view height width"] | None = None
+    hidden: Masks | None = None
 
 
 def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
@@ -116,13 +117,13 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
 
 def cuts_of(
     cues: Cues,
-    masks: Bool[Tensor, "view height width"],
+    masks: Masks,
     margins_px: Float[Tensor, "view height width"],
     doubted: Bool[Tensor, " view"],
 ) -> Cuts:
     """Compare cuts with backgrounds and points."""
 
-    def exposed(view: int) -> Float[Tensor, ""]:
+    def exposed(view: int) -> Scalar:
         agreement = None if cues.agreement is None else cues.agreement[view]
         return exposed_fraction(masks[view], agreement)
 
@@ -136,9 +137,7 @@ def cuts_of(
     )
 
 
-def _filled(
-    cues: Cues, masks: Bool[Tensor, "view height width"]
-) -> Bool[Tensor, "view height width"]:
+def _filled(cues: Cues, masks: Masks) -> Masks:
     """Fill holes that the plane is not seen through."""
     agreement = cues.agreement
     if agreement is None:
@@ -146,9 +145,7 @@ def _filled(
     return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
 
 
-def _in_front(
-    cues: Cues, masks: Bool[Tensor, "view height width"]
-) -> Bool[Tensor, "view height width"]:
+def _in_front(cues: Cues, masks: Masks) -> Masks:
     """Find what may hide the object in each view, so that its cut says nothing there."""
     agreement = cues.agreement
     if agreement is None:
@@ -156,14 +153,14 @@ def _in_front(
     return of_views(lambda view: in_front(masks[view], agreement[view]), len(masks))
 
 
-def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
+def _first(cues: Cues) -> Masks:
     """Cut from points and parallax; by parallax alone before a room, or with hardly a point.
 
     Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
     """
     height, width = cues.pictures.grey.shape[1:]
 
-    def first(view: int) -> Bool[Tensor, "height width"]:
+    def first(view: int) -> Mask:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         if cues.soft is not None and cues.soft.given[view]:
@@ -179,14 +176,11 @@ def _first(cues: Cues) -> Bool[Tensor, "view height width"]:
 
 
 def _again(
-    cues: Cues,
-    masks: Bool[Tensor, "view height width"],
-    seen: Float[Tensor, "view height width"],
-    unknown: Bool[Tensor, "view height width"],
-) -> Bool[Tensor, "view height width"]:
+    cues: Cues, masks: Masks, seen: Float[Tensor, "view height width"], unknown: Masks
+) -> Masks:
     """Cut from the last cut and the hull; drop what does not meet the hull."""
 
-    def again(view: int) -> Bool[Tensor, "height width"]:
+    def again(view: int) -> Mask:
         object_px = cues.object_px[view]
         agreement = None if cues.agreement is None else cues.agreement[view]
         labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
@@ -199,12 +193,8 @@ def _again(
 
 
 def _cut(
-    how: Cutter,
-    cues: Cues,
-    view: int,
-    labels: UInt8[Tensor, "height width"],
-    margin: Float[Tensor, "height width"],
-) -> Bool[Tensor, "height width"]:
+    how: Cutter, cues: Cues, view: int, labels: UInt8[Tensor, "height width"], margin: Map
+) -> Mask:
     """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
 
     Those cannot tell the grey inside of a vessel from a grey table: what is well inside is the
@@ -219,7 +209,7 @@ def _cut(
     return how(cues.pictures.opponent[view], labels, 2)
 
 
-def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
+def _likely(cues: Cues) -> Masks:
     """Find pixels too bright or too dark for the plane, such as the inside of a vessel.
 
     They count as object in the vote, even where the cuts miss them.
@@ -230,9 +220,7 @@ def _likely(cues: Cues) -> Bool[Tensor, "view height width"]:
     return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
-def _doubted(
-    cues: Cues, masks: Bool[Tensor, "view height width"], details: SilhouetteDetails
-) -> Bool[Tensor, " view"]:
+def _doubted(cues: Cues, masks: Masks, details: SilhouetteDetails) -> Bool[Tensor, " view"]:
     """Find soft masks that lack most of what most of them have in common; all if that is little."""
     if cues.soft is None or int(cues.soft.given.sum()) < FEW:
         return torch.zeros(len(masks), dtype=torch.bool)
@@ -247,7 +235,7 @@ def _doubted(
     return given
 
 
-def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
+def _unknown(cues: Cues) -> Masks:
     """Find what a first cut by parallax knows nothing of, as beyond the plane."""
     if cues.agreement is None or cues.has_points:
         return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
@@ -256,9 +244,9 @@ def _unknown(cues: Cues) -> Bool[Tensor, "view height width"]:
 
 def _voted(
     cues: Cues,
-    masks: Bool[Tensor, "view height width"],
+    masks: Masks,
     details: SilhouetteDetails,
-    unknown: Bool[Tensor, "view height width"] | None = None,
+    unknown: Masks | None = None,
     voting: Bool[Tensor, " view"] | None = None,
 ) -> Float[Tensor, "view height width"] | None:
     """Build the hull above the plane, of what is pointed at, and see it in every view.
@@ -287,7 +275,7 @@ def _voted(
         hull = pointed_at(hull, cameras, cues.soft.seeds_px)
     height, width = masks.shape[1:]
 
-    def margin(view: int) -> Float[Tensor, "height width"]:
+    def margin(view: int) -> Map:
         frame = cameras.cam_from_world[view]
         return margins(hull, cameras.intrinsics[view], frame, (width, height))
 
@@ -295,9 +283,9 @@ def _voted(
 
 
 def labels_from_points(
-    object_px: Float[Tensor, "point 2"],
+    object_px: Pixels,
     background_px: Float[Tensor, "other 2"],
-    agreement: Float[Tensor, "height width"] | None,
+    agreement: Map | None,
     size_px: tuple[int, int],
 ) -> UInt8[Tensor, "height width"]:
     """Seed with the points that a view observes, the object's and others, and with parallax.
@@ -322,11 +310,7 @@ def labels_from_points(
 
 
 def labels_from_hull(
-    margin: Float[Tensor, "height width"],
-    cut: Bool[Tensor, "height width"],
-    object_px: Float[Tensor, "point 2"],
-    agreement: Float[Tensor, "height width"] | None,
-    unknown: Bool[Tensor, "height width"] | None = None,
+    margin: Map, cut: Mask, object_px: Pixels, agreement: Map | None, unknown: Mask | None = None
 ) -> UInt8[Tensor, "height width"]:
     """Seed with a view's last cut, the projection of the hull, points in it, and parallax.
 
@@ -350,9 +334,7 @@ def labels_from_hull(
 
 
 def labels_from_soft(
-    labels: UInt8[Tensor, "height width"],
-    mask: Bool[Tensor, "height width"],
-    margin: Float[Tensor, "height width"],
+    labels: UInt8[Tensor, "height width"], mask: Mask, margin: Map
 ) -> UInt8[Tensor, "height width"]:
     """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
     border, reach = signed_distance(mask), 1 / 160 * max(mask.shape)
@@ -361,15 +343,13 @@ def labels_from_soft(
     return torch.where(outside, BACKGROUND, labels)
 
 
-def off_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def off_plane(agreement: Map) -> Mask:
     """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
     found = _grainless(agreement < _NOT_PLANE)
     return filled(closed(found, round(1 / 50 * max(agreement.shape))), agreement)
 
 
-def in_front(
-    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
+def in_front(cut: Mask, agreement: Map) -> Mask:
     """Find what stands before the plane and is not the object, as a person who may hide some of it.
 
     Windows that hold some of the object do not agree with the plane either: what is as narrow as
@@ -380,51 +360,43 @@ def in_front(
     return opened(other, round(_DEEP * longer))
 
 
-def is_deep(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def is_deep(margin: Map) -> Mask:
     """Find what is so far inside that shadows beside the object do not reach it."""
     return margin > _DEEP * max(margin.shape)
 
 
-def is_inmost(margin: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def is_inmost(margin: Map) -> Mask:
     """Find what is deep inside, and the middle of what is too thin to be deep."""
     longer = max(margin.shape)
     middle = margin > _MIDDLE * dilated(margin, max(1, round(_DEEP * longer)))
     return is_deep(margin) | (middle & (margin > _THIN * longer))
 
 
-def not_seen_through(
-    object_px: Float[Tensor, "point 2"], agreement: Float[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
+def not_seen_through(object_px: Pixels, agreement: Map) -> Mask:
     """Find what the object's points surround, where the plane is not seen."""
     height, width = agreement.shape
     return convex_hull_of(object_px, (width, height)) & ~_shows_plane(agreement)
 
 
-def off_level(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def off_level(agreement: Map) -> Mask:
     """Find what is so bright or dark that light cannot make it so on the plane."""
     return _grainless(agreement == -1)
 
 
-def filled(
-    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
+def filled(cut: Mask, agreement: Map) -> Mask:
     """Fill holes that the plane is not seen through, such as the inside of a vessel."""
     whole = closed(cut, max(1, round(_CLOSING * max(cut.shape))))
     return cut | blind_holes(whole, agreement > _ON_PLANE, _THROUGH)
 
 
-def exposed_fraction(
-    cut: Bool[Tensor, "height width"], agreement: Float[Tensor, "height width"] | None
-) -> Float[Tensor, ""]:
+def exposed_fraction(cut: Mask, agreement: Map | None) -> Scalar:
     """Return the fraction of a cut that shows a background for certain; 0 where none is known."""
     if agreement is None:
         return torch.zeros((), dtype=torch.float64)
     return (cut & surely_on_plane(agreement)).sum().double() / cut.sum().clamp_min(1)
 
 
-def held_fraction(
-    cut: Bool[Tensor, "height width"], object_px: Float[Tensor, "point 2"]
-) -> Float[Tensor, ""]:
+def held_fraction(cut: Mask, object_px: Pixels) -> Scalar:
     """Return the fraction of the object's points that a cut holds; 1 where too few are known."""
     if len(object_px) < MIN_POINTS:
         return torch.ones((), dtype=torch.float64)
@@ -433,16 +405,16 @@ def held_fraction(
     return cut[row.clamp(0, height - 1), column.clamp(0, width - 1)].double().mean()
 
 
-def surely_on_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def surely_on_plane(agreement: Map) -> Mask:
     """Find the plane, but not what is next to something else: the object's foot agrees, too."""
     sure = _grainless(agreement > _ON_PLANE)
     return signed_distance(sure) > 1 / 200 * max(agreement.shape)
 
 
-def _shows_plane(agreement: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def _shows_plane(agreement: Map) -> Mask:
     """Find what some window that agrees with the plane holds."""
     return signed_distance(_grainless(agreement > _ON_PLANE)) > -1 / 160 * max(agreement.shape)
 
 
-def _grainless(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def _grainless(mask: Mask) -> Mask:
     return opened(mask, max(1, round(1 / 200 * max(mask.shape))))

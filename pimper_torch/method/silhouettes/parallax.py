@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -19,6 +19,7 @@ from pimper_torch.ground.geometry.opencv import shrunk, warped, window_means
 from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.ground.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.ground.radiometry.response import srgb_from_linear
+from pimper_torch.ground.shapes import Map, Mask, Masks, Matrix3
 from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -119,10 +120,7 @@ class Raster(Record):
 
 
 def plane_agreement(
-    pictures: WorkingPictures,
-    plane: Plane,
-    fixation: Fixation,
-    hidden: Bool[Tensor, "view height width"] | None = None,
+    pictures: WorkingPictures, plane: Plane, fixation: Fixation, hidden: Masks | None = None
 ) -> Float[Tensor, "view height width"]:
     """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
 
@@ -138,7 +136,7 @@ def plane_agreement(
 def room_agreement(
     pictures: WorkingPictures,
     background_from_view: Float[Tensor, "view 3 3"],
-    hidden: Bool[Tensor, "view height width"] | None = None,
+    hidden: Masks | None = None,
 ) -> Float[Tensor, "view height width"]:
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
@@ -152,10 +150,7 @@ def room_agreement(
 
 
 def texture_agreement(
-    pictures: WorkingPictures,
-    near: Raster,
-    far: Raster,
-    hidden: Bool[Tensor, "view height width"] | None = None,
+    pictures: WorkingPictures, near: Raster, far: Raster, hidden: Masks | None = None
 ) -> Float[Tensor, "view height width"]:
     r"""Return how well each view agrees with the texture of a background.
 
@@ -175,14 +170,14 @@ def texture_agreement(
     count, longer = len(pictures.grey), max(pictures.grey.shape[1:])
     hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
 
-    def textured(view: int) -> Float[Tensor, "height width"]:
+    def textured(view: int) -> Map:
         return _textured(pictures.grey[view], hidden[view], longer)
 
     texture = of_views(textured, count)
     common, spread = _common(texture, hidden, near)
     level, level_spread = _common(pictures.grey, hidden, far)
 
-    def agreement_of(view: int) -> Float[Tensor, "height width"]:
+    def agreement_of(view: int) -> Map:
         agreement = _agreement(texture[view], common[view], spread[view], longer)
         other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
         other &= level_spread[view] < _NO_SHADOW / 2
@@ -192,9 +187,7 @@ def texture_agreement(
 
 
 def _common(
-    values: Float[Tensor, "view height width"],
-    hidden: Bool[Tensor, "view height width"],
-    raster: Raster,
+    values: Float[Tensor, "view height width"], hidden: Masks, raster: Raster
 ) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
     """Return the views' median on a background, and its spread, as each view sees it."""
     maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
@@ -228,9 +221,7 @@ def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row colu
     return torch.stack([common, spread]).masked_fill(few, torch.nan)
 
 
-def _in_front(
-    layer: Float[Tensor, "height width"], raster_from_pixels: Float[Tensor, "3 3"]
-) -> Float[Tensor, "height width"]:
+def _in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
     """Mask what a homography maps in front of the camera though it lies behind it."""
     height, width = layer.shape
     pixels = pixel_centers(width, height, like=layer)
@@ -278,9 +269,7 @@ def _room_raster(
     return Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
 
 
-def _textured(
-    grey: Float[Tensor, "height width"], hidden: Bool[Tensor, "height width"], longer: int
-) -> Float[Tensor, "height width"]:
+def _textured(grey: Map, hidden: Mask, longer: int) -> Map:
     """Take the light out: what varies smoothly, on the plane and on what hides it apart."""
     window = _odd(_SHADING * longer)
     off = hidden.to(grey)
@@ -289,12 +278,7 @@ def _textured(
     return grey - smooth
 
 
-def _agreement(
-    one: Float[Tensor, "height width"],
-    common: Float[Tensor, "height width"],
-    spread: Float[Tensor, "height width"],
-    longer: int,
-) -> Float[Tensor, "height width"]:
+def _agreement(one: Map, common: Map, spread: Map, longer: int) -> Map:
     """Compare a view with the plane's texture window by window."""
     known = common.isfinite() & spread.isfinite()
     common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)

@@ -12,6 +12,7 @@ from pimper_torch.ground.geometry.opencv import blind_holes, components_of, sign
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.ground.shapes import Map, Mask, Masks
 from pimper_torch.method.silhouettes.cues import SilhouetteDetails
 from pimper_torch.method.silhouettes.cuts import Cuts, is_deep
 from pimper_torch.records import Cameras, Record, Silhouettes, Views
@@ -134,7 +135,7 @@ def _at_full_size(cuts: Cuts, views: Views) -> Float[Tensor, "view height width"
     height, width = views.images.shape[-2:]
     device = views.images.device
 
-    def enlarged(view: int) -> Float[Tensor, "height width"]:
+    def enlarged(view: int) -> Map:
         cut, margin = cuts.masks[view], cuts.margins_px[view]
         layers = torch.stack([signed_distance(cut), margin.clamp(-100, 100)])
         border, hull = interpolate(
@@ -228,9 +229,7 @@ def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> Bool[Tensor, " 
     return silhouettes.reliable.clone()
 
 
-def _conflicts(
-    masks: Bool[Tensor, "view height width"], cameras: Cameras, box_world: Float[Tensor, "2 3"]
-) -> _Conflicts:
+def _conflicts(masks: Masks, cameras: Cameras, box_world: Float[Tensor, "2 3"]) -> _Conflicts:
     """Follow rays through pixels of each silhouette in smaller pictures."""
     by = max(1, math.ceil(max(masks.shape[1:]) / _SIZE_PX))
     small = by_view(
@@ -267,7 +266,7 @@ def _conflicts(
 
 
 def _places(
-    mask: Bool[Tensor, "height width"], camera: Cameras, box_world: Float[Tensor, "2 3"]
+    mask: Mask, camera: Cameras, box_world: Float[Tensor, "2 3"]
 ) -> tuple[Float[Tensor, "place 3"], Float[Tensor, " pixel"]]:
     """List places in the box on rays through pixels of a mask, and half of the way between them."""
     shown = mask.nonzero()

@@ -4,11 +4,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalars
+
 
 def parabola_minimum(
     cost: Float[Tensor, "*batch hypothesis"],
     prior: Float[Tensor, "*batch hypothesis"] | None = None,
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+) -> tuple[Scalars, Scalars, Bool[Tensor, "*batch"]]:
     """Fit a parabola to the least cost and the two beside it.
 
     Args:
@@ -39,10 +41,8 @@ def parabola_minimum(
 
 
 def posterior_variance(
-    cost: Float[Tensor, "*batch hypothesis"],
-    position: Float[Tensor, "*batch"],
-    curvature: Float[Tensor, "*batch"],
-) -> Float[Tensor, "*batch"]:
+    cost: Float[Tensor, "*batch hypothesis"], position: Scalars, curvature: Scalars
+) -> Scalars:
     r"""Return the variance of the minimum's position, in squared steps.
 
     Costs are taken for negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
@@ -65,7 +65,7 @@ def posterior_variance(
     return torch.where(bent, beyond + 1 / torch.where(bent, curvature, 1), torch.inf)
 
 
-def _variance(cost: Float[Tensor, "*batch hypothesis"]) -> Float[Tensor, "*batch"]:
+def _variance(cost: Float[Tensor, "*batch hypothesis"]) -> Scalars:
     """Return the variance of the hypotheses' index under their likelihoods."""
     steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
     likelihood = torch.softmax(-cost, dim=-1)

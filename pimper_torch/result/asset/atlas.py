@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.failures import reason_of
@@ -40,7 +41,7 @@ class Atlas(Record):
     """
 
     vertex: Int[Tensor, " copy"]
-    faces: Int[Tensor, "face 3"]
+    faces: Faces
     uv: Float[Tensor, "copy 2"]
     width: int
     height: int
@@ -110,7 +111,7 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
 
 
 def _pieces(
-    places: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face 3"]
+    places: Vertices, faces: Faces
 ) -> tuple[Int[Tensor, " face"], list[Int[Tensor, " some"]]]:
     """Halve the faces across their longest side until pieces are small; list them, and joined."""
     centres = places[faces].mean(dim=1)

@@ -1,7 +1,7 @@
 """Textures of a mesh of few faces, read off the surface that it stands for."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
@@ -15,6 +15,7 @@ from pimper_torch.ground.geometry.surfaces import (
 )
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.ground.shapes import Mask, Vertices
 from pimper_torch.records import Mesh, Textured
 from pimper_torch.result.asset.atlas import Atlas
 from pimper_torch.result.asset.tangents import frames, tangents
@@ -38,9 +39,7 @@ def _halved(
     return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
 
 
-def baked(
-    full: Mesh, few: Mesh, atlas: Atlas, reflectance: Float[Tensor, "vertex 3"] | None = None
-) -> Textured:
+def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = None) -> Textured:
     """Read albedo and normals of a surface off onto textures of a mesh that has fewer faces.
 
     From the centre of every texel, on a face of the mesh, a ray along the mesh's blended normals
@@ -169,16 +168,14 @@ def _relative(
     return normalize(torch.cat([found[:, :2], found[:, 2:].clamp_min(0.02)], dim=1), dim=1)
 
 
-def _nearest_known(
-    known: Bool[Tensor, "height width"],
-) -> tuple[Int[Tensor, " texel"], Float[Tensor, " texel"]]:
+def _nearest_known(known: Mask) -> tuple[Int[Tensor, " texel"], Float[Tensor, " texel"]]:
     """Number the nearest known texel of every one, row by row, and return how far that is."""
     away, (row, column) = distance_transform_edt(~known.numpy(), return_indices=True)
     index = torch.from_numpy(row).long() * known.shape[1] + torch.from_numpy(column)
     return index.flatten(), torch.from_numpy(away).flatten()
 
 
-def _normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+def _normals(mesh: Mesh) -> Vertices:
     if mesh.normals_world is None:
         return vertex_normals(mesh.vertices_world, mesh.faces)
     return mesh.normals_world

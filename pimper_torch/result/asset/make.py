@@ -1,10 +1,9 @@
 """A surface with textures on few faces."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import side_lengths
+from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import Mesh, Relighting, Textured
 from pimper_torch.result.asset.atlas import unwrapped
 from pimper_torch.result.asset.bake import baked
@@ -14,9 +13,7 @@ from pimper_torch.runtime.stage import Stage
 _TEXELS_PER_SIDE = 1.5
 
 
-def textured(
-    full: Mesh, few: Mesh, reflectance: Float[Tensor, "vertex 3"] | None = None
-) -> Textured:
+def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Textured:
     """Bake a surface onto few faces.
 
     Args:

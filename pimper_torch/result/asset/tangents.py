@@ -1,18 +1,16 @@
 """The frames that normal maps are relative to, as viewers compute them."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.visibility import Hits
+from pimper_torch.ground.shapes import Faces, Vertices
 
 
 def tangents(
-    vertices: Float[Tensor, "vertex 3"],
-    normals: Float[Tensor, "vertex 3"],
-    uv: Float[Tensor, "vertex 2"],
-    faces: Int[Tensor, "face 3"],
+    vertices: Vertices, normals: Vertices, uv: Float[Tensor, "vertex 2"], faces: Faces
 ) -> Float[Tensor, "vertex 4"]:
     """Return glTF's tangents: unit, at right angles to the normal, along ``u``; then a sign.
 
@@ -44,10 +42,7 @@ def tangents(
 
 
 def frames(
-    hits: Hits,
-    normals: Float[Tensor, "vertex 3"],
-    tangent: Float[Tensor, "vertex 4"],
-    faces: Int[Tensor, "face 3"],
+    hits: Hits, normals: Vertices, tangent: Float[Tensor, "vertex 4"], faces: Faces
 ) -> Float[Tensor, "*batch 3 3"]:
     """Return tangent, bitangent and normal in columns, blended over faces as shaders do.
 

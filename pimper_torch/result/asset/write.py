@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Textured
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 
@@ -75,7 +76,7 @@ def _reflect(
     ]
 
 
-def _levels(values: Float[Tensor, "*batch"]) -> UInt8[Tensor, "*batch"]:
+def _levels(values: Scalars) -> UInt8[Tensor, "*batch"]:
     return (255 * values.clamp(0, 1)).round().to(torch.uint8)
 
 

@@ -19,6 +19,7 @@ from pimper_torch.ground.geometry.directions import even_directions
 from pimper_torch.ground.geometry.pixels import scale_intrinsics
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import (
     Cameras,
     Materials,
@@ -256,10 +257,7 @@ def lights_of(
 
 
 def _fit(
-    surface: LitSurface,
-    seen: Observed,
-    material: Float[Tensor, "vertex 3"] | None,
-    start: ViewLights | None,
+    surface: LitSurface, seen: Observed, material: Vertices | None, start: ViewLights | None
 ) -> ViewLights:
     """Fit the light of one photograph."""
     if len(seen.radiance) == 0:

@@ -25,14 +25,13 @@ from torch.nn.functional import grid_sample, max_pool2d, normalize
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Cameras, Materials, Mesh, Record, Textured
 from pimper_torch.result.asset.tangents import frames
 from pimper_torch.result.viz.maps import base_color
 
 
-def facet_density(
-    cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch"]:
+def facet_density(cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]) -> Scalars:
     """Return GGX's density of facets per solid angle.
 
     Args:
@@ -47,7 +46,7 @@ def masking(
     to_light: Float[Tensor, "*#batch"],
     to_eye: Float[Tensor, "*#batch"],
     alpha: Float[Tensor, "*#batch"],
-) -> Float[Tensor, "*batch"]:
+) -> Scalars:
     """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
 
     Args:

@@ -14,6 +14,7 @@ from torch.nn.functional import interpolate
 
 from pimper_torch.ground.geometry.pixels import scale_intrinsics
 from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.ground.shapes import Map
 from pimper_torch.records import (
     Cameras,
     Mesh,
@@ -56,7 +57,7 @@ def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
-def outline(inside: Float[Tensor, "height width"], scale: float) -> str:
+def outline(inside: Map, scale: float) -> str:
     """Trace the border of a silhouette as a path of SVG.
 
     Args:

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
-from torch import Tensor
-
+from pimper_torch.ground.shapes import PerVertex
 from pimper_torch.records import Mesh
 
 
@@ -48,7 +46,7 @@ def surface_layers(mesh: Mesh) -> list[VertexLayer]:
 
 
 def length_layer(
-    attribute: str, title: str, about: str, values: Float[Tensor, " vertex"], unit: str = "units"
+    attribute: str, title: str, about: str, values: PerVertex, unit: str = "units"
 ) -> VertexLayer:
     """Return a layer of lengths, from 0 to what nearly all are below."""
     known = values[values.isfinite()]

@@ -7,6 +7,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.ground.geometry.supporting_plane import fixation
+from pimper_torch.ground.shapes import Matrix3, Scalar
 from pimper_torch.records import Cameras, Mesh
 
 
@@ -37,7 +38,7 @@ def frame_of_mesh(mesh: Mesh) -> Float[Tensor, "4 4"]:
 
 
 def _similarity(
-    rotation: Float[Tensor, "3 3"], middle: Float[Tensor, " 3"], distance: Float[Tensor, ""]
+    rotation: Matrix3, middle: Float[Tensor, " 3"], distance: Scalar
 ) -> Float[Tensor, "4 4"]:
     """Put the middle at the origin, and what is at that distance three units away."""
     scale = 3 / distance

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.report.predictions import shrunk
@@ -93,7 +94,7 @@ class Viewer:
         self,
         names: Sequence[str],
         cameras: Cameras,
-        points_world: Float[Tensor, "point 3"],
+        points_world: Points,
         reference: int = 0,
         views: Views | None = None,
     ) -> None:

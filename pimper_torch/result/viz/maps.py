@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, cast_view
+from pimper_torch.ground.shapes import Map, Mask, Vectors
 from pimper_torch.records import Cameras, Mesh, Record
 
 _GREY = 0.5  # colour of a mesh of unknown albedo
@@ -27,12 +28,12 @@ class ViewMaps(Record):
         expected_error: The same, scene units; ``None`` where the mesh carries none.
     """
 
-    seen: Bool[Tensor, "height width"]
-    depth: Float[Tensor, "height width"]
+    seen: Mask
+    depth: Map
     normals_cam: Float[Tensor, "height width 3"]
     albedo: Float[Tensor, "height width channel"]
-    confidence: Float[Tensor, "height width"]
-    expected_error: Float[Tensor, "height width"] | None = None
+    confidence: Map
+    expected_error: Map | None = None
 
 
 def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
@@ -67,7 +68,7 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     )
 
 
-def normal_colors(normals_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def normal_colors(normals_cam: Vectors) -> Vectors:
     """Colour normals the usual way: red to the right, green up, blue to the viewer.
 
     A zero normal, which is none, is black.

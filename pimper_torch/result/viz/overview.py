@@ -12,6 +12,7 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d
 from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import srgb_from_linear, to_bytes
+from pimper_torch.ground.shapes import Mask, Vertices
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -109,7 +110,7 @@ def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
     return torch.cat([doubted, trusted[even]]).sort().values.tolist()
 
 
-def _framed(camera: Cameras, vertices: Float[Tensor, "vertex 3"], width_px: int) -> Cameras:
+def _framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
     """Crop a camera's picture to the object, at the size that its panel has on the sheet."""
     low, high = bounding_box(camera, vertices, 0.05)
     width, height = (high - low).tolist()
@@ -188,7 +189,7 @@ def thumbnails(
     return sheet
 
 
-def border(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def border(mask: Mask) -> Mask:
     """Find pixels of the mask next to others; the picture's edge is no border."""
     beside = max_pool2d((~mask)[None].float(), kernel_size=3, stride=1, padding=1)[0] > 0
     return mask & beside

@@ -12,6 +12,7 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import unit_face_normals, vertex_normals
 from pimper_torch.ground.geometry.visibility import cast_view
+from pimper_torch.ground.shapes import Points, Scalars, Vectors
 from pimper_torch.records import Cameras, Mesh
 
 # Raking light from up on the left shows height field; a weaker one beside the viewer keeps the far
@@ -59,7 +60,7 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     return tone(radiance)
 
 
-def tone(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def tone(radiance: Scalars) -> Scalars:
     """Encode the radiance of matte surfaces for a display, in [0, 1].
 
     Well short of a display's curve: steeper tones show more of the shape.
@@ -67,7 +68,7 @@ def tone(radiance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return radiance.clamp(0, 1) ** (1 / 1.3)
 
 
-def lambertian(normals_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def lambertian(normals_cam: Vectors) -> Scalars:
     """Return the radiance of white matte surfaces under the lights of all pictures.
 
     Args:
@@ -95,9 +96,7 @@ def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: floa
     return camera.replace(cam_from_world=rotated_from_cam[None] @ camera.cam_from_world)
 
 
-def frame(
-    camera: Cameras, points_world: Float[Tensor, "point 3"], longer_side_px: int, margin: float
-) -> Cameras:
+def frame(camera: Cameras, points_world: Points, longer_side_px: int, margin: float) -> Cameras:
     """Crop and scale a camera's picture to the bounding box of some points.
 
     Args:
@@ -127,7 +126,7 @@ def crop(
 
 
 def bounding_box(
-    camera: Cameras, points_world: Float[Tensor, "point 3"], margin: float
+    camera: Cameras, points_world: Points, margin: float
 ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
     """Return the corners (top left, bottom right) of the pixels that some points cover."""
     pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])

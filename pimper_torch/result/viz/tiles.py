@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.ground.shapes import Mask, Scalars
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -87,9 +88,7 @@ def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: 
     return _picture(large.reduce(2))
 
 
-def with_color(
-    picture: Picture, where: Bool[Tensor, "height width"], color: tuple[float, float, float]
-) -> Picture:
+def with_color(picture: Picture, where: Mask, color: tuple[float, float, float]) -> Picture:
     """Colour some pixels of a picture."""
     painted = picture.copy()
     painted[where.cpu().numpy()] = color
@@ -101,7 +100,7 @@ def encoded(radiance: Float[Tensor, "height width channel"]) -> Picture:
     return array(srgb_from_linear(radiance.detach().clamp(0, 1)).expand(-1, -1, 3))
 
 
-def array(values: Float[Tensor, "*batch"]) -> Picture:
+def array(values: Scalars) -> Picture:
     """Return values as single precision on the CPU."""
     found: Picture = values.detach().cpu().float().numpy()
     return found

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Record
 
 
@@ -45,7 +46,7 @@ class Ambiguity(Record):
         return Ambiguity(matrix=eta @ self.matrix.mT @ eta / self.scale[..., None, None] ** 2)
 
     @property
-    def scale(self) -> Float[Tensor, "*batch"]:
+    def scale(self) -> Scalars:
         """The factor ``s`` on albedo."""
         return torch.linalg.det(self.matrix).abs() ** 0.25
 

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Mask, Scalars
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
@@ -39,9 +40,9 @@ class BasRelief(Record):
     tensor([ 0.5000,  0.0000, -1.0000])
     """
 
-    mu: Float[Tensor, "*batch"]
-    nu: Float[Tensor, "*batch"]
-    lam: Float[Tensor, "*batch"]
+    mu: Scalars
+    nu: Scalars
+    lam: Scalars
 
     @property
     def matrix(self) -> Float[Tensor, "*batch 3 3"]:
@@ -95,7 +96,7 @@ def convex(
     relief: BasRelief,
     shading: Float[Tensor, "3 pixel"],
     weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
+    mask: Mask,
 ) -> BasRelief:
     """Choose the convex one of a transformation and its mirror image, which fit equally well.
 
@@ -115,7 +116,7 @@ def relief_from_strength(
     lights: Float[Tensor, "view 3"],
     shading: Float[Tensor, "3 pixel"],
     weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
+    mask: Mask,
 ) -> BasRelief:
     """Find the bas-relief transformation that gives most point lights one strength; convex.
 

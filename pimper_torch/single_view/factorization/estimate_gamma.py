@@ -27,6 +27,7 @@ from pimper_torch.ground.linalg.robust import (
     with_slope,
 )
 from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
+from pimper_torch.ground.shapes import Mask
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.errors import InputError
@@ -238,9 +239,7 @@ def estimate_gamma(
         )
 
 
-def gamma_of_photographs(
-    views: Views, *, mask: Bool[Tensor, "height width"] | None = None, rank: int = 4
-) -> GammaEstimate:
+def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 4) -> GammaEstimate:
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Scalars
 from pimper_torch.method.photometry.bilinear import Bilinear, Factors
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
@@ -59,7 +60,7 @@ class Free:
 
     def split(
         self, shading: Float[Tensor, "*batch rank"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch rank"]]:
+    ) -> tuple[Scalars, Float[Tensor, "*batch rank"]]:
         """Return lengths and directions: albedo and normals with rank three."""
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Map
 from pimper_torch.paper.integrate import differences
 from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.runtime.progress import report
@@ -63,10 +64,7 @@ class Continuity(Record):
 
 
 def find_discontinuities(
-    steps: Steps,
-    weight: Float[Tensor, " step"],
-    anchor: Float[Tensor, "height width"] | None,
-    heights: Float[Tensor, "height width"] | None,
+    steps: Steps, weight: Float[Tensor, " step"], anchor: Map | None, heights: Map | None
 ) -> Continuity:
     """Find the continuous steps; constant to autograd.
 

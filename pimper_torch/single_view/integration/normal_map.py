@@ -6,11 +6,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.pixels import crop_intrinsics
+from pimper_torch.ground.shapes import Map, Mask, Matrix3
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
@@ -41,8 +42,8 @@ class IntegratedMap(Record):
         continuity: The continuous steps between pixels; ``None`` where all are.
     """
 
-    depth: Float[Tensor, "height width"]
-    valid: Bool[Tensor, "height width"]
+    depth: Map
+    valid: Mask
     continuity: Continuity | None = None
 
 
@@ -126,7 +127,7 @@ def integrate_normal_map(
     )
 
 
-def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> Float[Tensor, " step"]:
+def _weights(steps: Steps, weight: Map | None) -> Float[Tensor, " step"]:
     """Return the weights of squared differences of the unknown, zero outside the mask."""
     reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
     least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
@@ -134,10 +135,7 @@ def _weights(steps: Steps, weight: Float[Tensor, "height width"] | None) -> Floa
 
 
 def _known(
-    depth: Float[Tensor, "height width"] | None,
-    mask: Bool[Tensor, "height width"],
-    steps: Steps,
-    intrinsics: Float[Tensor, "3 3"] | None,
+    depth: Map | None, mask: Mask, steps: Steps, intrinsics: Matrix3 | None
 ) -> tuple[Tensor | None, Tensor | None]:
     """Return anchors and the unknowns there."""
     if depth is None:

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.ground.shapes import Mask, Matrix3, Scalars
 from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
@@ -53,8 +54,8 @@ class Steps(Record):
     reliable: Bool[Tensor, " step"]
     kink: Float[Tensor, " step"]
     twist: Float[Tensor, " step"]
-    inside: Bool[Tensor, "height width"]
-    valid: Bool[Tensor, "height width"]
+    inside: Mask
+    valid: Mask
 
     @property
     def unit(self) -> Float[Tensor, " step"]:
@@ -93,9 +94,7 @@ def at_both_ends(
 
 
 def orthographic_steps(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-    spacing: tuple[float, float] = (1.0, 1.0),
+    normals: Float[Tensor, "height width 3"], mask: Mask, spacing: tuple[float, float] = (1.0, 1.0)
 ) -> Steps:
     """Return the steps of depth under parallel rays, differentiable in the normals.
 
@@ -109,9 +108,7 @@ def orthographic_steps(
 
 
 def perspective_steps(
-    normals: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"],
+    normals: Float[Tensor, "height width 3"], mask: Mask, intrinsics: Matrix3
 ) -> Steps:
     r"""Return the steps of the logarithm of depth under rays through a pinhole.
 
@@ -134,9 +131,7 @@ def perspective_steps(
     return _steps(normals, rays, unit, mask, unit)
 
 
-def _between_planes(
-    first: Float[Tensor, "*batch"], second: Float[Tensor, "*batch"], unit: float
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+def _between_planes(first: Scalars, second: Scalars, unit: float) -> tuple[Scalars, Scalars]:
     """Return the step between tangent planes, and the rotation between them.
 
     Args:
@@ -156,7 +151,7 @@ def _steps(
     normals: Float[Tensor, "height width 3"],
     rays: Float[Tensor, "height width 3"],
     bend: tuple[float, float],
-    mask: Bool[Tensor, "height width"],
+    mask: Mask,
     unit: tuple[float, float],
 ) -> Steps:
     known = normals.isfinite().all(dim=-1)

@@ -16,12 +16,13 @@ Source: Yuille & Snow, Shape and albedo from multiple images using integrability
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.ground.shapes import Mask, Matrix3, Vectors
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
@@ -45,22 +46,16 @@ class Curls(Record):
     across: Float[Tensor, "equation 3"]
     down: Float[Tensor, "equation 3"]
     weight: Float[Tensor, " equation"]
-    noise: Float[Tensor, "3 3"]
+    noise: Matrix3
 
 
-def wedge(
-    one: Float[Tensor, "*batch 3"], other: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
+def wedge(one: Vectors, other: Vectors) -> Vectors:
     """Return the bivector of two vectors: ``u_i v_j - u_j v_i`` for i < j."""
     first, second = [0, 0, 1], [1, 2, 2]
     return one[..., first] * other[..., second] - one[..., second] * other[..., first]
 
 
-def curls(
-    pseudo: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
-) -> Curls:
+def curls(pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mask: Mask) -> Curls:
     """Assemble the equations of integrability over a raster.
 
     Pseudo-normals are whitened and normalized first, so that neither albedo nor its edges enter
@@ -114,10 +109,8 @@ def curls(
 
 
 def integrable(
-    pseudo: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
-) -> Float[Tensor, "3 3"]:
+    pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mask: Mask
+) -> Matrix3:
     """Find ``A`` that makes pseudo-normals the normals of a surface: shading is ``A s``.
 
     The six unknowns are the least generalised eigenvector of the equations' squares against

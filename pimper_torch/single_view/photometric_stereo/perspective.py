@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.ground.shapes import Mask, Matrix3
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
@@ -31,8 +32,8 @@ _DISTINCT = 1.5
 
 def factorize_in_perspective(
     images: Float[Tensor, "view channel height width"],
-    mask: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"],
+    mask: Mask,
+    intrinsics: Matrix3,
     seen: Bool[Tensor, "view pixel"] | None = None,
     *,
     radius: int = 3,
@@ -109,12 +110,12 @@ def integrability_equations(
 def _between(
     right: Float[Tensor, "3 pixel"],
     known: Bool[Tensor, " pixel"],
-    mask: Bool[Tensor, "height width"],
-    inside: Bool[Tensor, "height width"],
-    intrinsics: Float[Tensor, "3 3"],
+    mask: Mask,
+    inside: Mask,
+    intrinsics: Matrix3,
     rays: Float[Tensor, "height width 3"],
     radius: int,
-) -> Float[Tensor, "3 3"]:
+) -> Matrix3:
     """Find the matrix under which the vectors are normals times albedo, up to a factor."""
     moment = right @ right.mT / known.sum().clamp_min(1)
     values, axes = torch.linalg.eigh(moment)
@@ -171,7 +172,7 @@ def _cofactors(
     noise_covariance: Float[Tensor, "pixel 3 3"],
     by_u: Float[Tensor, "pixel 3"],
     by_v: Float[Tensor, "pixel 3"],
-) -> tuple[Float[Tensor, "3 3"], float]:
+) -> tuple[Matrix3, float]:
     """Find the cofactors of minimum residual relative to that of noise.
 
     Returns:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import Mask, Masks, Matrix3
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import bas_relief
@@ -52,8 +53,8 @@ class PhotometricStereo(Record):
     normals: Float[Tensor, "height width 3"]
     albedo: Float[Tensor, "height width channel"]
     lights: Float[Tensor, "view 3"]
-    lit: Bool[Tensor, "view height width"]
-    valid: Bool[Tensor, "height width"]
+    lit: Masks
+    valid: Mask
     applied: bas_relief.BasRelief | None = None
     free: str = "nothing"
 
@@ -65,7 +66,7 @@ def photometric_stereo(
     method: str,
     resolve: str | None = None,
     lights: Float[Tensor, "light 3"] | None = None,
-    intrinsics: Float[Tensor, "3 3"] | None = None,
+    intrinsics: Matrix3 | None = None,
     weight: Float[Tensor, "..."] | None = None,
     robust: bool = True,
 ) -> PhotometricStereo:
@@ -148,7 +149,7 @@ _FACTOR = "a factor between albedo and light"
 def _integrable(
     radiance: Float[Tensor, "view channel pixel"],
     weight: Float[Tensor, "view pixel"],
-    mask: Bool[Tensor, "height width"],
+    mask: Mask,
     resolve: str,
     robust: bool,
 ) -> tuple[Factored, bas_relief.BasRelief]:
@@ -190,7 +191,7 @@ def _lambertian(radiance: Float[Tensor, "view channel pixel"], factors: Factored
 def _spread_out(
     found: StereoSolution,
     given: Float[Tensor, "view pixel"],
-    mask: Bool[Tensor, "height width"],
+    mask: Mask,
     used: Bool[Tensor, " view"],
     like: Tensor,
 ) -> PhotometricStereo:
