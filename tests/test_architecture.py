@@ -22,23 +22,13 @@ ROOT = Path(__file__).parents[1]
 # (the command line names its verbs there, and imports one when it is called). viz stands above io,
 # which draws the contact sheet of a result with it.
 ROOMS = [
-    *("journal", "errors", "mapped", "config", "progress", "cores", "file_names", "numpy_files"),
-    *("shapes", "kernels", "radiometry", "records", "ledger", "failures", "parallel", "stage"),
-    *("store", "geometry", "memory", "linalg", "camera_files", "sfm", "silhouettes", "coarse"),
-    *(
-        "patches",
-        "photometry",
-        "sweep",
-        "fusion",
-        "paper",
-        "meshing",
-        "size",
-        "reporting",
-        "priors",
-        "viz",
-    ),
-    *("asset", "relighting", "chains", "stages", "report", "outputs", "io", "exchange"),
-    *("prior_files", "viewer", "doctor", "video", "cli", "batches", "single_view", "__main__"),
+    *("journal", "errors", "mapped", "config", "progress", "cores", "file_names"),
+    *("numpy_files", "shapes", "kernels", "radiometry", "records", "ledger", "failures"),
+    *("parallel", "stage", "store", "geometry", "memory", "linalg", "camera_files", "sfm"),
+    *("silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "paper", "meshing"),
+    *("size", "reporting", "priors", "viz", "asset", "relighting", "chains", "stages"),
+    *("report", "outputs", "io", "exchange", "prior_files", "viewer", "doctor", "video", "cli"),
+    *("batches", "single_view", "__main__"),
 ]
 
 FLOORS = {"runtime", "ground", "method", "priors", "result", "doors", "cli"}

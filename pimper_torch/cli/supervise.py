@@ -1,7 +1,8 @@
 """The console's ``pimper``: a light process that watches the one that does the work.
 
 What kills the work, as a system without memory does, leaves the watcher, which says so; it passes
-on signals. Where processes cannot be forked, as on Windows, there is one process alone.
+on signals, and a second Ctrl-C ends the work at once. Where processes cannot be forked, as on
+Windows, there is one process alone.
 """
 
 import ctypes
@@ -16,11 +17,11 @@ from contextlib import suppress
 
 from pimper_torch.cli.stopping import SIGNALS
 
-_REMEDY = (
+_SHRINK = (
     "Shrink the photographs (`--max-size-px`), close other programs, or give `--max-memory` to be "
-    "told before the surface takes too much. No result was written; the same command goes on from "
-    "what stages finished."
+    "told before the surface takes too much."
 )
+_GOES_ON = "No result was written; the same command goes on from what stages finished."
 
 
 def main() -> int:
@@ -35,10 +36,15 @@ def main() -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watcher, worker = os.getpid(), os.fork()
 
+    presses: list[float] = []
+
     def heard(number: int, frame: types.FrameType | None) -> None:
         if worker != 0:  # which `stoppable` stops; behind it, its end is near
+            presses.append(time.monotonic())
+            # The first press of Ctrl-C may reach both processes; nobody presses again so fast.
+            again = presses[-1] - presses[0] > 0.2
             with suppress(ProcessLookupError):  # it has just ended
-                os.kill(worker, number)
+                os.kill(worker, signal.SIGKILL if again else number)
 
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
@@ -59,9 +65,12 @@ def main() -> int:
     from pimper_torch.cli.deaths import what_killed
     from pimper_torch.cli.output import Output
 
-    Output(as_json="--json" in sys.argv).error(
-        "Killed", f"{what_killed(ended)} {_REMEDY}", 128 - ended
-    )
+    output = Output(as_json="--json" in sys.argv)
+    if presses:
+        ended = -signal.SIGINT
+        output.error("Interrupted", f"ended at once. {_GOES_ON}", 128 - ended)
+    else:
+        output.error("Killed", f"{what_killed(ended)} {_SHRINK} {_GOES_ON}", 128 - ended)
     return 128 - ended
 
 

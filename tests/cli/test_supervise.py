@@ -119,6 +119,16 @@ def test_a_signal_is_one_message(tmp_path, number, group, importing):
     assert (last["event"], last["exit_code"]) == ("error", 128 + number)
 
 
+def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path):
+    ran = Ran(tmp_path, at_run(f"while True:\n try:\n  {WAITS}\n except BaseException: pass"))
+    os.killpg(ran.process.pid, signal.SIGINT)
+    time.sleep(0.5)
+    os.killpg(ran.process.pid, signal.SIGINT)
+    returned, _, err = ran.end()
+    assert returned == 130
+    assert "ended at once" in err
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")
 def test_the_worker_dies_with_the_watcher(tmp_path):
     ran = Ran(tmp_path, at_run(WAITS))
