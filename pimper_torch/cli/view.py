@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Turn a result in a browser, until Ctrl-C.
+    """Turn and light a result in a browser, until Ctrl-C.
 
     Attributes:
         out: Folder that `pimper reconstruct` wrote, or a mesh file; needs pip install

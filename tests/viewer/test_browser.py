@@ -52,7 +52,6 @@ def test_the_object_is_there_and_a_click_on_a_frustum_stands_there(viewer, page,
     page.on("pageerror", lambda error: errors.append(error.message))
     page.on("console", lambda told: errors.append(told.text) if told.type == "error" else None)
     add_found(viewer, reconstruction)
-    viewer.choose("none")
     page.goto(viewer.address)
     until(page, lambda picture: (picture < 0.99).sum() > LARGE)
     (client,) = viewer.server.get_clients().values()

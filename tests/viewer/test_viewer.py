@@ -1,5 +1,7 @@
 import math
 import socket
+from contextlib import nullcontext
+from types import SimpleNamespace
 from urllib.request import urlopen
 
 import numpy as np
@@ -7,10 +9,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
+from pimper_torch.result.viewer import layers
 from pimper_torch.result.viewer import server as server_module
+from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
 from pimper_torch.result.viewer.server import open_server, require_viser
 from pimper_torch.result.viewer.show import add_found, show
 from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, Viewer
@@ -50,7 +56,16 @@ def test_scene_holds_cameras_photographs_points_and_surface(page, reconstruction
     assert frustum.fov == pytest.approx(2 * math.atan(20 / 90))
 
 
-def test_frusta_and_pages_stand_where_the_cameras_do(page, reconstruction):
+@pytest.fixture
+def camera(page, monkeypatch):
+    """The camera of an open page."""
+    camera = SimpleNamespace(up_direction=None)
+    client = SimpleNamespace(camera=camera, atomic=nullcontext)
+    monkeypatch.setattr(page.server, "get_clients", lambda: {0: client})
+    return camera
+
+
+def test_frusta_and_pages_stand_where_the_cameras_do(page, camera, reconstruction):
     from viser.transforms import SO3
 
     frame = page._viewer_from_world
@@ -63,14 +78,13 @@ def test_frusta_and_pages_stand_where_the_cameras_do(page, reconstruction):
         np.testing.assert_allclose(frustum.position, placed[view], atol=1e-12)
         forward = torch.nn.functional.normalize(ahead[view] - placed[view], dim=0)
         np.testing.assert_allclose(SO3(frustum.wxyz).as_matrix()[:, 2], forward, atol=1e-6)
-        if name == page._chosen.value:
-            camera = page.server.initial_camera
-            np.testing.assert_allclose(camera.position, placed[view], atol=1e-6)
-            gaze = torch.as_tensor(camera.look_at).double() - placed[view]
-            assert_close(gaze / gaze.norm(), forward, rtol=0, atol=1e-6)
-            assert camera.up[2] > 0
-            right = SO3(frustum.wxyz).as_matrix()[:, 0]
-            assert abs(float(np.dot(camera.up, right))) < 1e-6  # right in its picture is right
+        page.choose(name)
+        np.testing.assert_allclose(camera.position, placed[view], atol=1e-6)
+        gaze = torch.as_tensor(camera.look_at).double() - placed[view]
+        assert_close(gaze / gaze.norm(), forward, rtol=0, atol=1e-6)
+        assert camera.up_direction[2] > 0
+        right = SO3(frustum.wxyz).as_matrix()[:, 0]
+        assert abs(float(np.dot(camera.up_direction, right))) < 1e-6  # right in its picture
 
 
 def test_the_last_surface_is_shown_and_those_before_are_kept(viewer, reconstruction):
@@ -83,12 +97,78 @@ def test_the_last_surface_is_shown_and_those_before_are_kept(viewer, reconstruct
     assert viewer._about.content == f"**result**, {len(reconstruction.mesh.faces):,} faces."
 
 
-def test_choosing_a_photograph_hides_its_frustum(page, reconstruction):
-    names = reconstruction.scene.views.names
-    page.choose(names[0])
-    assert [node(page, f"/cameras/{view:05d}").visible for view in range(3)] == [0, 1, 1]
+def test_a_photograph_hides_the_frusta_and_none_shows_the_whole_surface(
+    page, camera, reconstruction
+):
+    page.choose(reconstruction.scene.views.names[0])
+    assert not node(page, "/cameras").visible
     page.choose(NO_PHOTOGRAPH)
-    assert all(node(page, f"/cameras/{view:05d}").visible for view in range(3))
+    assert node(page, "/cameras").visible
+    vertices = transform(page._viewer_from_world, reconstruction.mesh.vertices_world.double())
+    rays, eye = vertices - torch.as_tensor(camera.position), torch.as_tensor(camera.position)
+    angles = torch.cosine_similarity(rays, -eye.double(), dim=1).acos()
+    # The farthest vertex may be nearer to the eye than the middle, or farther away.
+    assert camera.fov / 4 < float(angles.max()) <= camera.fov / 2 + 1e-6
+    np.testing.assert_array_equal(page.server.initial_camera.position, camera.position)
+
+
+@pytest.fixture
+def ball():
+    """A sphere that carries all that a result does."""
+    vertices, faces = icosphere(2)
+    vertices = vertices.float()
+    known = (vertices[:, 2] + 1) / 2
+    return Mesh(
+        vertices_world=vertices,
+        faces=faces,
+        normals_world=-vertices,
+        albedo=0.5 + 0.4 * vertices,
+        confidence=known,
+        expected_error=known,
+    )
+
+
+def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
+    viewer.add_pass("ball", ball)
+    names = ("lit", "shape", "albedo", "normals", "expected error", "support")
+    assert viewer._layer.options == names
+    drawn, ranges = set(), []
+    for name in names:
+        viewer._layer.value = name
+        drawn.add(node(viewer, "/surfaces/0: ball").glb_data)
+        if viewer._bar.visible:
+            ranges.append(viewer._about.content.rpartition(", ")[2])
+    assert len(drawn) == len(names)
+    # All but a fiftieth of the vertices are within the range.
+    assert ranges == ["from 0 to 0.976 units or more.", "from none to full."]
+    viewer.add_pass("bare", Mesh(vertices_world=ball.vertices_world, faces=ball.faces))
+    assert viewer._layer.options == ("lit", "shape", "normals")
+    assert viewer._layer.value == "lit"
+    assert not viewer._bar.visible
+
+
+def test_what_layers_show(ball, monkeypatch):
+    """The ball's world is the viewer's frame; its normals point inward."""
+    monkeypatch.setattr(layers, "gltf_of", lambda *given: given)
+    shown = {name: layers.painted(ball, name, torch.eye(4).double())[0] for name in layers.LAYERS}
+    assert ["extensions" in material for _, _, material in shown.values()] == [0, 0, 1, 1]
+    outward = ball.vertices_world.numpy()
+    for name, sign in [("lit", -1), ("shape", 1)]:  # clay is shaded by its own normals
+        assert ((shown[name][0]["NORMAL"] * sign * outward).sum(axis=1) > 0.99).all()
+    colors = {name: attributes["COLOR_0"] for name, (attributes, _, _) in shown.items()}
+    np.testing.assert_array_equal(colors["lit"], colors["albedo"])
+    assert (colors["shape"] == 0.5).all()
+    # From the reference camera, which stands at x, y is to the right, red, and z is up, green.
+    encoded = torch.tensor(0.5 - 0.5 * outward[:, [1, 2, 0]])
+    np.testing.assert_allclose(colors["normals"], linear_from_srgb(encoded), atol=1e-6)
+    error = layers.painted(ball, "expected error", torch.eye(4).double())[0][0]["COLOR_0"]
+    assert (np.diff(error.sum(axis=1)[outward[:, 2].argsort()]) > -1e-6).all()
+
+
+def test_the_light_is_where_the_sliders_are(viewer):
+    for azimuth, elevation, direction in [(90.0, 0.0, (0, 1, 0)), (90.0, 90.0, (0, 0, 1))]:
+        viewer._azimuth.value, viewer._elevation.value = azimuth, elevation
+        np.testing.assert_allclose(node(viewer, "/light").position, direction, atol=1e-9)
 
 
 def test_a_cloud_is_no_surface(viewer, reconstruction):
@@ -110,15 +190,16 @@ def test_show_takes_what_chains_and_folders_return(reconstruction):
         reference=scene.views.names[1],
         summary={},
     )
+    towards = frame_of_cameras(scene.cameras, 1)
     shown = [
-        (reconstruction, RESULT, scene.views.names[reconstruction.coarse.reference]),
-        (read, "/surfaces/0: result", scene.views.names[1]),
-        (reconstruction.mesh, "/surfaces/0: surface", NO_PHOTOGRAPH),
+        (reconstruction, RESULT, towards),
+        (read, "/surfaces/0: result", towards),
+        (reconstruction.mesh, "/surfaces/0: surface", frame_of_mesh(reconstruction.mesh)),
     ]
-    for result, surface, photograph in shown:
+    for result, surface, frame in shown:
         with show(result, port=0) as viewer:
             assert node(viewer, surface).visible
-            assert viewer._chosen.value == photograph
+            assert_close(viewer._viewer_from_world, frame)
 
 
 def test_show_closes_what_it_cannot_fill(tmp_path, monkeypatch):

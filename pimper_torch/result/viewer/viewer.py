@@ -1,6 +1,7 @@
 """The page: what is in the scene, and the controls beside it."""
 
 import math
+import threading
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from io import StringIO
@@ -12,16 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.ground.geometry.pinholes import look_at
+from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, Mesh, Views
-from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.report.predictions import shrunk
 from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
+from pimper_torch.result.viewer.layers import LAYERS, VIRIDIS, layers_of, painted
 from pimper_torch.result.viewer.server import HOST, PORT, open_server
-from pimper_torch.result.viz.maps import base_color
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import each
 
@@ -30,10 +30,7 @@ NO_PHOTOGRAPH = "none"
 # them on a ring stand 0.8 apart.
 _SCALE = 0.15
 _POINT_COLOR = (110, 140, 190)
-# Towards a raking light up on the left of the reference camera, and the share of light that comes
-# from everywhere.
-_TO_LIGHT = (0.54, -0.54, 0.64)
-_AMBIENT = 0.15
+_AMBIENT = 0.15  # the share of light that comes from everywhere
 # Of light that falls straight on: three.js divides by pi what a matte surface reflects.
 _BRIGHTNESS = math.pi
 
@@ -48,22 +45,35 @@ class Viewer:
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
         self.server = open_server(host, port)
         self._viewer_from_world: Float[Tensor, "4 4"] | None = None
+        self._lock = threading.RLock()  # a page's thread repaints what a run adds
         self._surfaces: list[str] = []
+        self._newest: tuple[str, Mesh] | None = None
         self._cameras: dict[str, tuple[Float[Tensor, "4 4"], float]] = {}
+        self._see_whole(1.0)
         scene, gui = self.server.scene, self.server.gui
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
         direct = _BRIGHTNESS * (1 - _AMBIENT)
-        scene.add_light_directional("/light", intensity=direct, position=_TO_LIGHT)
+        self._light = scene.add_light_directional("/light", intensity=direct)
+        self._frusta = scene.add_frame("/cameras", show_axes=False)
         scene.add_light_ambient("/ambient", intensity=_BRIGHTNESS * _AMBIENT)
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
+        self._layer = gui.add_dropdown("layer", LAYERS)
         self._about = gui.add_markdown("No surface yet.")
+        self._bar = gui.add_image(VIRIDIS.expand(12, -1, -1).numpy(), visible=False)
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
         # Without a client it is `choose` itself that sets it.
         self._chosen.on_update(
             lambda event: self.choose(self._chosen.value) if event.client else None
         )
+        with gui.add_folder("light"):  # at first raking, from up on the reference camera's left
+            self._azimuth = gui.add_slider("azimuth", -180.0, 180.0, 1.0, -45.0)
+            self._elevation = gui.add_slider("elevation", -90.0, 90.0, 1.0, 40.0)
+        self._layer.on_update(lambda _: self._paint())
+        for slider in (self._azimuth, self._elevation):
+            slider.on_update(lambda _: self._turn_light())
+        self._turn_light()
 
     def __enter__(self) -> "Viewer":
         return self
@@ -109,8 +119,7 @@ class Viewer:
         frame = self._viewer_from_world = frame_of_cameras(cameras, reference)
         points = transform(frame, points_world.detach().cpu().double()).float().numpy()
         scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
-        scene.add_frame("/cameras", show_axes=False)
-        pictures = [None] * len(names) if views is None else small_pictures(views)
+        pictures = None if views is None else small_pictures(views)
         poses = frame @ invert_rigid(cameras.cam_from_world.detach().cpu().double())
         for view, (name, pose) in enumerate(zip(names, poses, strict=True)):
             width, height = cameras.sizes_px[view].tolist()
@@ -124,14 +133,12 @@ class Viewer:
                 scale=_SCALE,
                 thickness=1.5,
                 thickness_units="screen",
-                image=pictures[view],
+                image=None if pictures is None else pictures[view],
                 wxyz=SO3.from_matrix(pose[:3, :3].numpy()).wxyz,
                 position=pose[:3, 3].numpy(),
             )
             frustum.on_click(lambda _, name=name: self.choose(name))
         self._chosen.options = (NO_PHOTOGRAPH, *names)
-        _put(self.server.initial_camera, *self._cameras[names[reference]])
-        self.choose(names[reference])
 
     def add_pass(self, name: str, mesh: Mesh) -> None:
         """Show a surface in place of those before, which the page's list of the scene brings back.
@@ -144,43 +151,59 @@ class Viewer:
                 f"the {name} has {len(mesh.vertices_world)} vertices and no faces; needed: a "
                 "surface, as a viewer of point clouds shows clouds."
             )
-        mesh, scene = mesh.detach().to("cpu"), self.server.scene
-        if self._viewer_from_world is None:
-            self._viewer_from_world = frame_of_mesh(mesh)
-        normals = mesh.normals_world
-        if normals is None:
-            normals = vertex_normals(mesh.vertices_world, mesh.faces)
-        attributes = {
-            "POSITION": transform(self._viewer_from_world, mesh.vertices_world.double()),
-            "NORMAL": normalize(rotate(self._viewer_from_world, normals.double()), dim=1),
-            "COLOR_0": base_color(mesh).expand(-1, 3).float(),
-        }
-        arrays = {key: values.numpy() for key, values in attributes.items()}
-        for before in ("/points", *self._surfaces):  # points lie on the surface
-            if node := scene.get_handle_by_name(before):
-                node.visible = False
-        self._surfaces.append(f"/surfaces/{len(self._surfaces)}: {name}")
-        scene.add_glb(self._surfaces[-1], gltf_of(arrays, mesh.faces.numpy(), MATTE))
-        self._about.content = f"**{name}**, {len(mesh.faces):,} faces."
+        mesh = mesh.detach().to("cpu")
+        with self._lock:
+            if self._viewer_from_world is None:
+                self._viewer_from_world = frame_of_mesh(mesh)
+            for before in ("/points", *self._surfaces):  # points lie on the surface
+                if node := self.server.scene.get_handle_by_name(before):
+                    node.visible = False
+            self._surfaces.append(f"/surfaces/{len(self._surfaces)}: {name}")
+            self._newest = name, mesh
+            vertices = transform(self._viewer_from_world, mesh.vertices_world.double())
+            self._see_whole(float(vertices.norm(dim=1).max()))
+            self._layer.options = layers_of(mesh)
+            self._paint()
 
     def choose(self, name: str) -> None:
-        """Stand, on every open page, where a photograph was taken.
-
-        Its own frustum is hidden meanwhile, as it is before the object.
+        """Stand, on every open page, where a photograph was taken, without frusta before the eye.
 
         Args:
-            name: Of the photograph; :data:`NO_PHOTOGRAPH` shows all frusta and moves no page.
+            name: Of the photograph; :data:`NO_PHOTOGRAPH` looks at the whole, with all frusta.
         """
         self._chosen.value = name
-        for view, other in enumerate(self._cameras):
-            self.server.scene.get_handle_by_name(f"/cameras/{view:05d}").visible = other != name
-        for client in self.server.get_clients().values() if name in self._cameras else ():
+        self._frusta.visible = name == NO_PHOTOGRAPH
+        for client in self.server.get_clients().values():
             with client.atomic():
                 _put(client.camera, *self._cameras[name])
 
+    def _paint(self) -> None:
+        """Show the newest surface in the chosen layer."""
+        with self._lock:
+            if self._newest is None or self._viewer_from_world is None:
+                return
+            name, mesh = self._newest
+            glb, legend = painted(mesh, self._layer.value, self._viewer_from_world)
+            self.server.scene.add_glb(self._surfaces[-1], glb)
+            self._about.content = f"**{name}**, {len(mesh.faces):,} faces. {legend}".rstrip()
+            self._bar.visible = bool(legend)
+
+    def _turn_light(self) -> None:
+        """Let the light come from where the sliders are; it shines on the origin."""
+        azimuth, elevation = np.radians((self._azimuth.value, self._elevation.value))
+        x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+        self._light.position = x, y, np.sin(elevation)
+
+    def _see_whole(self, radius: float) -> None:
+        """Let pages without a photograph look down at all within a radius of the middle."""
+        fov, up = math.radians(50), torch.tensor([0.0, 0.0, 1.0])
+        eye = radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
+        whole = self._cameras[NO_PHOTOGRAPH] = invert_rigid(look_at(eye, 0 * up, up))[0], fov
+        _put(self.server.initial_camera, *whole)
+
 
 def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: ANN401 - viser's
-    """Put the camera of a page, or of new pages, where a photograph was taken.
+    """Put the camera of a page, or of new pages, at a pose, ``viewer_from_cam``.
 
     It turns about a point as far away as the middle of the scene. Up stays that of the viewer, but
     for the roll of the picture.
