@@ -57,7 +57,7 @@ class Forecast:
         if passed:
             share = self._done
             left[0] = (1 - share) * max(left[0], passed) if share else max(0.0, left[0] - passed)
-        return sum(left)
+        return sum(left, 0.0)
 
     def _factor(self, name: str, taken: Sequence[tuple[str, float, float]]) -> float:
         """Return real over planned seconds: of the pass before, or of all stages."""
