@@ -115,10 +115,11 @@ def _refuse_video(entries: Sequence[Path]) -> None:
             )
 
 
-def tell_passed_over(folder: Path, read: Sequence[Path]) -> None:
+def tell_passed_over(folder: Path | str, read: Sequence[Path | str]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
-    names = {path.relative_to(folder).parts[0] for path in read}
-    raw = {path.stem.casefold() for path in read if extra_of(path) == "raw"}
+    folder, paths = Path(folder), [Path(path) for path in read]
+    names = {path.relative_to(folder).parts[0] for path in paths}
+    raw = {path.stem.casefold() for path in paths if extra_of(path) == "raw"}
     twins: list[str] = []
     kinds: dict[Path, str] = {}
     for path in sorted(_visible(folder)):

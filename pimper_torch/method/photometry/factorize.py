@@ -125,6 +125,7 @@ class Factorize(Stage):
     ) -> None:
         super().__init__()
         self.config = config = config or FactorizeConfig()
+        require(config.loss in LOSSES, "factorize.loss", config.loss, " or ".join(LOSSES))
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
             priors = [*own, Guesses()]

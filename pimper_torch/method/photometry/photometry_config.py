@@ -7,7 +7,6 @@ from pimper_torch.runtime.config import Range, require, require_ranges
 
 _Model = Literal["auto", "soft", "point_light", "room"]
 _Solver = Literal["variable-projection", "balm"]
-_Loss = Literal["squares", "cauchy", "huber", "geman-mcclure"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +54,8 @@ class FactorizeConfig:
         geometry_weight: Weight of the prior of normals, whose mean is the coarse ones, in units
             of one view.
         loss: ``"cauchy"``, by which highlights and shadows lose weight; ``"geman-mcclure"``, by
-            which they lose it faster; ``"huber"``, more slowly; or ``"squares"``.
+            which they lose it faster; ``"huber"``, more slowly; ``"squares"``; or another name in
+            :data:`~pimper_torch.method.photometry.factorize.LOSSES`.
         loss_scale: Of the loss, in standard deviations of the patch's residuals; 0 for that at
             which it is 95 % efficient on Gaussian noise.
         min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
@@ -70,7 +70,7 @@ class FactorizeConfig:
     solver: _Solver = "variable-projection"
     light_prior: Annotated[float, Range(least=0, most=1e12)] = 1.0
     geometry_weight: Annotated[float, Range(least=0, most=1e12)] = 0.1
-    loss: _Loss = "cauchy"
+    loss: str = "cauchy"
     loss_scale: Annotated[float, Range(least=0, most=1e12)] = 0.0
     min_views: Annotated[int, Range(least=3, most=100_000)] = 4
     min_light_variation: Annotated[float, Range(least=0, below=1)] = 0.02
@@ -79,6 +79,5 @@ class FactorizeConfig:
 
     def __post_init__(self) -> None:
         require_ranges(self, "factorize")
-        solvers, losses = get_args(_Solver), get_args(_Loss)
+        solvers = get_args(_Solver)
         require(self.solver in solvers, "factorize.solver", self.solver, " or ".join(solvers))
-        require(self.loss in losses, "factorize.loss", self.loss, " or ".join(losses))
