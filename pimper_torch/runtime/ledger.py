@@ -66,8 +66,7 @@ GUARDS: dict[str, tuple[What, str]] = {
     "remesh.data": ("facets", "no data"),
     "extract.support": ("faces", "no photograph supports them"),
     "extract.expected_error": ("faces", "expected to be far off"),
-    "extract.spikes": ("faces", "long edges"),
-    "extract.overturned": ("faces", "turned from their facet"),
+    "extract.spikes": ("faces", "long edges, or turned over by a fold"),
     "extract.borders": ("faces", "stick out of borders"),
     "extract.pieces": ("faces", "small components"),
 }

@@ -116,12 +116,6 @@ def test_a_strip_that_is_twisted_once_has_no_inside():
         closed(Mesh(vertices_world=torch.rand(2 * count, 3), faces=faces))
 
 
-def test_a_border_runs_against_the_faces_on_it():
-    (cycle,) = border_cycles(torch.tensor([[0, 1, 2], [0, 2, 3]]))
-    start = cycle.index(0)
-    assert cycle[start:] + cycle[:start] == [0, 3, 2, 1]
-
-
 def test_caps_follow_their_border_to_autograd():
     mesh = ball(above=0.5, level=2)
     vertices = mesh.vertices_world.clone().requires_grad_()

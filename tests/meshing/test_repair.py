@@ -14,13 +14,11 @@ from pimper_torch.ground.geometry.topology import (
     face_edges,
     vertex_components,
 )
+from pimper_torch.method.meshing import repair as repairing
 from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.faults import faults
-from pimper_torch.method.meshing.meshing_config import ExtractConfig, RepairConfig
 from pimper_torch.method.meshing.repair import Repair, least_bent, repair, surroundings
 from pimper_torch.records import Mesh
-
-OLD = ExtractConfig(overturned="all")
 
 
 def supported(vertices, faces, facet=None):
@@ -59,7 +57,7 @@ def volume(mesh):
 
 def test_a_folded_sphere_was_slit_and_comes_out_closed():
     sphere, surface = folded_sphere()
-    slit = closedness(Extract(OLD)(surface))
+    slit = closedness(Extract()(surface))
     assert len(slit.loops) >= 3
     mesh = Extract()(Repair()(surface))
     found = closedness(mesh)
@@ -92,7 +90,7 @@ def test_only_repaired_vertices_change_and_their_confidence_is_zero():
 def test_without_repair_exactly_the_overturned_faces_go():
     _, surface = folded_sphere()
     gone = overturned(surface, surface.facet)
-    mesh = Extract(OLD)(surface)
+    mesh = Extract()(surface)
     assert gone.sum() > 6
     assert_close(
         mesh.vertices_world[mesh.faces],
@@ -149,12 +147,12 @@ def test_a_fold_at_the_border_goes_as_before():
     assert_close(mesh.vertices_world[mesh.faces], cut.vertices_world[cut.faces[~gone]])
 
 
-def test_a_fold_that_extends_too_far_is_left():
+def test_a_fold_that_extends_too_far_is_left(monkeypatch):
+    monkeypatch.setattr(repairing, "_MAX_EXTENT", 0.01)
     _, surface = folded_sphere()
-    left = Repair(RepairConfig(max_extent=0.01))(surface)
+    left = Repair()(surface)
     assert torch.equal(left.vertices_world, surface.vertices_world)
     assert torch.equal(left.confidence, surface.confidence)
-    assert Repair(RepairConfig(max_extent=0.0))(surface) is surface
 
 
 def test_a_spike_is_drawn_in():
@@ -164,7 +162,7 @@ def test_a_spike_is_drawn_in():
     mesh = Extract()(Repair()(supported(spiked, faces)))
     assert closedness(mesh).closed
     assert_close(mesh.vertices_world[100].norm(), torch.ones(()).double(), rtol=0, atol=0.01)
-    assert not closedness(Extract(OLD)(supported(spiked, faces))).closed
+    assert not closedness(Extract()(supported(spiked, faces))).closed
 
 
 def test_a_facet_that_bends_far_has_no_fold():

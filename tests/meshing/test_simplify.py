@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.meshing.simplify import Bounds, simplify
+from pimper_torch.method.meshing.simplify import simplify
 from pimper_torch.records import Mesh
 from tests.threads import on_threads
 
@@ -55,8 +55,7 @@ def test_every_former_vertex_stays_within_the_bounds():
     mesh = square(60, waves)
     mesh = mesh.replace(vertices_world=mesh.vertices_world + torch.tensor([3.0, -4.0, 5.0]))
     values = 10 * mesh.albedo
-    bounds = Bounds(spacings=0.1, angle_deg=3.0)
-    found = simplify(mesh, bounds, values)
+    found = simplify(mesh, values, spacings=0.1, angle_deg=3.0)
     assert len(found.kept) < 0.5 * len(mesh.vertices_world)
     assert len(found.kept) + int((found.face >= 0).sum()) == len(mesh.vertices_world)
     distance, angle, off = deviations(mesh, found, values)
@@ -71,18 +70,14 @@ def test_every_former_vertex_stays_within_the_bounds():
 
 
 @pytest.mark.parametrize(
-    ("bounds", "channel"),
-    [
-        (Bounds(spacings=0.001, angle_deg=180.0), None),
-        (Bounds(spacings=100.0, angle_deg=0.05), None),
-        (Bounds(spacings=100.0, angle_deg=180.0), 1e3),
-    ],
+    ("spacings", "angle_deg", "channel"),
+    [(0.001, 180.0, None), (100.0, 0.05, None), (100.0, 180.0, 1e3)],
 )
-def test_each_bound_alone_keeps_vertices(bounds, channel):
+def test_each_bound_alone_keeps_vertices(spacings, angle_deg, channel):
     mesh = square(40, waves)
     values = None if channel is None else channel * mesh.albedo
-    loose = simplify(mesh, Bounds(spacings=100.0, angle_deg=180.0))
-    found = simplify(mesh, bounds, values)
+    loose = simplify(mesh, spacings=100.0, angle_deg=180.0)
+    found = simplify(mesh, values, spacings=spacings, angle_deg=angle_deg)
     assert len(found.kept) > 0.9 * len(mesh.vertices_world) > 5 * len(loose.kept)
 
 
@@ -144,7 +139,7 @@ def test_meshes_that_nothing_can_be_taken_from_come_back():
     crowded = torch.cat([tetrahedron[:1], tetrahedron[:1], tetrahedron[:1]])  # no manifold
     for faces in (tetrahedron, crowded):
         mesh = Mesh(vertices_world=corners, faces=faces)
-        found = simplify(mesh, Bounds(spacings=100.0, angle_deg=180.0))
+        found = simplify(mesh, spacings=100.0, angle_deg=180.0)
         assert torch.equal(found.mesh.faces, faces)
     cloud = Mesh(vertices_world=corners, faces=torch.zeros(0, 3, dtype=torch.long))
     assert simplify(cloud).mesh is cloud

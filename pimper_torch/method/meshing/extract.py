@@ -26,10 +26,10 @@ _UNSURE = 5.0
 class Extract(Stage):
     """Extract the mesh that the photographs support, a manifold.
 
-    Faces without support are dropped, and so are spikes and overturned faces, and what sticks out
-    of borders (:mod:`~pimper_torch.method.meshing.borders`) and is not determined. Of the remaining
-    ones the large components stay, and where two fans of faces met in a vertex only, each gets its
-    own copy. Orientation is the coarse mesh's: counter-clockwise from outside.
+    Faces without support are dropped, and so are spikes, faces that a fold turns over, and what
+    sticks out of borders (:mod:`~pimper_torch.method.meshing.borders`) and is not determined. Of
+    the remaining ones the large components stay, and where two fans of faces met in a vertex only,
+    each gets its own copy. Orientation is the coarse mesh's: counter-clockwise from outside.
 
     Differentiable: faces are chosen without gradient, and vertices, normals, albedo and
     confidence of those keep theirs.
@@ -59,10 +59,10 @@ class Extract(Stage):
             leave_out("extract.expected_error", keep & ~near, at=(vertices, surface.faces))
             keep &= near
         with_support = int(keep.sum())
-        long, over = self._long_and_overturned(surface)
-        leave_out("extract.spikes", keep & long, at=(vertices, surface.faces))
-        leave_out("extract.overturned", keep & over & ~long, at=(vertices, surface.faces))
-        faces = surface.faces[keep & ~long & ~over]
+        defects = faults(vertices, surface.faces, surface.facet, self.config.max_stretch)
+        spikes = defects.stretched(vertices) | defects.folded_over(vertices)
+        leave_out("extract.spikes", keep & spikes, at=(vertices, surface.faces))
+        faces = surface.faces[keep & ~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -89,15 +89,6 @@ class Extract(Stage):
             confidence=surface.confidence[source],
             expected_error=None if error is None else error[source],
         )
-
-    def _long_and_overturned(self, surface: Surface) -> tuple[FaceMask, FaceMask]:
-        vertices = surface.vertices_world.detach()
-        found = faults(vertices, surface.faces, surface.facet, self.config.max_stretch)
-        long = found.stretched(vertices)
-        if self.config.overturned == "none":
-            return long, torch.zeros_like(long)
-        folded = self.config.overturned == "folded"
-        return long, found.folded_over(vertices) if folded else found.overturned(vertices)
 
 
 def facet_side(surface: Surface) -> float:

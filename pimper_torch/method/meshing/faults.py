@@ -12,7 +12,6 @@ from pimper_torch.ground.geometry.surfaces import (
     face_normals,
     side_lengths,
     unit_face_normals,
-    vertex_normals,
 )
 from pimper_torch.ground.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 
@@ -29,7 +28,7 @@ class Faults:
     several. Overturned faces without a fold round their component are on a facet that bends far.
 
     Attributes:
-        along: Mean normal of each face's facet, of any length.
+        along: Mean normal of each face's facet, weighted by area, of any length.
         longest: Longest side of a sound face, scene units.
     """
 
@@ -60,35 +59,15 @@ class Faults:
 
     def _folded(self, vertices: Vertices) -> FaceMask:
         normals, overturned = unit_face_normals(vertices, self.faces), self.overturned(vertices)
-        near = self._near_folds(vertices, normals, overturned).nonzero()[:, 0]
-        pairs = near[topology.face_pairs(self.faces[near])[0]]
+        pairs, _ = topology.face_pairs(self.faces)
         one, other = pairs.unbind(dim=1)
         fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(_FOLD)
         found = torch.zeros_like(overturned)
         found[pairs[fold].flatten()] = True
-        (index,) = torch.nonzero(overturned, as_tuple=True)
-        rank = overturned.cumsum(dim=0) - 1
-        label = topology.graph_components(rank[pairs[overturned[pairs].all(dim=1)]], len(index))
-        bounded = torch.zeros_like(index, dtype=torch.bool)
-        bounded[label[found[index]]] = True
-        found[index[bounded[label]]] = True
-        return found
-
-    def _near_folds(
-        self, vertices: Vertices, normals: Float[Tensor, "face 3"], overturned: FaceMask
-    ) -> FaceMask:
-        """Find the faces round vertices of overturned faces, and round those that may have a fold.
-
-        Two faces whose normals are within half a fold of any axis have no fold between them, so
-        that neighbours are looked for among few faces.
-        """
-        axis = vertex_normals(vertices, self.faces)
-        near = topology.corners_of(self.faces, overturned, len(vertices))
-        for corner in self.faces.unbind(dim=1):
-            # Rounding of a cosine in float32: faces that it adds change nothing.
-            bent = (normals * axis[corner]).sum(dim=1) < math.cos(_FOLD / 2) + 1e-3
-            near[corner[bent]] = True
-        return near[self.faces].any(dim=1)
+        label = topology.graph_components(pairs[overturned[pairs].all(dim=1)], len(found))
+        bounded = torch.zeros_like(found)
+        bounded[label[found & overturned]] = True
+        return found | (overturned & bounded[label])
 
 
 def faults(
@@ -100,21 +79,12 @@ def faults(
         facet: Of each vertex; a face belongs to the facet of most of its vertices.
         max_stretch: Longest side, in multiples of the median.
     """
-    return Faults(
-        faces=faces,
-        along=facet_means(vertices, faces, facet),
-        longest=max_stretch * side_lengths(vertices[faces]).median(),
-    )
-
-
-def facet_means(
-    vertices: Vertices, faces: Faces, facet: Int[Tensor, " vertex"]
-) -> Float[Tensor, "face 3"]:
-    """Assign each face the mean normal of its facet, weighted by area, of any length."""
     one, other, last = facet[faces].unbind(dim=1)
     owner = torch.where(other == last, other, one)
     normals = face_normals(vertices, faces)
-    return normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)[owner]
+    sums = normals.new_zeros(int(facet.max()) + 1, 3).index_add(0, owner, normals)
+    longest = max_stretch * side_lengths(vertices[faces]).median()
+    return Faults(faces=faces, along=sums[owner], longest=longest)
 
 
 def small_groups(

@@ -13,7 +13,6 @@ from pimper_torch.ground.geometry.surfaces import side_lengths, vertex_normals
 from pimper_torch.ground.linalg.systems import solutions
 from pimper_torch.ground.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
-from pimper_torch.method.meshing.meshing_config import RepairConfig
 from pimper_torch.records import Surface
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -64,6 +63,12 @@ def least_bent(vertices: Vertices, faces: Faces, free: VertexMask) -> Vertices:
     return vertices.index_copy(0, moved, found.to(vertices))
 
 
+# Diagonal of a repaired component's bounding box, at most, as a fraction of the surface's.
+_MAX_EXTENT = 0.1
+
+# Longest edge of a sound face, in multiples of the median.
+_MAX_STRETCH = 10.0
+
 # Rings of sound vertices that a component with defects may take in, one at a time: with twice the
 # samples a pixel, 6 left 5 openings in a skull's orbit, and 12 none (commit 3dadfd4).
 _RINGS = 12
@@ -78,19 +83,13 @@ class Repair(Stage):
     Differentiable in the vertices that stay; which these are is a constant.
     """
 
-    def __init__(self, config: RepairConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or RepairConfig()
-
     def forward(self, surface: Surface) -> Surface:
         """Repair what can be repaired."""
-        if self.config.max_extent == 0:
-            return surface
         vertices, faces = surface.vertices_world, surface.faces
         before = vertices.detach()
-        found = faults(before, faces, surface.facet, self.config.max_stretch)
+        found = faults(before, faces, surface.facet, _MAX_STRETCH)
         part, used = found.part(surroundings(faces, found.broken(before), len(vertices)))
-        farthest = self.config.max_extent * diagonal(before)
+        farthest = _MAX_EXTENT * diagonal(before)
         positions, moving = repair(vertices[used], part.faces, part.broken, farthest)
         vertices = vertices.index_copy(0, used, positions)
         moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)

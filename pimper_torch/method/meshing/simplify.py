@@ -20,24 +20,6 @@ _SLICES = 4
 _EDGES = 100_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bounds:
-    """Limits on the deviation of a former vertex from the decimated mesh.
-
-    Attributes:
-        spacings: Distance to the surface, in multiples of the former mesh's median edge.
-        angle_deg: Between its normal and the surface's, which is blended from the corners.
-    """
-
-    spacings: float
-    angle_deg: float
-
-
-# A twentieth of a sample's spacing and 1.5 degrees: with a tenth, the finest height field of the
-# demo's skull is lost where its shape is shaded without the vertices' normals.
-FAITHFUL = Bounds(spacings=0.05, angle_deg=1.5)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Simplified(Record):
     """A mesh with fewer vertices, and how far the others are from it.
@@ -60,7 +42,11 @@ class Simplified(Record):
 
 
 def simplify(
-    mesh: Mesh, bounds: Bounds = FAITHFUL, values: Float[Tensor, "vertex channel"] | None = None
+    mesh: Mesh,
+    values: Float[Tensor, "vertex channel"] | None = None,
+    *,
+    spacings: float = 0.05,
+    angle_deg: float = 1.5,
 ) -> Simplified:
     """Collapse edges as long as every former vertex stays within bounds of the mesh.
 
@@ -72,6 +58,10 @@ def simplify(
         mesh: Any; without normals, those of its shape are taken.
         values: More that is interpolated over the faces, in units of its bound: the value of a
             removed vertex and that interpolated on its face differ by 1 at most.
+        spacings: Distance of a former vertex to the surface at most, in multiples of the median
+            edge. With a tenth, the finest height field of the demo's skull is lost where its shape
+            is shaded without the vertices' normals.
+        angle_deg: Between its normal and the surface's, which is blended from the corners.
     """
     from pimper_torch.ground.kernels import decimation  # compiled when it is imported
 
@@ -96,7 +86,7 @@ def simplify(
     links = np.empty(len(points) + faces.size, np.int32)
     lists = np.full(len(faces) + len(points), -1, np.int32)
     off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
-    cosine = float(np.cos(np.radians(bounds.angle_deg)))
+    cosine = float(np.cos(np.radians(angle_deg)))
     decimation.link_corners(faces, links)
 
     part = _slices(points)
@@ -107,7 +97,7 @@ def simplify(
 
     def thin_out(free: np.ndarray) -> None:
         arguments = (free, candidates, faces, links, lists, off)
-        decimation.decimate(points, channels, bounds.spacings * spacing, cosine, *arguments)
+        decimation.decimate(points, channels, spacings * spacing, cosine, *arguments)
 
     inner = [(part == mine) & ~between for mine in range(_SLICES)]
     list(side_by_side(thin_out, inner))
