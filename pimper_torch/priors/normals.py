@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.contours import RayConfig, contour_rays
+from pimper_torch.ground.geometry.contours import contour_rays
 from pimper_torch.ground.shapes import Points
 from pimper_torch.priors.at_points import at_points, means_by, places
 from pimper_torch.priors.choice import surely_better
@@ -159,7 +159,7 @@ def _at_outlines(
     prior: NormalPrior, known: Tensor, scene: SparseScene, silhouettes: Silhouettes
 ) -> Float[Tensor, "reading sample"]:
     """Return what readings are worth just inside the outlines."""
-    rays = contour_rays(silhouettes, scene.cameras, RayConfig(per_view=_RIM))
+    rays = contour_rays(silhouettes, scene.cameras, _RIM)
     rotation = scene.cameras.cam_from_world[rays.view, :3, :3]
     outward = normalize((rotation @ rays.normals_world[..., None])[:, :2, 0], dim=-1)
     place, within = places(prior, scene, rays.view, rays.pixels - _INSIDE * outward)

@@ -9,7 +9,7 @@ from pimper_torch.method.sfm.colmap import reprojection_errors
 from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.sfm.sparse_scene import assemble_scene, point_colors, write_model
-from pimper_torch.method.silhouettes.cues import SilhouetteDetails, cues_of
+from pimper_torch.method.silhouettes.cues import cues_of
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 
 
@@ -118,7 +118,7 @@ def test_a_region_is_a_box_in_the_frame_of_the_model(views, model):
         region=tuple((corners + torch.tensor(UTM, dtype=torch.float64)).flatten().tolist())
     )
     scene = assemble_scene(views, moved(model, UTM))
-    box = cues_of(scene, settings, SilhouetteDetails()).box_world
+    box = cues_of(scene, settings).box_world
     local = (
         corners + torch.tensor(UTM, dtype=torch.float64) - corners.new_tensor(scene.offset_world)
     )

@@ -7,7 +7,7 @@ from torch import Tensor
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project, rays_through
-from pimper_torch.method.silhouettes.cues import SilhouetteDetails
+from pimper_torch.method.silhouettes import cuts
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Cameras, Lens, SparseScene, Views
 from tests.silhouettes.shapes import all_round
@@ -16,7 +16,12 @@ from tests.silhouettes.shapes import all_round
 CENTER, RADIUS = torch.tensor([0.0, 0.0, 0.5]), 0.5
 
 
-SMALL = SilhouetteConfig(size_px=240), SilhouetteDetails(num_voxels=60_000)
+SMALL = SilhouetteConfig(size_px=240)
+
+
+@pytest.fixture(autouse=True)
+def few_voxels(monkeypatch):
+    monkeypatch.setattr(cuts, "NUM_VOXELS", 60_000)
 
 
 def overlap(found: Tensor, truth: Tensor) -> Tensor:

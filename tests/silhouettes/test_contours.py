@@ -3,13 +3,12 @@ from functools import partial
 
 import pytest
 import torch
-from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.visual_hull import box_round
 from pimper_torch.method.silhouettes import trace
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.runtime.errors import PimperWarning
-from tests.silhouettes.shapes import PIXEL, ball, silhouettes_of, two_balls
+from tests.silhouettes.shapes import ball, silhouettes_of, two_balls
 
 
 @pytest.fixture(autouse=True)
@@ -25,20 +24,6 @@ def test_a_box_holds_what_the_silhouettes_show_and_not_much_more(cameras, shape)
     assert (low < -1.1).all()
     assert (high > 1.1).all()
     assert (high - low).max() < 2 * 2.4
-
-
-def test_contours_of_a_ball_touch_it(cameras):
-    contours = TraceContours()(silhouettes_of(ball, cameras), cameras)
-    assert contours is not None
-    generator = torch.Generator().manual_seed(7)
-    points = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
-    found = contours.touching(points, points)
-    assert len(found.points_world) > 0.9 * len(contours.rays.view)
-    assert (found.points_world.norm(dim=1) - 1).abs().median() < 0.5 * PIXEL
-    # Deep in the centre, and out of it beside the ball.
-    depth = contours.hull.depth_of(torch.tensor([[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]))
-    assert depth[0] > 0.9
-    assert depth[1] < -0.1
 
 
 def test_two_wrong_silhouettes_in_twenty_cut_nothing_off_where_they_were_found(cameras):

@@ -23,7 +23,7 @@ from tests.silhouettes.conftest import SMALL, overlap
 
 
 def test_a_ball_on_a_table_is_found_in_every_view(staged):
-    silhouettes = FindSilhouettes(*SMALL)(staged.scene)
+    silhouettes = FindSilhouettes(SMALL)(staged.scene)
     assert silhouettes is not None
     assert silhouettes.source == "found"
     assert silhouettes.reliable.all()
@@ -41,7 +41,7 @@ def without_points_of_the_ball(scene):
 
 
 def test_an_object_without_a_point_is_found_by_parallax(staged):
-    silhouettes = FindSilhouettes(*SMALL)(without_points_of_the_ball(staged.scene))
+    silhouettes = FindSilhouettes(SMALL)(without_points_of_the_ball(staged.scene))
     assert silhouettes is not None
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
 
@@ -51,7 +51,7 @@ def test_what_stands_before_the_dark_beyond_a_table_is_found(staged):
     images = staged.scene.views.images.clone()
     images[:, :, :70] *= staged.truth[:, None, :70]
     scene = staged.scene.replace(views=staged.scene.views.replace(images=images))
-    silhouettes = FindSilhouettes(*SMALL)(without_points_of_the_ball(scene))
+    silhouettes = FindSilhouettes(SMALL)(without_points_of_the_ball(scene))
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
 
 
@@ -74,7 +74,7 @@ def test_what_hides_the_object_is_of_its_silhouette_and_is_not_used(staged):
 @pytest.mark.parametrize("seen_in", [1, 3])
 def test_a_view_abstains_where_something_stands_before_the_object(staged, monkeypatch, seen_in):
     """What a view's cut lacks carves the hull, unless something else stands there."""
-    cues = cues_of(staged.scene, *SMALL)
+    cues = cues_of(staged.scene, SMALL)
     agreement = torch.where(staged.truth, -0.2, 0.95)
     person = torch.zeros_like(staged.truth)
     for view in range(0, 12, 4)[:seen_in]:
@@ -86,7 +86,7 @@ def test_a_view_abstains_where_something_stands_before_the_object(staged, monkey
     monkeypatch.setattr(Cues, "relearned", lambda cues, masks: cues)
     known = cues.replace(agreement=agreement.where(~person, -0.2))
     carved = cues.replace(agreement=agreement.where(~person, torch.nan))
-    found, plain = (cuts.cut_in_iterations(one, SMALL[1]) for one in (known, carved))
+    found, plain = (cuts.cut_in_iterations(one) for one in (known, carved))
     assert overlap(found.masks, staged.truth).min() > 0.93
     assert torch.equal(found.masks & ~found.hidden, cut)
     assert (found.hidden & ~person).sum() == 0
@@ -188,7 +188,7 @@ def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
     with pytest.warns(PimperWarning, match=r"is taken for the object.*`silhouettes.region`"):
-        assert FindSilhouettes(*SMALL)(scene).source == "everything"
+        assert FindSilhouettes(SMALL)(scene).source == "everything"
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
@@ -201,10 +201,10 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     masks = torch.zeros_like(staged.truth)
     masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
     nonsense = shapes.cuts_of(masks, projections, on_plane=True)
-    monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: nonsense)
+    monkeypatch.setattr(find, "cut_in_iterations", lambda _: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"above the plane.*by {overlap_percent:.0f}%"):
-        silhouettes = FindSilhouettes(*SMALL)(staged.scene)
+        silhouettes = FindSilhouettes(SMALL)(staged.scene)
     assert silhouettes.source == "everything"
     # The ball stands on z = 0; what is a few hundredths thick is the table.
     table = torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, -0.5, 0.05, 1.0], [0.0, 0.0, -1.0, 1.0]])
@@ -220,9 +220,9 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     masks = projections > 0
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
     cuts = shapes.cuts_of(masks, projections, on_plane=False)
-    monkeypatch.setattr(find, "cut_in_iterations", lambda *_, **__: cuts)
+    monkeypatch.setattr(find, "cut_in_iterations", lambda _: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
-        assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+        assert FindSilhouettes(SMALL)(staged.scene).source == "everything"
 
 
 @pytest.mark.parametrize(
@@ -235,12 +235,12 @@ def test_silhouettes_that_all_err_alike_are_not_trusted(staged, monkeypatch, gro
     masks = reach > -grown_px
     margins = torch.where(masks, 5.0, -5.0)
 
-    def agreed(cues, _):
+    def agreed(cues):
         return cuts_of(cues.relearned(masks), masks, margins, torch.zeros(12, dtype=torch.bool))
 
     monkeypatch.setattr(find, "cut_in_iterations", agreed)
     with pytest.warns(PimperWarning, match=why):
-        assert FindSilhouettes(*SMALL)(staged.scene).source == "everything"
+        assert FindSilhouettes(SMALL)(staged.scene).source == "everything"
 
 
 def signed_distances(masks):
@@ -322,8 +322,8 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
-    left = SilhouetteConfig(size_px=240, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1)), SMALL[1]
-    silhouettes = FindSilhouettes(*left)(staged.scene)
+    left = SilhouetteConfig(size_px=240, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1))
+    silhouettes = FindSilhouettes(left)(staged.scene)
     assert silhouettes is not None
     assert 0 < silhouettes.masks.sum() < 0.8 * staged.truth.sum()  # half a ball, as the box cuts it
 
@@ -335,9 +335,9 @@ def test_a_region_is_two_corners():
 
 
 def test_a_region_that_nothing_shows_is_refused(staged):
-    away = SilhouetteConfig(size_px=240, region=(50.0, 50.0, 50.0, 51.0, 51.0, 51.0)), SMALL[1]
+    away = SilhouetteConfig(size_px=240, region=(50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
     with pytest.raises(InputError, match="no photograph shows and no point of the cloud is in"):
-        FindSilhouettes(*away)(staged.scene)
-    tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001)), SMALL[1]
+        FindSilhouettes(away)(staged.scene)
+    tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001))
     with pytest.warns(PimperWarning, match="Everything"):  # shown, though no point is in it
-        FindSilhouettes(*tiny)(staged.scene)
+        FindSilhouettes(tiny)(staged.scene)

@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.metrics.in_view import angles_deg
-from pimper_torch.ground.geometry.contours import RayConfig, contour_rays
+from pimper_torch.ground.geometry.contours import contour_rays
 from tests.silhouettes.shapes import PIXEL, ball, nearest_to, ring, silhouettes_of
 
 
@@ -86,7 +86,7 @@ def test_borders_specks_corners_and_untrusted_views_have_no_rays(cameras):
 
 def test_the_number_of_rays_is_what_is_asked_for(cameras):
     silhouettes = silhouettes_of(ball, cameras)
-    rays = contour_rays(silhouettes, cameras, RayConfig(per_view=50))
+    rays = contour_rays(silhouettes, cameras, 50)
     count = torch.bincount(rays.view)
     assert bool(((count >= 45) & (count <= 51)).all())
 
@@ -94,4 +94,4 @@ def test_the_number_of_rays_is_what_is_asked_for(cameras):
 def test_no_number_of_rays_reaches_past_the_end_of_a_contour(cameras):
     found = silhouettes_of(ball, cameras)
     for asked in (31, 62):
-        assert len(contour_rays(found, cameras, RayConfig(per_view=asked)).view) > 0
+        assert len(contour_rays(found, cameras, asked).view) > 0

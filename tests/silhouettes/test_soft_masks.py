@@ -38,7 +38,7 @@ def without_any_hint(scene):
 def test_masks_of_half_the_size_are_followed(staged):
     scene = without_any_hint(staged.scene)
     prior = guessed(scene.views.names, soft(staged.truth, (90, 120)))
-    found = FindSilhouettes(*SMALL)(with_priors(scene, prior))
+    found = FindSilhouettes(SMALL)(with_priors(scene, prior))
     assert found.source == "found"
     assert found.reliable.all()
     # Without colours the cut lies anywhere within 1.5 pixels of the mask's border: 0.89 of 50.
@@ -50,7 +50,7 @@ def test_what_single_masks_take_along_the_others_leave_out(staged):
     for view in (1, 4, 8):
         wide[view, 60:170, 20 + 5 * view : 60 + 5 * view] = True
     assert overlap(wide, staged.truth)[[1, 4, 8]].max() < 0.8
-    found = FindSilhouettes(*SMALL)(with_priors(scene, guessed(scene.views.names, soft(wide))))
+    found = FindSilhouettes(SMALL)(with_priors(scene, guessed(scene.views.names, soft(wide))))
     assert overlap(found.masks, staged.truth).min() > 0.9
 
 
@@ -62,14 +62,14 @@ def test_masks_of_another_thing_are_doubted_by_name(staged):
     prior = guessed(staged.scene.views.names, soft(wrong))
     names = ", ".join(staged.scene.views.names[view] for view in views)
     with pytest.warns(PimperWarning, match=rf"\(views? {names}\): its soft mask lacks"):
-        found = FindSilhouettes(*SMALL)(with_priors(staged.scene, prior))
+        found = FindSilhouettes(SMALL)(with_priors(staged.scene, prior))
     assert overlap(found.masks, staged.truth).min() > 0.95
 
 
 def test_masks_of_some_photographs_tell_of_all(staged):
     names = staged.scene.views.names
     prior = guessed((*names[::3], "another.png"), soft(staged.truth)[[0, 3, 6, 9, 0]])
-    found = FindSilhouettes(*SMALL)(with_priors(staged.scene, prior))
+    found = FindSilhouettes(SMALL)(with_priors(staged.scene, prior))
     assert overlap(found.masks, staged.truth).min() > 0.95
 
 

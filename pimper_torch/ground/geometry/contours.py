@@ -6,7 +6,7 @@ ray touches the surface follows from the surface, as far as it is known.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.visual_hull import Everywhere, Hull
 from pimper_torch.ground.shapes import Map, Points
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
-from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.parallel import num_workers, side_by_side
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -35,41 +34,19 @@ _PIXEL = 1 / 12
 _READING = 1 / 12 + 1 / 6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RayConfig:
-    """Which points of the silhouettes become rays.
-
-    Lengths are in pixels of the probability maps.
-
-    Attributes:
-        per_view: About so many rays a view, evenly spaced, at least a pixel apart.
-        blur_px: Standard deviation of the Gaussian that the maps are smoothed with.
-        tangent_px: The same along the silhouette, for its tangents.
-        corner_px: A corner is where the tangent turns too far from so far before to so far
-            after it.
-        max_convex_deg: Turn of a silhouette that bends round the object, at most.
-        max_concave_deg: The same of one that bends into it: where one part of the surface
-            hides another, the silhouette has a concave corner, and no normal.
-        border_px: Rays keep so far from the photograph's border.
-        min_length_px: Shorter silhouettes are specks.
-    """
-
-    per_view: Annotated[int, Range(least=1, most=1_000_000)] = 300
-    blur_px: Annotated[float, Range(above=0, most=65_535)] = 1.0
-    tangent_px: Annotated[float, Range(above=0, most=65_535)] = 3.0
-    corner_px: Annotated[float, Range(least=1, most=65_535)] = 6.0
-    max_convex_deg: Annotated[float, Range(above=0, most=180)] = 90.0
-    max_concave_deg: Annotated[float, Range(above=0, most=180)] = 40.0
-    border_px: Annotated[float, Range(least=0, most=65_535)] = 3.0
-    min_length_px: Annotated[float, Range(least=0, most=65_535)] = 24.0
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "contours")
+# Which points of the silhouettes become rays; choices, in pixels of the probability maps.
+_BLUR_PX = 1.0  # standard deviation of the Gaussian that the maps are smoothed with
+_TANGENT_PX = 3.0  # the same along the silhouette, for its tangents
+_BORDER_PX = 3.0  # rays keep so far from the photograph's border
+_MIN_LENGTH_PX = 24.0  # shorter silhouettes are specks
+_CORNER_PX = 6  # a corner is where the tangent turns too far from so far before to so far after
+_MAX_CONVEX_DEG = 90.0  # turn of a silhouette that bends around the object
+# The same of one that bends into it: where one part of the surface hides another, the silhouette
+# has a concave corner, and no normal.
+_MAX_CONCAVE_DEG = 40.0
 
 
-def contour_rays(
-    silhouettes: Silhouettes, cameras: Cameras, config: RayConfig | None = None
-) -> ContourRays:
+def contour_rays(silhouettes: Silhouettes, cameras: Cameras, per_view: int = 300) -> ContourRays:
     r"""Cast rays through the silhouettes, and tell the surface's normal on each.
 
     A surface that ends in the picture is tangent there to the ray, and its contour to the
@@ -81,15 +58,15 @@ def contour_rays(
     Args:
         silhouettes: Probabilities that pixels show the object; views that are not reliable get
             no rays.
+        per_view: About so many rays a view, evenly spaced, at least a pixel apart.
 
     Returns:
         Rays of all reliable views. Corners, where the surface has no single normal, specks,
         and what lies at the photograph's border have none. A constant to autograd.
     """
-    config = config or RayConfig()
 
     def of_view(view: int) -> ContourRays:
-        return _of_view(silhouettes.inside[view], cameras, view, config)
+        return _of_view(silhouettes.inside[view], cameras, view, per_view)
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
     return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])
@@ -107,15 +84,15 @@ def _nothing(cameras: Cameras) -> ContourRays:
 
 
 @torch.no_grad()
-def _of_view(inside: Map, cameras: Cameras, view: int, config: RayConfig) -> ContourRays:
+def _of_view(inside: Map, cameras: Cameras, view: int, per_view: int) -> ContourRays:
     like, (width, height) = cameras.intrinsics, cameras.sizes_px[view].tolist()
     smooth = gaussian_filter(
-        inside[:height, :width].detach().cpu().double().numpy(), config.blur_px, mode="nearest"
+        inside[:height, :width].detach().cpu().double().numpy(), _BLUR_PX, mode="nearest"
     )
     lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
-    lines = [line for line in lines if len(line.points) >= config.min_length_px]
-    stride = max(1.0, sum(len(line.points) for line in lines) / config.per_view)
-    rows = [_samples(line, smooth, stride, config) for line in lines]
+    lines = [line for line in lines if len(line.points) >= _MIN_LENGTH_PX]
+    stride = max(1.0, sum(len(line.points) for line in lines) / per_view)
+    rows = [_samples(line, smooth, stride) for line in lines]
     table = torch.from_numpy(np.concatenate([np.zeros((0, 7)), *rows])).to(like)
     point, along, outward, slope = torch.split(table, [2, 2, 2, 1], dim=1)
     pixels = pixels_from_indices(point)
@@ -125,7 +102,7 @@ def _of_view(inside: Map, cameras: Cameras, view: int, config: RayConfig) -> Con
     across = torch.linalg.cross(rays, rays_through(pixels + along, frame, intrinsics) - rays)
     towards = rays_through(pixels + outward, frame, intrinsics) - rays
     side = (across * towards).sum(dim=1, keepdim=True).sign()
-    added = config.blur_px**2 + _READING
+    added = _BLUR_PX**2 + _READING
     spread = 1 / (math.sqrt(2 * math.pi) * slope[:, 0])
     return ContourRays(
         view=torch.full_like(pixels[:, 0], view, dtype=torch.long),
@@ -160,23 +137,22 @@ def _resampled(corners: Array) -> _Line:
     return _Line(np.stack(points, axis=1), closed)
 
 
-def _samples(line: _Line, smooth: Array, stride: float, config: RayConfig) -> Array:
+def _samples(line: _Line, smooth: Array, stride: float) -> Array:
     """Return rows of place, tangent and outward direction, two numbers each, and slope."""
     points = line.points
     how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
-    tangent = _unit(gaussian_filter1d(points, config.tangent_px, axis=0, order=1, mode=how))
+    tangent = _unit(gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how))
     # The probability falls outward; half a pixel to either side tells how fast.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
     outward = -np.sign(rise)[:, None] * across
-    reach = round(config.corner_px)
-    behind, ahead = line.shifted(tangent, -reach), line.shifted(tangent, reach)
+    behind, ahead = line.shifted(tangent, -_CORNER_PX), line.shifted(tangent, _CORNER_PX)
     rotation = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
     convex = ((ahead - behind) * outward).sum(axis=1) < 0
-    most = np.where(convex, config.max_convex_deg, config.max_concave_deg)
+    most = np.where(convex, _MAX_CONVEX_DEG, _MAX_CONCAVE_DEG)
     size = np.array([smooth.shape[1], smooth.shape[0]]) - 1.0
     margin = np.minimum(points, size - points).min(axis=1) + 0.5
-    good = (rotation <= most) & (margin >= config.border_px) & (rise != 0)
+    good = (rotation <= most) & (margin >= _BORDER_PX) & (rise != 0)
     chosen = np.arange(0, len(points), stride).astype(int)
     chosen = chosen[chosen < len(points)]  # rounding may add one
     chosen = chosen[good[chosen]]
@@ -229,7 +205,8 @@ def contour_points(
     steps = 128
     depth = low + torch.linspace(0, 1, steps).to(low) * (high - low)
     pixel = depth.mean(dim=1) / focal
-    surface = _SignedDistance(points_world, normals_world) if len(points_world) else None
+    known = len(points_world) > 0 and len(rays.view) > 0
+    surface = _SignedDistance(points_world, normals_world) if known else None
     cost = _costs(rays, centers, depth, hull, _TOLERANCE_PX * pixel, surface)
     # Places nearer to each other than that tell nothing of which surface a ray touches.
     clear = ~ambiguous(cost, 2.0 * pixel)
@@ -362,13 +339,4 @@ class Contours(Record):
 
     def touching(self, points_world: Points, normals_world: Points) -> ContourPoints:
         """Find where the rays touch a surface; see :func:`.contour_points`."""
-        if not self.confine:
-            rays, none = self.rays, points_world.new_zeros(0)
-            return ContourPoints(
-                points_world=none.reshape(0, 3),
-                normals_world=none.reshape(0, 3),
-                variance=none,
-                view=rays.view,
-                ray=rays.view,
-            )
         return contour_points(self.rays, self.cameras, self.hull, points_world, normals_world)

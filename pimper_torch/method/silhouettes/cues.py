@@ -1,7 +1,7 @@
 """Cues about the object before any view is cut."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import reduce
 
 import torch
@@ -21,7 +21,7 @@ from pimper_torch.ground.geometry.supporting_plane import (
     well_tracked,
 )
 from pimper_torch.ground.geometry.visual_hull import Hull
-from pimper_torch.ground.shapes import Masks
+from pimper_torch.ground.shapes import Map, Maps, Masks, ViewMask
 from pimper_torch.method.silhouettes import parallax
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
@@ -30,37 +30,6 @@ from pimper_torch.runtime.mapped import by_view
 
 FEW = 3  # soft masks: fewer have no majority
 _SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SilhouetteDetails:
-    """Settings of the search for silhouettes that all photographs share.
-
-    See :class:`~pimper_torch.method.silhouettes.find.FindSilhouettes`. Chosen on the four rendered
-    scenes and the skull (``benchmarks/silhouettes.py``).
-
-    Attributes:
-        iterations: Of cutting and voting after the first cut.
-        disagreeing: Fraction of the views that may see a voxel of the hull outside.
-        min_covered: Fraction of a view's silhouette that the hull's projection must cover, or the
-            view is not reliable.
-        max_exposed: Fraction of a view's silhouette that may show a background for certain: the
-            supporting plane, or a room at rest. True masks show up to 0.001, masks 20 px of 640 too
-            wide 0.007 to 0.19 (mug, potatoes and scorpion, two of them on turntables).
-        min_held: Fraction of the object's points that a view's silhouette must hold. True masks
-            hold 0.948 and more, masks 20 px too narrow 0.50 to 0.80 (mug, potatoes).
-        min_overlap: Intersection over union of silhouettes and projections, in the median, below
-            which silhouettes are not reliable.
-    """
-
-    iterations: int = 2
-    num_voxels: int = 500_000
-    disagreeing: float = 0.05
-    plane: PlaneSearch = field(default_factory=PlaneSearch)
-    min_covered: float = 0.9
-    max_exposed: float = 0.01
-    min_held: float = 0.9
-    min_overlap: float = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -72,8 +41,8 @@ class SoftMasks(Record):
         seeds_px: Pixels of the object in each view, from maps that say nothing else.
     """
 
-    inside: Float[Tensor, "view height width"]
-    given: Bool[Tensor, " view"]
+    inside: Maps
+    given: ViewMask
     seeds_px: tuple[Float[Tensor, "_ 2"], ...]
 
     @property
@@ -172,7 +141,7 @@ class Cues(Record):
     background_px: tuple[Float[Tensor, "_ 2"], ...]
     plane: Plane | None
     background_from_view: Float[Tensor, "mapped 3 3"]
-    agreement: Float[Tensor, "view height width"] | None
+    agreement: Maps | None
     fixation: Fixation
     box_world: Float[Tensor, "2 3"]
     soft: SoftMasks | None
@@ -193,6 +162,10 @@ class Cues(Record):
         """Whether backgrounds that are known are all round: a room, and the plane before it."""
         return self.plane is not None and len(self.background_from_view) > 0
 
+    def agreement_in(self, view: int) -> Map | None:
+        """Return a view's agreement with the backgrounds; ``None`` without any."""
+        return None if self.agreement is None else self.agreement[view]
+
     def surrounded(self) -> Masks:
         """Find what the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
@@ -200,17 +173,27 @@ class Cues(Record):
             lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
         )
 
-    def relearned(self, masks: Masks) -> "Cues":
-        """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere."""
-        found = self._agreement(masks)
-        if found is None or self.agreement is None:
+    def relearned(self, masks: Masks | None) -> "Cues":
+        """Learn the backgrounds' texture anew where cuts do not hide it, and keep it elsewhere.
+
+        Args:
+            masks: The cuts; ``None`` before the first.
+        """
+        found = []
+        if self.plane is not None:
+            found.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, masks))
+        if len(self.background_from_view):
+            room = parallax.room_agreement(self.pictures, self.background_from_view, masks)
+            surrounded = self.surrounded()
+            found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
+        if not found:
             return self
-        newest = by_view(lambda new, old: new.where(~new.isnan(), old), found, self.agreement)
+        newest = by_view(lambda *all_of: reduce(torch.fmax, all_of), *found)
+        if self.agreement is not None:
+            newest = by_view(lambda new, old: new.where(~new.isnan(), old), newest, self.agreement)
         return self.replace(agreement=newest)
 
-    def without(
-        self, doubted: Bool[Tensor, " view"]
-    ) -> tuple["Cues", Bool[Tensor, " view"] | None]:
+    def without(self, doubted: ViewMask) -> tuple["Cues", ViewMask | None]:
         """Leave soft masks out, and find the views that have one; ``None`` where they are few."""
         if self.soft is None:
             return self, None
@@ -226,7 +209,7 @@ class Cues(Record):
         pixels, _ = project(place, cameras.cam_from_world, cameras.intrinsics)
         return self.replace(soft=self.soft.replace(seeds_px=tuple(pixels)))
 
-    def seen_in(self, seen: Float[Tensor, "view height width"]) -> "Cues":
+    def seen_in(self, seen: Maps) -> "Cues":
         """Keep points inside the hull alone where soft masks tell of the object."""
         if self.soft is None:
             return self
@@ -237,23 +220,8 @@ class Cues(Record):
             kept.append(pixels[margin[row, column] > 0])
         return self.replace(object_px=tuple(kept))
 
-    def observed(self) -> "Cues":
-        """Learn the backgrounds' texture, if there are any."""
-        return self.replace(agreement=self._agreement(None))
 
-    def _agreement(self, hidden: Masks | None) -> Float[Tensor, "view height width"] | None:
-        """Compare views with what they see through homographies; ``None`` without any."""
-        found = []
-        if self.plane is not None:
-            found.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, hidden))
-        if len(self.background_from_view):
-            room = parallax.room_agreement(self.pictures, self.background_from_view, hidden)
-            surrounded = self.surrounded()
-            found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
-        return by_view(lambda *all_of: reduce(torch.fmax, all_of), *found) if found else None
-
-
-def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDetails) -> Cues:
+def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
     """Gather what is known of the object from photographs, cameras and cloud."""
     scene = scene.to("cpu", torch.float32)
     pictures = parallax.working_pictures(scene.views, scene.cameras, config.size_px)
@@ -261,24 +229,23 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig, details: SilhouetteDet
     focus = fixation(cameras.cam_from_world)
     distance = float(focus.distance)
     tracked = points[well_tracked(scene)]
-    plane = supporting_plane(tracked, cameras.centers_world, distance, details.plane)
-    tolerance = details.plane.tolerance * distance
+    plane = supporting_plane(tracked, cameras.centers_world, distance)
+    tolerance = PlaneSearch().tolerance * distance
     region = _region(scene, config.region) if config.region else None
-    cloud = split_cloud(scene, focus, plane, tolerance, region)
+    on_object, background = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world
     turns = plane is None and len(scene.background_from_view) > 0
-    seen = pixels_of if turns else pixels_seen
     return Cues(
         pictures=pictures,
-        object_px=tuple(seen(scene, cameras, cloud.on_object)),
-        background_px=tuple(pixels_seen(scene, cameras, cloud.background)),
+        object_px=pixels_of(scene, cameras, on_object, observed=not turns),
+        background_px=pixels_of(scene, cameras, background),
         plane=plane,
         background_from_view=scene.background_from_view,
         agreement=None,
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
         soft=soft_masks_of(scene.views, pictures),
-    ).observed()
+    ).relearned(None)
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
@@ -309,26 +276,14 @@ _NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 
 _CENTRE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SplitCloud(Record):
-    """The cloud's points, divided into object and background.
-
-    Attributes:
-        background: Certainly not the object's; the remainder may be either.
-    """
-
-    on_object: Bool[Tensor, " point"]
-    background: Bool[Tensor, " point"]
-
-
 def split_cloud(
     scene: SparseScene,
     fixation: Fixation,
     plane: Plane | None,
     tolerance: float,
     box_world: Float[Tensor, "2 3"] | None,
-) -> SplitCloud:
-    """Divide the cloud into points of the object and of the background.
+) -> tuple[Bool[Tensor, " point"], Bool[Tensor, " point"]]:
+    """Find the points of the object, and those that certainly are not; others may be either.
 
     With a plane they are what stands above it near the fixation point, without one what is near
     that point.
@@ -352,28 +307,19 @@ def split_cloud(
         low, high = box_world.to(points)
         inside = ((points >= low) & (points <= high)).all(dim=1)
         on_object, background = on_object & inside, background | ~inside
-    return SplitCloud(on_object=tracked & on_object, background=tracked & background)
-
-
-def pixels_seen(
-    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
-) -> list[Float[Tensor, "_ 2"]]:
-    """Return where each view shows those of the chosen points that it observes."""
-    points = scene.points_world.cpu().float()
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
-    seen = (scene.observed & chosen[:, None]).cpu()
-    return [pixels[view, seen[:, view]] for view in range(cameras.num_views)]
+    return tracked & on_object, tracked & background
 
 
 def pixels_of(
-    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"]
-) -> list[Float[Tensor, "_ 2"]]:
-    """Return where the chosen points are in each view, whether or not it observes them.
+    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"], observed: bool = True
+) -> tuple[Float[Tensor, "_ 2"], ...]:
+    """Return where the chosen points are in each view.
 
-    A point of the object is inside its silhouette also where another part hides it.
+    Args:
+        observed: Those that the view observes, or else all in its frame: a point of the object is
+            inside its silhouette also where another part hides it.
     """
-    points = scene.points_world.cpu().float()[chosen.cpu()]
-    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    pixels, _ = project(scene.points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px.to(pixels)[:, None]
-    within = ((pixels > 0) & (pixels < sizes)).all(dim=-1)
-    return [pixels[view, within[view]] for view in range(cameras.num_views)]
+    shown = scene.observed.mT if observed else ((pixels > 0) & (pixels < sizes)).all(dim=-1)
+    return tuple(pixels[view, chosen & shown[view]] for view in range(cameras.num_views))

@@ -4,10 +4,10 @@ Cuts start from labels that are certain: of points, of parallax and, after a vot
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.ground.geometry.opencv import (
@@ -27,21 +27,26 @@ from pimper_torch.ground.geometry.opencv import (
     without_specks,
 )
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.ground.shapes import Map, Mask, Masks, Pixels, Scalar
+from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Pixels, Scalar, ViewMask
 from pimper_torch.method.silhouettes.cues import (
     FEW,
     MIN_POINTS,
     Cues,
-    SilhouetteDetails,
     pointed_at,
 )
 from pimper_torch.method.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.records import Record, Silhouettes
 from pimper_torch.runtime.mapped import by_view
 
-# Fractions of the views that may lack what the others have in common, tried in turn until that
-# takes so much of a median mask; a mask that shows less than this of it is of something else.
-_DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
+# Chosen on the four rendered scenes and the skull (benchmarks/silhouettes.py).
+_ITERATIONS = 2  # of cutting and voting after the first cut
+NUM_VOXELS = 500_000  # of the hull
+_DISAGREEING = 0.05  # fraction of the views that may see a voxel of the hull outside
+
+# Fractions of the views that may lack what the others have in common, tried in turn after that
+# until it takes so much of a median mask; a mask that shows less than this of it is of something
+# else.
+_MORE_DISAGREEING, _COMMON, _HELD = (0.15, 0.3, 0.45), 0.2, 0.5
 
 # Lengths are fractions of the pictures' longer side.
 _DISC = 1 / 400  # about a point: its feature is larger, but may reach over the silhouette
@@ -72,15 +77,15 @@ class Cuts(Record):
     """
 
     masks: Masks
-    margins_px: Float[Tensor, "view height width"]
+    margins_px: Maps
     exposed: Float[Tensor, " view"]
     held: Float[Tensor, " view"]
     on_plane: bool
-    doubted: Bool[Tensor, " view"]
+    doubted: ViewMask
     hidden: Masks | None = None
 
 
-def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
+def cut_in_iterations(cues: Cues) -> Cuts | None:
     """Cut every view, vote, and cut again from what the vote says.
 
     Before every vote the plane's texture is learned anew where the cuts do not hide it: holes
@@ -91,14 +96,14 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
         ``None`` where the cuts have nothing in common.
     """
     masks, unknown = _first(cues), _unknown(cues)
-    doubted = _doubted(cues, masks, details)
+    doubted = _doubted(cues, masks)
     cues, voting = cues.without(doubted)
-    for _ in range(details.iterations):
+    for _ in range(_ITERATIONS):
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
         abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
         likely = by_view(torch.bitwise_or, masks, _likely(cues))
-        seen = _voted(cues, likely, details, abstain, voting)
+        seen = _voted(cues, likely, abstain, voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
@@ -106,7 +111,7 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
     hidden = _in_front(cues, masks)
-    seen = _voted(cues, masks, details, hidden)
+    seen = _voted(cues, masks, hidden)
     if seen is None:
         return None
     hidden = by_view(lambda at, margin: at & (margin > 0), hidden, seen)
@@ -115,23 +120,14 @@ def cut_in_iterations(cues: Cues, details: SilhouetteDetails) -> Cuts | None:
     return found.replace(hidden=hidden) if bool(hidden.any()) else found
 
 
-def cuts_of(
-    cues: Cues,
-    masks: Masks,
-    margins_px: Float[Tensor, "view height width"],
-    doubted: Bool[Tensor, " view"],
-) -> Cuts:
+def cuts_of(cues: Cues, masks: Masks, margins_px: Maps, doubted: ViewMask) -> Cuts:
     """Compare cuts with backgrounds and points."""
-
-    def exposed(view: int) -> Scalar:
-        agreement = None if cues.agreement is None else cues.agreement[view]
-        return exposed_fraction(masks[view], agreement)
-
+    views = len(masks)
     return Cuts(
         masks=masks,
         margins_px=margins_px,
-        exposed=of_views(exposed, len(masks)),
-        held=of_views(lambda view: held_fraction(masks[view], cues.object_px[view]), len(masks)),
+        exposed=of_views(lambda at: exposed_fraction(masks[at], cues.agreement_in(at)), views),
+        held=of_views(lambda at: held_fraction(masks[at], cues.object_px[at]), views),
         on_plane=cues.plane is not None,
         doubted=doubted,
     )
@@ -162,7 +158,7 @@ def _first(cues: Cues) -> Masks:
 
     def first(view: int) -> Mask:
         object_px = cues.object_px[view]
-        agreement = None if cues.agreement is None else cues.agreement[view]
+        agreement = cues.agreement_in(view)
         if cues.soft is not None and cues.soft.given[view]:
             mask = cues.soft.masks[view]
             return mask if agreement is None else mask & ~surely_on_plane(agreement)
@@ -175,14 +171,12 @@ def _first(cues: Cues) -> Masks:
     return of_views(first, cues.num_views)
 
 
-def _again(
-    cues: Cues, masks: Masks, seen: Float[Tensor, "view height width"], unknown: Masks
-) -> Masks:
+def _again(cues: Cues, masks: Masks, seen: Maps, unknown: Masks) -> Masks:
     """Cut from the last cut and the hull; drop what does not meet the hull."""
 
     def again(view: int) -> Mask:
         object_px = cues.object_px[view]
-        agreement = None if cues.agreement is None else cues.agreement[view]
+        agreement = cues.agreement_in(view)
         labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
         if cues.soft is not None and cues.soft.given[view]:
             labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
@@ -220,13 +214,13 @@ def _likely(cues: Cues) -> Masks:
     return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
-def _doubted(cues: Cues, masks: Masks, details: SilhouetteDetails) -> Bool[Tensor, " view"]:
+def _doubted(cues: Cues, masks: Masks) -> ViewMask:
     """Find soft masks that lack most of what most of them have in common; all if that is little."""
     if cues.soft is None or int(cues.soft.given.sum()) < FEW:
         return torch.zeros(len(masks), dtype=torch.bool)
     given = cues.soft.given
-    for disagreeing in (details.disagreeing, *_DISAGREEING):
-        seen = _voted(cues, masks, replace(details, disagreeing=disagreeing), None, given)
+    for disagreeing in (_DISAGREEING, *_MORE_DISAGREEING):
+        seen = _voted(cues, masks, None, given, disagreeing)
         if seen is not None:
             common = seen > 0
             shown, own = (one.sum(dim=(1, 2)).clamp_min(1) for one in (common, masks))
@@ -245,10 +239,10 @@ def _unknown(cues: Cues) -> Masks:
 def _voted(
     cues: Cues,
     masks: Masks,
-    details: SilhouetteDetails,
     unknown: Masks | None = None,
-    voting: Bool[Tensor, " view"] | None = None,
-) -> Float[Tensor, "view height width"] | None:
+    voting: ViewMask | None = None,
+    disagreeing: float = _DISAGREEING,
+) -> Maps | None:
     """Build the hull above the plane, of what is pointed at, and see it in every view.
 
     Args:
@@ -263,8 +257,8 @@ def _voted(
         silhouettes,
         cameras,
         cues.box_world,
-        num_voxels=details.num_voxels,
-        disagreeing=details.disagreeing,
+        num_voxels=NUM_VOXELS,
+        disagreeing=disagreeing,
         unknown=unknown,
     )
     if hull is None:

@@ -3,14 +3,17 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.geometry.supporting_plane import PlaneSearch
 from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_hull
-from pimper_torch.method.silhouettes.cues import Cues, SilhouetteDetails, cues_of
-from pimper_torch.method.silhouettes.cuts import Cuts, cut_in_iterations
+from pimper_torch.ground.shapes import ViewMask
+from pimper_torch.method.silhouettes.cues import Cues, cues_of
+from pimper_torch.method.silhouettes.cuts import NUM_VOXELS, Cuts, cut_in_iterations
 from pimper_torch.method.silhouettes.reliability import (
-    Agreement,
+    MAX_EXPOSED,
+    MIN_HELD,
     agreement_of,
     contradictory,
     silhouettes_of,
@@ -24,6 +27,9 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view
 from pimper_torch.runtime.stage import Stage
 
+# Intersection over union of silhouettes and projections, in the median, below which silhouettes are
+# not reliable.
+_MIN_OVERLAP = 0.8
 _USED = 0.25  # probability above which a pixel is used as the object's
 _UNLIKE = "its soft mask lacks most of what the others have in common"
 _BY_HULL = "The hull of the other masks stands in for them, and they do not constrain the surface"
@@ -32,12 +38,9 @@ _BY_HULL = "The hull of the other masks stands in for them, and they do not cons
 class FindSilhouettes(Stage):
     """Find the object's silhouette in every view; a constant to autograd."""
 
-    def __init__(
-        self, config: SilhouetteConfig | None = None, details: SilhouetteDetails | None = None
-    ) -> None:
+    def __init__(self, config: SilhouetteConfig | None = None) -> None:
         super().__init__()
         self.config = config or SilhouetteConfig()
-        self.details = details or SilhouetteDetails()
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> Silhouettes:
@@ -85,7 +88,7 @@ class FindSilhouettes(Stage):
         cameras, box = scene.cameras.to(torch.float32), box_round(others, scene.cameras)
         hull = None
         if box is not None:
-            hull = visual_hull(others, cameras, box.float(), num_voxels=self.details.num_voxels)
+            hull = visual_hull(others, cameras, box.float(), num_voxels=NUM_VOXELS)
         within = scene.views.inside
         inside = by_view(Tensor.detach, silhouettes.inside)
         for view in doubted.nonzero()[:, 0].tolist():
@@ -99,59 +102,67 @@ class FindSilhouettes(Stage):
 
     def _found(self, scene: SparseScene) -> Silhouettes:
         """Find silhouettes in photographs between which the object was not moved."""
-        cues = cues_of(scene, self.config, self.details)
-        cuts, doubt = self._cut(cues)
+        cues = cues_of(scene, self.config)
+        cuts, doubt = _cut(cues)
         if doubt and cues.soft is not None and not cues.soft.points:
             # Several things stand apart: the one that cameras look at is likelier than all.
-            cuts, doubt = self._cut(cues.looked_at())
+            cuts, doubt = _cut(cues.looked_at())
         leave_out("silhouettes.doubt", bool(doubt))
         if cuts is None or doubt:
-            _warn(doubt, cues.plane is not None)
-            return Silhouettes.everything(scene.views, self._top(cues))
+            above = cues.plane is not None
+            what = "above the plane that it stands on" if above else "that the photographs show"
+            caution(
+                f"Everything {what} is taken for the object: {doubt}. Give masks, or a box round "
+                "the object (`silhouettes.region`); `silhouettes.object` everything says that this "
+                "is meant.",
+                stacklevel=2,
+            )
+            return Silhouettes.everything(scene.views, _top(cues))
         _tell(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
-        return _believed(silhouettes_of(cuts, scene.views, self.details), scene.views.names)
+        return _believed(silhouettes_of(cuts, scene.views), scene.views.names)
 
-    def _cut(self, cues: Cues) -> tuple[Cuts | None, str]:
-        """Cut all views, and state why the cuts are unreliable, or nothing."""
-        cuts = None
-        if cues.agreement is not None or cues.has_points or cues.soft is not None:
-            cuts = cut_in_iterations(cues, self.details)
-        if cuts is None:
-            return None, "the views' silhouettes have nothing in common"
-        return cuts, self._doubt(agreement_of(cuts))
 
-    def _top(self, cues: Cues) -> Float[Tensor, "plane 4"] | None:
-        """Return the upper side of the supporting plane, as thick as its points are rough."""
-        if cues.plane is None:
-            return None
-        thickness = self.details.plane.tolerance * cues.fixation.distance
-        height = cues.plane.offset + thickness
-        return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
+def _cut(cues: Cues) -> tuple[Cuts | None, str]:
+    """Cut all views, and state why the cuts are unreliable, or nothing."""
+    cuts = None
+    if cues.agreement is not None or cues.has_points or cues.soft is not None:
+        cuts = cut_in_iterations(cues)
+    if cuts is None:
+        return None, "the views' silhouettes have nothing in common"
+    return cuts, _doubt(cuts)
 
-    def _doubt(self, agreement: Agreement) -> str:
-        reliable = agreement.reliable(self.details)
-        overlap = float(agreement.overlap.median())
-        if overlap < self.details.min_overlap:
-            return (
-                f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
-                f"needed: {self.details.min_overlap:.0%}"
-            )
-        exposed, held = float(agreement.exposed.median()), float(agreement.held.median())
-        if exposed > self.details.max_exposed:
-            return (
-                f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
-                f"the median; at most: {self.details.max_exposed:.0%}"
-            )
-        if held < self.details.min_held:
-            return (
-                f"silhouettes hold {held:.0%} of the object's points in the median; needed: "
-                f"{self.details.min_held:.0%}"
-            )
-        if int(reliable.sum()) < max(3, len(reliable) / 2):
-            return (
-                f"only {int(reliable.sum())} of {len(reliable)} silhouettes agree with the others"
-            )
-        return ""
+
+def _top(cues: Cues) -> Float[Tensor, "plane 4"] | None:
+    """Return the upper side of the supporting plane, as thick as its points are rough."""
+    if cues.plane is None:
+        return None
+    thickness = PlaneSearch().tolerance * cues.fixation.distance
+    height = cues.plane.offset + thickness
+    return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
+
+
+def _doubt(cuts: Cuts) -> str:
+    overlaps, reliable = agreement_of(cuts)
+    overlap = float(overlaps.median())
+    if overlap < _MIN_OVERLAP:
+        return (
+            f"silhouettes overlap with the hull of all views by {overlap:.0%} in the median; "
+            f"needed: {_MIN_OVERLAP:.0%}"
+        )
+    exposed, held = float(cuts.exposed.median()), float(cuts.held.median())
+    if exposed > MAX_EXPOSED:
+        return (
+            f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
+            f"the median; at most: {MAX_EXPOSED:.0%}"
+        )
+    if held < MIN_HELD:
+        return (
+            f"silhouettes hold {held:.0%} of the object's points in the median; needed: "
+            f"{MIN_HELD:.0%}"
+        )
+    if int(reliable.sum()) < max(3, len(reliable) / 2):
+        return f"only {int(reliable.sum())} of {len(reliable)} silhouettes agree with the others"
+    return ""
 
 
 def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
@@ -200,22 +211,12 @@ def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
     return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
 
 
-def _tell(views: Bool[Tensor, " view"], names: tuple[str, ...], reason: str, done: str) -> None:
+def _tell(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> None:
     skipped(
         *(
             Failure(stage="silhouettes", what="view", name=names[view], reason=reason, done=done)
             for view in views.nonzero()[:, 0].tolist()
         )
-    )
-
-
-def _warn(why: str, on_plane: bool) -> None:
-    what = "above the plane that it stands on" if on_plane else "that the photographs show"
-    caution(
-        f"Everything {what} is taken for the object: {why}. Give masks, or a "
-        "box round the object (`silhouettes.region`); `silhouettes.object` everything says that "
-        "this is meant.",
-        stacklevel=3,
     )
 
 

@@ -19,7 +19,7 @@ from pimper_torch.ground.geometry.opencv import shrunk, warped, window_means
 from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.ground.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.ground.radiometry.response import srgb_from_linear
-from pimper_torch.ground.shapes import Map, Mask, Masks, Matrix3
+from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Matrix3
 from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -41,7 +41,7 @@ class WorkingPictures(Record):
 
     colours: UInt8[Tensor, "view height width 3"]
     opponent: UInt8[Tensor, "view height width 3"]
-    grey: Float[Tensor, "view height width"]
+    grey: Maps
     cameras: Cameras
     factors: tuple[float, float]
 
@@ -121,7 +121,7 @@ class Raster(Record):
 
 def plane_agreement(
     pictures: WorkingPictures, plane: Plane, fixation: Fixation, hidden: Masks | None = None
-) -> Float[Tensor, "view height width"]:
+) -> Maps:
     """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
 
     Args:
@@ -137,7 +137,7 @@ def room_agreement(
     pictures: WorkingPictures,
     background_from_view: Float[Tensor, "view 3 3"],
     hidden: Masks | None = None,
-) -> Float[Tensor, "view height width"]:
+) -> Maps:
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
     Args:
@@ -151,7 +151,7 @@ def room_agreement(
 
 def texture_agreement(
     pictures: WorkingPictures, near: Raster, far: Raster, hidden: Masks | None = None
-) -> Float[Tensor, "view height width"]:
+) -> Maps:
     r"""Return how well each view agrees with the texture of a background.
 
     Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
@@ -186,9 +186,7 @@ def texture_agreement(
     return of_views(agreement_of, count)
 
 
-def _common(
-    values: Float[Tensor, "view height width"], hidden: Masks, raster: Raster
-) -> tuple[Float[Tensor, "view height width"], Float[Tensor, "view height width"]]:
+def _common(values: Maps, hidden: Masks, raster: Raster) -> tuple[Maps, Maps]:
     """Return the views' median on a background, and its spread, as each view sees it."""
     maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
     sees = maps.isfinite().flatten(1).all(dim=1).tolist()

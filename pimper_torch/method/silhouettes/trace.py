@@ -2,7 +2,7 @@
 
 import torch
 
-from pimper_torch.ground.geometry.contours import Contours, RayConfig, contour_rays
+from pimper_torch.ground.geometry.contours import Contours, contour_rays
 from pimper_torch.ground.geometry.visual_hull import box_round, visual_hull
 from pimper_torch.records import Cameras, Silhouettes
 from pimper_torch.runtime.errors import caution
@@ -17,10 +17,6 @@ _DISAGREEING = {"masks": 0.03, "found": 0.1}
 
 class TraceContours(Stage):
     """Turn silhouettes into constraints on the surface; a constant to autograd."""
-
-    def __init__(self, config: RayConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or RayConfig()
 
     @torch.no_grad()
     def forward(self, silhouettes: Silhouettes, cameras: Cameras) -> Contours:
@@ -48,5 +44,5 @@ class TraceContours(Stage):
                 stacklevel=2,
             )
             return Contours.none(silhouettes, cameras)
-        rays = contour_rays(silhouettes, cameras, self.config)
+        rays = contour_rays(silhouettes, cameras)
         return Contours(silhouettes=silhouettes, rays=rays, cameras=cameras, hull=hull)
