@@ -31,7 +31,6 @@ from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.method.coarse.fine_surface import (
-    POINT_PX,
     REACH_PX,
     TOLERANCE_PX,
     closed_surface,
@@ -102,7 +101,7 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     reliable = reliable_points(scene)
     inside = reliable[hull.depth_of(scene.points_world[reliable]) > 0]
     part = cropped(scene, silhouettes)
-    cloud, maps, pixel = matched_cloud(part, inside, builder.densify, POINT_PX)
+    cloud, maps, pixel = matched_cloud(part, inside, builder.config.levels)
     away, cell = TOLERANCE_PX * pixel, CELL_PX * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
@@ -116,11 +115,12 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
 
     def facets(some: Surface) -> Surface:
         vertices, faces = some
-        counts = view_counts(vertices, faces, maps.level, maps)
+        reach = REACH_PX * pixel
+        counts = view_counts(vertices, faces, maps.level, maps, cloud.points_world, reach)
         centre = vertices[faces].mean(dim=1)
-        support = supports(centre, cloud, contour, counts, REACH_PX * pixel)
+        support = supports(centre, cloud, contour, counts, reach)
         within = hull.depth_of(centre) > -max(away, float(hull.spacing))
-        kept = seen_surface(vertices, faces, support, counts, within, pixel, builder.fine)
+        kept = seen_surface(vertices, faces, support, counts, within, pixel, 0.01)
         used, faces = torch.unique(faces[kept], return_inverse=True)
         mesh = Mesh(vertices_world=vertices[used], faces=faces)
         few = reduced(mesh, builder.config.num_facets)

@@ -23,10 +23,7 @@ MAY_BE_INFINITE = {
     "ExtractConfig.max_expected_error",
     "ExtractConfig.max_hole",
     "ExtractConfig.max_stretch",
-    "FineSurfaceConfig.hole_px",
     "RemeshConfig.max_departure",
-    "RepairConfig.max_extent",
-    "RepairConfig.max_stretch",
     "WarpConfig.saturation_level",
 }
 

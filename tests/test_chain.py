@@ -239,7 +239,7 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     settings = {"scales": [0.5, 1.0]} | (
         {} if masked else {"silhouettes": {"object": "everything"}}
     )
-    result = pt.load_chain("default", settings, coarse_surface=CoarseSurface(*ball.SETTINGS))(scene)
+    result = pt.load_chain("default", settings, coarse_surface=CoarseSurface(ball.SETTINGS))(scene)
     mesh, coarse = result.mesh, result.coarse.mesh
     off = mesh.vertices_world.norm(dim=1) - 1
     chords = coarse.vertices_world[coarse.faces].mean(dim=1).norm(dim=1) - 1
@@ -256,7 +256,7 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
 def test_fast_is_closed_all_round_in_one_pass():
     scene = ball.photographed(ball.all_round())
     views = scene.views.replace(masks=ball.silhouettes_of(scene.cameras).masks)
-    result = pt.load_chain("fast", coarse_surface=CoarseSurface(*ball.SETTINGS))(
+    result = pt.load_chain("fast", coarse_surface=CoarseSurface(ball.SETTINGS))(
         scene.replace(views=views)
     )
     off = result.mesh.vertices_world.norm(dim=1) - 1

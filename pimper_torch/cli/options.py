@@ -99,7 +99,7 @@ class CommonOptions:
     def __post_init__(self) -> None:
         bytes_of(self.max_kept, "max_kept")
         _ = self.files  # refused before anything is read
-        # The smallest photographs in which depth is searched; see DensifyConfig.
+        # The smallest photographs in which depth is searched.
         sound = self.max_size_px == 0 or self.max_size_px >= 32
         require(sound, "max_size_px", self.max_size_px, "0, or 32 pixels at least")
 

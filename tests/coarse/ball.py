@@ -8,18 +8,10 @@ from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.coarse.coarse_config import (
-    CoarseSurfaceConfig,
-    DensifyConfig,
-    FineSurfaceConfig,
-)
+from pimper_torch.method.coarse.coarse_config import CoarseSurfaceConfig
 from pimper_torch.records import Silhouettes
 
-SETTINGS = (
-    CoarseSurfaceConfig(num_facets=600),
-    DensifyConfig(coarsest_px=120, levels=1, max_hypotheses=48),
-    FineSurfaceConfig(hole_px=12.0),
-)
+SETTINGS = CoarseSurfaceConfig(num_facets=600, levels=1)
 
 
 def mottled(points):

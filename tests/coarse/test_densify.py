@@ -139,13 +139,13 @@ def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_s
     depth = truth.depth.float()
     inverse_depth = torch.where(depth.isfinite(), 1 / depth, 0.0)
     good, others = depth.isfinite(), torch.tensor([1, 3])
-    count = agreeing(level, inverse_depth, good, 2, others, 1.0)
+    count = agreeing(level, inverse_depth, good, 2, others)
     inner = good[2] & (truth.normals_world[2][..., 2] > 0.7)
     assert float((count[inner] == 2).double().mean()) > 0.98
     assert not bool(count[~good[2]].any())
     wrong = inverse_depth.clone()
     wrong[3] *= 1.1
-    count = agreeing(level, wrong, good, 2, others, 1.0)
+    count = agreeing(level, wrong, good, 2, others)
     assert float((count[inner] == 1).double().mean()) > 0.98
 
 
@@ -165,7 +165,7 @@ def test_a_poisson_surface_is_the_same_whatever_was_made_before_it():
 def test_sources_are_the_views_at_angles_that_match_well():
     _, scene = ball(9)  # 50 degrees in all: 6 between neighbours
     everyone = torch.arange(len(scene.points_world))
-    found = choose_sources(scene, everyone, 4, 4)
+    found = choose_sources(scene, everyone, 4)
     rays = normalize(scene.cameras.centers_world, dim=1)
     angle = torch.rad2deg((rays @ rays[4]).clamp(-1, 1).acos())
     assert set(found[:2].tolist()) == {2, 6}  # 12 degrees, the best there is
@@ -174,7 +174,7 @@ def test_sources_are_the_views_at_angles_that_match_well():
     # Without shared points no view is a source.
     seen_by_4 = scene.observed[:, 4]
     alone = (scene.observation_view == 4) | ~seen_by_4[scene.observation_point]
-    assert len(choose_sources(observing(scene, alone), everyone, 4, 4)) == 0
+    assert len(choose_sources(observing(scene, alone), everyone, 4)) == 0
 
 
 def test_a_step_of_inverse_depth_moves_points_by_a_pixel():

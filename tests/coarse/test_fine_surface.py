@@ -8,7 +8,7 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import face_components, face_pairs
-from pimper_torch.method.coarse.coarse_config import FineSurfaceConfig
+from pimper_torch.method.coarse import trim
 from pimper_torch.method.coarse.fine_surface import closed_surface, cropped
 from pimper_torch.method.coarse.oriented import no_points
 from pimper_torch.method.coarse.surface import CoarseSurface
@@ -18,7 +18,11 @@ from pimper_torch.records import Support
 from pimper_torch.runtime.errors import ReconstructionError
 from tests.coarse.ball import SETTINGS, mottled, photographed, silhouettes_of
 
-SMALL_HOLES = FineSurfaceConfig(hole_px=0.3**0.5)  # closed up to an area of 0.3 with pixels of 1
+
+@pytest.fixture
+def small_holes(monkeypatch):
+    """They are closed up to an area of 0.3 with pixels of 1."""
+    monkeypatch.setattr(trim, "HOLE_PX", 0.3**0.5)
 
 
 def white(points):
@@ -34,7 +38,7 @@ def built(scene, some=lambda points: points[:, 2] > -2):
     """The coarse mesh of a ball with its silhouettes, on some points of its cloud."""
     errors = torch.where(some(scene.points_world), 0.5, 100.0)
     scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
-    return CoarseSurface(*SETTINGS)(
+    return CoarseSurface(SETTINGS)(
         scene, TraceContours()(silhouettes_of(scene.cameras), scene.cameras)
     )
 
@@ -85,7 +89,7 @@ def test_what_no_view_sees_is_left_out():
     assert off[mesh.vertices_world[:, 2] > 0].mean() < 0.02
 
 
-def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay():
+def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay(small_holes):
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     cover, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
@@ -94,14 +98,14 @@ def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay():
     support = torch.full_like(count, Support.LIGHT)
     support[centre[:, 0] > 0.9] = Support.CONTOUR
     everywhere = torch.ones_like(cover)
-    kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES)
+    kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, 0.01)
     assert bool((kept == ~cover).all())  # the cover's area is 1.2, the speck's 0.2
     # Nothing is dropped where points are.
     support[cover] = Support.POINTS
-    assert bool(seen_surface(vertices, faces, support, counts, everywhere, 1.0, SMALL_HOLES).all())
+    assert bool(seen_surface(vertices, faces, support, counts, everywhere, 1.0, 0.01).all())
 
 
-def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
+def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes(monkeypatch):
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     bottom, back, cover = centre[:, 2] > 0.97, centre[:, 2] < -0.5, centre[:, 0] > 0.97
@@ -111,16 +115,16 @@ def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes():
     counts = ViewCounts(seen=seen, lit=seen, behind=torch.where(cover, 2, 0))
     support = torch.where(seen > 0, Support.POINTS, Support.NOTHING)
     everywhere = torch.ones_like(cover)
-    config = FineSurfaceConfig(hole_px=0.0)
+    monkeypatch.setattr(trim, "HOLE_PX", 0.0)
 
-    def kept(inside=everywhere, config=config):
-        return seen_surface(vertices, faces, support, counts, inside, 1.0, config)
+    def kept(inside=everywhere):
+        return seen_surface(vertices, faces, support, counts, inside, 1.0, 0.01)
 
     assert bool((kept() == ~(back | cover)).all())
     # One face of it behind which something is seen, or outside the hull, opens all of it.
     assert bool((kept(inside=everywhere & (centre[:, 2] < centre[:, 2].max())) == (seen > 0)).all())
-    none = FineSurfaceConfig(hole_px=0.0, max_unseen=0.0)
-    assert bool((kept(config=none) == (seen > 0)).all())
+    monkeypatch.setattr(trim, "MAX_UNSEEN", 0.0)
+    assert bool((kept() == (seen > 0)).all())
 
 
 def test_pieces_that_neither_points_nor_contours_support_go():
@@ -130,14 +134,16 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     count = torch.full((len(two[1]),), 3)
     counts = ViewCounts(seen=count, lit=count, behind=0 * count)
     support = torch.where(first, Support.POINTS, Support.LIGHT)
-    kept = seen_surface(*two, support, counts, torch.ones_like(first), 1.0, FineSurfaceConfig())
+    kept = seen_surface(*two, support, counts, torch.ones_like(first), 1.0, 0.01)
     assert bool((kept == first).all())
 
 
 @pytest.mark.parametrize(
     ("share", "stays", "views"), [(0.3, False, 2), (0.2, True, 2), (0.3, False, 1)]
 )
-def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(share, stays, views):
+def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(
+    small_holes, share, stays, views
+):
     vertices, faces = icosphere(2)
     two = torch.cat([vertices, 0.9 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     index = torch.arange(len(two[1]))
@@ -147,7 +153,7 @@ def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(shar
 
     def kept(behind):
         counts = ViewCounts(seen=count, lit=count, behind=views * behind.long())
-        return seen_surface(*two, support, counts, torch.ones_like(first), 1.0, SMALL_HOLES)
+        return seen_surface(*two, support, counts, torch.ones_like(first), 1.0, 0.01)
 
     rest = ~through if views == 2 else torch.ones_like(first)
     assert bool((kept(through) == (first | (rest & stays))).all())

@@ -24,7 +24,7 @@ from tests.coarse.ball import SETTINGS, photographed
 def built(scene, mesh=None):
     """The coarse mesh of photographs without silhouettes."""
     contours = Contours.none(Silhouettes.everything(scene.views), scene.cameras)
-    return CoarseSurface(*SETTINGS)(scene, contours, mesh)
+    return CoarseSurface(SETTINGS)(scene, contours, mesh)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_what_lies_below_the_supporting_plane_gets_no_facets(whole, round_about)
     plane = torch.tensor([0.0, 0.6, 0.8, -0.2])
     silhouettes = Silhouettes.everything(round_about.views, plane[None])
     contours = Contours.none(silhouettes, round_about.cameras)
-    mesh = CoarseSurface(*SETTINGS)(round_about, contours).mesh
+    mesh = CoarseSurface(SETTINGS)(round_about, contours).mesh
     side = 0.15  # of a facet
     height = mesh.vertices_world.double() @ plane[:3].double() + plane[3]
     assert -side < height.min() < side

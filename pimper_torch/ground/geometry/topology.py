@@ -102,8 +102,7 @@ def dilated(faces: Faces, some: FaceMask, rings: int, num_vertices: int) -> Face
 
 def connected_to(faces: Faces, among: FaceMask, marked: FaceMask) -> FaceMask:
     """Find the connected components of the faces ``among`` that have a marked face."""
-    pairs, _ = face_pairs(faces)
-    label = graph_components(pairs[among[pairs].all(dim=1)], len(faces))
+    label = face_components(faces, among)
     count = torch.zeros_like(label).index_add(0, label, (marked & among).long())
     return among & (count[label] > 0)
 
@@ -123,9 +122,15 @@ def vertex_components(faces: Faces, among: VertexMask) -> Int[Tensor, " vertex"]
     return graph_components(edges[among[edges].all(dim=1)], len(among))
 
 
-def face_components(faces: Faces) -> Int[Tensor, " face"]:
-    """Label faces connected by edges with exactly two faces; a common vertex is not enough."""
+def face_components(faces: Faces, among: FaceMask | None = None) -> Int[Tensor, " face"]:
+    """Label faces connected by edges with exactly two faces; a common vertex is not enough.
+
+    Args:
+        among: Faces that connect; every other one is a component alone. All by default.
+    """
     pairs, _ = face_pairs(faces)
+    if among is not None:
+        pairs = pairs[among[pairs].all(dim=1)]
     return graph_components(pairs, len(faces))
 
 

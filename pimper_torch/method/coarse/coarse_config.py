@@ -7,49 +7,6 @@ from pimper_torch.runtime.config import Range, require_ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DensifyConfig:
-    """The resolutions at which depth maps are searched.
-
-    Attributes:
-        coarsest_px: Longer side of the photographs, about, where the whole range of depths
-            is searched.
-        levels: How often the resolution doubles from there, that included.
-        max_hypotheses: Of the search of the whole range.
-    """
-
-    coarsest_px: Annotated[int, Range(least=32, most=65_535)] = 100
-    levels: Annotated[int, Range(least=1, most=16)] = 3
-    max_hypotheses: Annotated[int, Range(least=8, most=10_000)] = 160
-
-    def __post_init__(self) -> None:
-        require_ranges(self)
-
-    def factors(self, longest_px: int) -> tuple[int, ...]:
-        """Return by how much photographs of that size are reduced, the coarsest first."""
-        coarsest = max(1, round(longest_px / self.coarsest_px))
-        return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(self.levels)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FineSurfaceConfig:
-    """Which holes of the surface are closed.
-
-    Attributes:
-        hole_px: Side of a square as large as the largest hole that is closed whatever made it,
-            pixels of the finest depth maps. Strips along a border that are narrower go, where
-            they are small or unsupported.
-        max_unseen: Fraction of the area seen that a hole may have which only lack of views made,
-            such as the bottom of a deep concavity, to be closed.
-    """
-
-    hole_px: Annotated[float, Range(least=0)] = 24.0
-    max_unseen: Annotated[float, Range(least=0, below=1)] = 0.02
-
-    def __post_init__(self) -> None:
-        require_ranges(self, "fine_surface")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseSurfaceConfig:
     """The reference view and the size of the coarse mesh.
 
@@ -62,11 +19,10 @@ class CoarseSurfaceConfig:
 
     reference: str = ""
     num_facets: Annotated[int, Range(least=4, most=1_000_000)] = 3000
-    levels: int = 3
+    levels: Annotated[int, Range(least=1, most=16)] = 3
 
     def __post_init__(self) -> None:
         require_ranges(self, "coarse_surface")
-        DensifyConfig(levels=self.levels)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

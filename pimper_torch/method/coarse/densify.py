@@ -12,21 +12,26 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.shapes import Map, Mask, Masks, Pixels
-from pimper_torch.method.coarse.coarse_config import DensifyConfig
+from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Pixels
 from pimper_torch.method.coarse.window_matching import (
     Matcher,
     MatchingLevel,
     Pairing,
-    Windows,
     level_of,
     pair,
+    pixels_from_pixels,
     shifted,
 )
 from pimper_torch.records import Record, SparseScene
 from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
+
+# Longer side of the photographs, about, where the whole range of depths is searched.
+_COARSEST_PX = 100
+
+# Hypotheses of the search of the whole range, at most.
+_MOST_HYPOTHESES = 160
 
 # Views that a view is matched with. A choice.
 _NUM_SOURCES = 5
@@ -63,17 +68,27 @@ class DepthMaps(Record):
 
     factor: int
     level: MatchingLevel
-    inverse_depth: Float[Tensor, "view height width"]
+    inverse_depth: Maps
     agreed: Int[Tensor, "view height width"]
     valid: Masks
     step: Float[Tensor, " view"]
     sources: Int[Tensor, "view source"]
 
 
+def factors(longest_px: int, levels: int) -> tuple[int, ...]:
+    """Return by how much photographs of that size are reduced, the coarsest first."""
+    coarsest = max(1, round(longest_px / _COARSEST_PX))
+    return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(levels)))
+
+
 def depth_maps(
-    scene: SparseScene, points: Int[Tensor, " chosen"], config: DensifyConfig
+    scene: SparseScene, points: Int[Tensor, " chosen"], levels: int
 ) -> tuple[DepthMaps, ...]:
     """Search every view's depths: the whole range at low resolution, then near what was found.
+
+    Args:
+        levels: How often the resolution doubles from a longer side of about 100 pixels, that
+            included.
 
     Returns:
         The maps of every resolution, the coarsest first.
@@ -82,37 +97,31 @@ def depth_maps(
     2016, for windows, sources and consistency; planes are swept in place of random search.
     """
     maps: list[DepthMaps] = []
-    for factor in config.factors(max(scene.views.images.shape[-2:])):
+    chosen = [choose_sources(scene, points, view) for view in range(scene.cameras.num_views)]
+    for factor in factors(max(scene.views.images.shape[-2:]), levels):
         level = level_of(scene, factor)
-        search = partial(_search, scene, points, level, config, maps[-1] if maps else None)
+        search = partial(_search, scene, points, level, chosen, maps[-1] if maps else None)
         # Small results among what threads free would keep their memory from being used again.
         fields = zeros((2, *level.tone.shape), level.tone.dtype, level.tone.device)
-        found = []
-        for view, one in enumerate(side_by_side(search, range(scene.cameras.num_views))):
-            fields[0, view], fields[1, view] = one.inverse_depth, one.score
-            found.append(one.replace(inverse_depth=fields[0, view], score=fields[1, view]))
-        maps.append(_checked(factor, level, fields, found))
+        steps = []
+        for view, (found, score, step) in enumerate(side_by_side(search, range(len(chosen)))):
+            fields[0, view], fields[1, view] = found, score
+            steps.append(step)
+        maps.append(_checked(factor, level, fields, steps, chosen))
         release_memory()
     return tuple(maps)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Found(Record):
-    inverse_depth: Map
-    score: Map
-    step: float
-    sources: Int[Tensor, " source"]
 
 
 def _search(
     scene: SparseScene,
     points: Int[Tensor, " chosen"],
     level: MatchingLevel,
-    config: DensifyConfig,
+    chosen: Sequence[Int[Tensor, " source"]],
     before: DepthMaps | None,
     view: int,
-) -> _Found:
-    sources = choose_sources(scene, points, view, _NUM_SOURCES)
+) -> tuple[Map, Map, float]:
+    """Return a view's inverse depths, their scores, and the step that moves a pixel by one."""
+    sources = chosen[view]
     here, cameras = points[scene.observed[points, view]], level.cameras
     pixels, depth = project(
         scene.points_world[here], cameras.cam_from_world[view], cameras.intrinsics[view]
@@ -121,52 +130,49 @@ def _search(
     pixels, known = pixels[within], 1 / depth[within]
     blank = torch.zeros_like(level.tone[view])
     if len(sources) == 0 or len(known) < 3:
-        return _Found(inverse_depth=blank, score=blank, step=0.0, sources=sources)
+        return blank, blank, 0.0
     pairing = pair(level, view, sources)
-    matcher = Matcher(level, pairing, Windows())
+    matcher = Matcher(level, pairing)
     step = step_for_one_pixel(pairing, pixels, known)
     if before is None:
-        found, score = _whole_range(matcher, pixels, known, blank, step, config.max_hypotheses)
+        found, _ = _whole_range(matcher, pixels, known, blank, step)
     else:
         field = filled(before, view)
         field = interpolate(field[None, None], blank.shape, mode="bilinear", align_corners=False)
-        found, score = _near(matcher, field[0, 0], step)
-    field = median3(found)
-    found, score = sweep(matcher, field, [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)])
-    return _Found(inverse_depth=found, score=score, step=step, sources=sources)
+        found, _ = _near(matcher, field[0, 0], step)
+    offsets = [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)]
+    return *sweep(matcher, median3(found), offsets), step
 
 
 def _whole_range(
-    matcher: Matcher,
-    pixels: Pixels,
-    known: Float[Tensor, " point"],
-    blank: Map,
-    step: float,
-    max_hypotheses: int,
+    matcher: Matcher, pixels: Pixels, known: Float[Tensor, " point"], blank: Map, step: float
 ) -> tuple[Map, Map]:
     """Search planes parallel to the image, then offsets of a smooth surface through the points."""
     low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
     low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
     low = max(low, 0.1 * high)
-    count = min(max_hypotheses, max(3, round((high - low) / (_WHOLE_STEP * step))))
+    count = min(_MOST_HYPOTHESES, max(3, round((high - low) / (_WHOLE_STEP * step))))
     found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
-    along = spanned(pixels, known, blank)
+    points = _splatted(pixels, known, blank)
+    along = push_pull(points, points > 0)
     reach = min(10, count)
-    again, better = sweep(
-        matcher, along, [_WHOLE_STEP * step * rank for rank in range(-reach, reach + 1)]
-    )
-    return torch.where(better > score, again, found), torch.maximum(better, score)
+    offsets = [_WHOLE_STEP * step * rank for rank in range(-reach, reach + 1)]
+    return _better(found, score, *sweep(matcher, along, offsets))
 
 
 def _near(matcher: Matcher, field: Map, step: float) -> tuple[Map, Map]:
     """Search near a field, and near the larger and smaller depths on either side of its steps."""
     offsets = [_NEAR_STEP * step * rank for rank in range(-3, 4)]
     found, score = sweep(matcher, field, offsets)
-    for side in (_largest_around(field, 2), -_largest_around(-field, 2)):
-        again, better = sweep(matcher, side, offsets[2:-2])
-        found = torch.where(better > score, again, found)
-        score = torch.maximum(better, score)
+    highest, lowest = (max_pool2d(one[None, None], 5, 1, 2)[0, 0] for one in (field, -field))
+    for side in (highest, -lowest):
+        found, score = _better(found, score, *sweep(matcher, side, offsets[2:-2]))
     return found, score
+
+
+def _better(one: Map, score: Map, other: Map, other_score: Map) -> tuple[Map, Map]:
+    """Return the field of the higher score at every pixel, and that score."""
+    return torch.where(other_score > score, other, one), torch.maximum(other_score, score)
 
 
 def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, Map]:
@@ -193,37 +199,33 @@ def _checked(
     factor: int,
     level: MatchingLevel,
     fields: Float[Tensor, "2 view height width"],
-    found: Sequence[_Found],
+    steps: Sequence[float],
+    chosen: Sequence[Int[Tensor, " source"]],
 ) -> DepthMaps:
     """Find as valid the depths whose windows match and that other views agree with."""
     inverse_depth, score = fields
-    sources = torch.full((len(found), _NUM_SOURCES), -1, device=score.device)
-    for view, one in enumerate(found):
-        sources[view, : len(one.sources)] = one.sources
+    sources = torch.full((len(chosen), _NUM_SOURCES), -1, device=score.device)
+    for view, some in enumerate(chosen):
+        sources[view, : len(some)] = some
     good = (score >= _MIN_SCORE) & level.usable & (inverse_depth > 0)
 
     def counted(view: int) -> Int[Tensor, "height width"]:
-        return agreeing(level, inverse_depth, good, view, found[view].sources, _MAX_ERROR_PX)
+        return agreeing(level, inverse_depth, good, view, chosen[view])
 
-    agreed = stacked(side_by_side(counted, range(len(found)), tracked=False), len(found))
+    agreed = stacked(side_by_side(counted, range(len(chosen)), tracked=False), len(chosen))
     return DepthMaps(
         factor=factor,
         level=level,
         inverse_depth=inverse_depth,
         agreed=agreed,
         valid=good & (agreed >= _MIN_AGREEING),
-        step=score.new_tensor([one.step for one in found]),
+        step=score.new_tensor(steps),
         sources=sources,
     )
 
 
 def agreeing(
-    level: MatchingLevel,
-    inverse_depth: Float[Tensor, "view height width"],
-    good: Masks,
-    view: int,
-    others: Int[Tensor, " other"],
-    max_error_px: float,
+    level: MatchingLevel, inverse_depth: Maps, good: Masks, view: int, others: Int[Tensor, " other"]
 ) -> Int[Tensor, "height width"]:
     """Count the views whose depths agree: there and back ends on the same pixel.
 
@@ -243,7 +245,7 @@ def agreeing(
     # To first order, so that rounding to the source's nearest pixel does not count.
     rate = _pixels_per_inverse_depth(level, view, others, pixels, there)
     error = (there - expected).abs() * rate
-    count[chosen] = (valid & (ratio > 0) & (error <= max_error_px)).sum(dim=0)
+    count[chosen] = (valid & (ratio > 0) & (error <= _MAX_ERROR_PX)).sum(dim=0)
     return count
 
 
@@ -255,11 +257,8 @@ def _pixels_per_inverse_depth(
     inverse_depth: Float[Tensor, "other point"],
 ) -> Float[Tensor, "other point"]:
     """Differentiate the pixels in a view of other views' points by their inverse depth there."""
-    cameras = level.cameras
-    frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
-    relative = frames[view] @ torch.linalg.inv(frames[others])
-    rotation = intrinsics[view] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[others])
-    shift = (intrinsics[view] @ relative[:, :3, 3:])[..., 0].to(pixels)[:, :, None]
+    rotation, shift = pixels_from_pixels(level.cameras, view, others)
+    shift = shift.to(pixels)[:, :, None]
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
     ray = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous)
     at = ray + inverse_depth[:, None] * shift
@@ -278,23 +277,28 @@ def filled(maps: DepthMaps, view: int) -> Map:
     sources = maps.sources[view]
     splat = torch.zeros_like(field)
     for source in sources[sources >= 0].tolist():
-        splat = torch.maximum(splat, splatted(maps, source, view))
+        splat = torch.maximum(splat, _seen_from(maps, source, view))
     field = torch.where(known, field, splat)
     return push_pull(field, known | (splat > 0))
 
 
-def splatted(maps: DepthMaps, source: int, view: int) -> Map:
-    """Project one view's valid depths into another: the nearest of each pixel, 0 for none."""
+def _seen_from(maps: DepthMaps, source: int, view: int) -> Map:
+    """Project a source's valid depths into a view: the nearest of each pixel, 0 for none."""
     one = torch.tensor([view], device=maps.valid.device)
     pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
     chosen = maps.valid[source] & (ratio[0] > 0)
-    height, width = chosen.shape
-    column, row = pixels[0][:, chosen].floor().long()
     value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
+    return _splatted(pixels[0][:, chosen].mT, value, maps.inverse_depth[view])
+
+
+def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
+    """Write values into the pixels of an image: the largest of each, 0 for none."""
+    height, width = like.shape
+    column, row = pixels.floor().long().unbind(dim=1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = (row * width + column)[inside]
-    flat = torch.zeros(height * width, dtype=value.dtype, device=value.device)
-    return flat.scatter_reduce(0, index, value[inside], "amax").reshape(height, width)
+    flat = torch.zeros_like(like).reshape(-1)
+    return flat.scatter_reduce(0, index, values.to(like)[inside], "amax").reshape(height, width)
 
 
 def push_pull(values: Map, known: Mask) -> Map:
@@ -312,24 +316,9 @@ def push_pull(values: Map, known: Mask) -> Map:
     return torch.where(known, values, up[0, 0])
 
 
-def spanned(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
-    """Interpolate values smoothly from some pixels of an image to all."""
-    height, width = like.shape
-    column = pixels[:, 0].long().clamp(0, width - 1)
-    row = pixels[:, 1].long().clamp(0, height - 1)
-    known = torch.zeros_like(like).reshape(-1)
-    known = known.scatter_reduce(0, row * width + column, values.to(like), "amax")
-    known = known.reshape(height, width)
-    return push_pull(known, known > 0)
-
-
 def median3(values: Map) -> Map:
     """Take the median of every pixel and its eight neighbours."""
     return torch.stack(shifted(values, 1, "replicate")).median(dim=0).values
-
-
-def _largest_around(field: Map, radius: int) -> Map:
-    return max_pool2d(field[None, None], 2 * radius + 1, 1, radius)[0, 0]
 
 
 def nearest_pixels(
@@ -340,12 +329,12 @@ def nearest_pixels(
 
 
 def choose_sources(
-    scene: SparseScene, points: Int[Tensor, " chosen"], view: int, count: int
+    scene: SparseScene, points: Int[Tensor, " chosen"], view: int
 ) -> Int[Tensor, " source"]:
     """Choose the views to match a view with by shared points and the angles at them.
 
     Returns:
-        The best first; fewer than ``count`` if the others share nothing.
+        The best five first; fewer if the others share nothing.
     """
     observed = scene.observed[points]
     here = observed[:, view]
@@ -356,7 +345,7 @@ def choose_sources(
     value = torch.exp(-(away / torch.where(away < 0, 4.0, 12.0)).square() / 2)
     score = (value * shared).sum(dim=0)
     score[view] = 0
-    order = score.argsort(descending=True)[:count]
+    order = score.argsort(descending=True)[:_NUM_SOURCES]
     return order[score[order] > 0]
 
 

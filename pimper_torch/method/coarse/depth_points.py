@@ -17,9 +17,8 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.ground.geometry.supporting_plane import fixation
 from pimper_torch.ground.shapes import Mask, Pixels, Points, Scalar
-from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.densify import DepthMaps, agreeing, depth_maps, nearest_pixels
-from pimper_torch.method.coarse.window_matching import Matcher, Windows, pair
+from pimper_torch.method.coarse.window_matching import Matcher, pair
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.ledger import leave_out
@@ -34,14 +33,13 @@ _NEAREST, _FARTHEST = 0.3, 3.0
 _MOST = 1500
 # Views that a point must be found in.
 _FEWEST_VIEWS = 3
-# Pixels of the maps by which depth maps may disagree, and of the photographs that a point may be
-# off in a view. Choices: what the coarse surface asks of points, too.
-_AGREEING_PX, _MAX_ERROR_PX = 1.0, 1.5
+# Pixels of the photographs that a point may be off in a view: what the coarse surface asks, too.
+_MAX_ERROR_PX = 1.5
 # Fraction of the pixels with one agreeing view that must have two: 0.83 and 0.55 with the cameras
 # of rendered potatoes and of a jar with hardly any texture, 0.29 to 0.47 with other views'.
 _MIN_CONFIRMED = 0.5
 # Sizes at which depth is searched: 100, 200, 400 and 800 pixels.
-_MAPS = DensifyConfig(levels=4)
+_LEVELS = 4
 
 
 @torch.no_grad()
@@ -57,8 +55,9 @@ def depth_points(scene: SparseScene) -> SparseScene:
     if len(everywhere) == 0:
         _tell(scene, 0)
         return scene
-    maps = depth_maps(room, everywhere, _MAPS)[-1]
-    confirmed = _confirmed(maps) >= _MIN_CONFIRMED
+    maps = depth_maps(room, everywhere, _LEVELS)[-1]
+    once, twice = (int((maps.agreed >= count).sum()) for count in (1, 2))
+    confirmed = twice >= _MIN_CONFIRMED * max(once, 1)
     leave_out("depth_points.doubt", not confirmed)
     if not confirmed:
         _tell(scene, 0)
@@ -68,12 +67,6 @@ def depth_points(scene: SparseScene) -> SparseScene:
     found = _with(scene, pixels, seen)
     _tell(found, len(found.points_world) - len(scene.points_world))
     return found
-
-
-def _confirmed(maps: DepthMaps) -> float:
-    """Return the fraction of the pixels that one view agrees with where a second one does, too."""
-    once = int((maps.agreed >= 1).sum())
-    return int((maps.agreed >= 2).sum()) / max(once, 1)
 
 
 def _tell(scene: SparseScene, count: int) -> None:
@@ -179,8 +172,8 @@ def _in_source(
     one = torch.tensor([source], device=chosen.device)
     pairing = pair(maps.level, view, one)
     field, there = maps.inverse_depth[view], maps.agreed > 0
-    agrees = agreeing(maps.level, maps.inverse_depth, there, view, one, _AGREEING_PX)[chosen] > 0
-    alike = Matcher(maps.level, pairing, Windows()).scores(field, [0.0])[0, chosen] >= 0.5
+    agrees = agreeing(maps.level, maps.inverse_depth, there, view, one)[chosen] > 0
+    alike = Matcher(maps.level, pairing).scores(field, [0.0])[0, chosen] >= 0.5
     rays = pairing.replace(ray=pairing.ray[:, :, chosen])
     height, width = chosen.shape
     grid = grid_from_pixels(rays.look(field[chosen])[0].movedim(1, -1), width, height)

@@ -16,7 +16,7 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.shapes import Faces, VertexMask, Vertices
 from pimper_torch.method.coarse import trim
-from pimper_torch.method.coarse.coarse_config import DensifyConfig, FineSurfaceConfig
+from pimper_torch.method.coarse.densify import factors
 from pimper_torch.method.coarse.oriented import (
     OrientedPoints,
     matched_cloud,
@@ -30,10 +30,10 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, each, zeros
 
 # Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
-# those of the surface through points and contours (rims) that benchmarks/README.md measures:
-# the finest grid of the cloud; how far points and surface may lie outside the visual hull; how
-# near a face is to the points or contour points that support it.
-POINT_PX, TOLERANCE_PX, REACH_PX = 1.0, 4.0, 4.0
+# those of the surface through points and contours (rims) that benchmarks/README.md measures: how
+# far points and surface may lie outside the visual hull; how near a face is to the points or
+# contour points that support it.
+TOLERANCE_PX, REACH_PX = 4.0, 4.0
 
 # Barycentric coordinates, times 6, of the points of a facet that vote for its support.
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
@@ -64,11 +64,7 @@ class FineSurface(Record):
 
 
 def fine_surface(
-    scene: SparseScene,
-    reliable: Int[Tensor, " reliable"],
-    contours: Contours,
-    densify: DensifyConfig,
-    config: FineSurfaceConfig,
+    scene: SparseScene, reliable: Int[Tensor, " reliable"], contours: Contours, levels: int
 ) -> FineSurface:
     """Put a surface through matched points and contours, smooth where there are neither.
 
@@ -79,6 +75,7 @@ def fine_surface(
     Args:
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
+        levels: Resolutions of the depth maps.
 
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
@@ -87,13 +84,13 @@ def fine_surface(
     centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = no_points(centre), None
     if len(reliable) >= 16 or not contours.confine:
-        found, maps, pixel = matched_cloud(part, reliable, densify, POINT_PX)
+        found, maps, pixel = matched_cloud(part, reliable, levels)
         near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
         leave_out("coarse.matched", ~near, at=found.points_world)
         cloud = found.take(near)
         level = maps.level
     else:
-        factor = densify.factors(max(part.views.images.shape[-2:]))[-1]
+        factor = factors(max(part.views.images.shape[-2:]), levels)[-1]
         pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
@@ -107,7 +104,7 @@ def fine_surface(
         leave_out("coarse.far", inside & ~near, at=centres)
         inside &= near
     fraction = trim.min_fraction(contours)
-    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, config, fraction)
+    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, fraction)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
@@ -147,8 +144,8 @@ def closed_surface(
                 "are needed. Take photographs that overlap more, look at the masks, or give a "
                 "mesh of your own."
             )
-        # Points are denser than contours: without these an octree's cell is two of their grid.
-        cell = (trim.CELL_PX if len(touched.ray) else 2 * POINT_PX) * pixel
+        # Points are denser than contours: without these an octree's cell is two of their grid's.
+        cell = (trim.CELL_PX if len(touched.ray) else 2.0) * pixel
         vertices, faces = poisson(OrientedPoints.cat([cloud, contour]), cell)
         if not len(touched.ray):
             break

@@ -13,9 +13,8 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.shapes import Map, Mask, Points
-from pimper_torch.method.coarse.coarse_config import DensifyConfig
 from pimper_torch.method.coarse.densify import DepthMaps, depth_maps
-from pimper_torch.method.coarse.window_matching import shifted
+from pimper_torch.method.coarse.window_matching import RADIUS, shifted
 from pimper_torch.records import Cameras, Record, SparseScene
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import zeros
@@ -24,9 +23,6 @@ from pimper_torch.runtime.parallel import side_by_side
 # Length of the mean of unit normals round a point, at least: that of normals which scatter by
 # 60 degrees.
 _MIN_AGREEMENT = 0.5
-
-# Radius of the windows that planes are fitted in, pixels: that of the windows that were matched.
-_RADIUS = 2
 
 # Robust iterations of the plane's fit, and what is added to the diagonal of its normal equations,
 # which are of the order of 10. Choices.
@@ -150,15 +146,18 @@ def fitted_planes(
 
 
 def _fits(inverse_depth: Map, valid: Mask, step: float) -> Float[Tensor, "5 height width"]:
-    """Return offset, slopes, variance and mean weight of planes, in steps; 0 where not valid."""
-    side = torch.arange(-_RADIUS, _RADIUS + 1).to(inverse_depth)
+    """Return offset, slopes, variance and mean weight of planes, in steps; 0 where not valid.
+
+    Planes are fitted in windows of the size that was matched.
+    """
+    side = torch.arange(-RADIUS, RADIUS + 1).to(inverse_depth)
     v, u = (one.reshape(-1) for one in torch.meshgrid(side, side, indexing="ij"))
     basis = torch.stack([torch.ones_like(u), u, v])
     squares = (basis[:, None] * basis).flatten(0, 1)
     ridge = _RIDGE * torch.eye(3).to(basis)[..., None]
 
     def around(values: Map) -> Float[Tensor, "entry pixel"]:
-        return torch.stack([one[valid] for one in shifted(values, _RADIUS, "constant")])
+        return torch.stack([one[valid] for one in shifted(values, RADIUS, "constant")])
 
     differences = (around(inverse_depth) - inverse_depth[valid]) * (1 / step)
     counted = around(valid.to(inverse_depth))
@@ -336,20 +335,21 @@ def sparse_oriented(
 
 
 def matched_cloud(
-    scene: SparseScene, reliable: Int[Tensor, " reliable"], config: DensifyConfig, cell_px: float
+    scene: SparseScene, reliable: Int[Tensor, " reliable"], levels: int
 ) -> tuple[OrientedPoints, DepthMaps, float]:
     """Match the photographs densely, and merge the depth maps and the sparse points.
 
     Args:
-        cell_px: Of the cloud's finest grid, pixels of the finest depth maps.
+        levels: Resolutions of the depth maps; pixels of the finest are cells of the cloud's finest
+            grid.
 
     Returns:
         The cloud, the finest depth maps, and the size of their pixels there, scene units.
     """
-    maps = depth_maps(scene, reliable, config)
+    maps = depth_maps(scene, reliable, levels)
     pixel = pixel_size(scene, reliable) * maps[-1].factor
     # The coarsest windows of three reach past contours: they only initialize the finer ones.
-    dense = with_common_normals(thinned(oriented_points(maps[-2:]), cell_px * pixel))
+    dense = with_common_normals(thinned(oriented_points(maps[-2:]), pixel))
     cloud = OrientedPoints.cat([dense, sparse_oriented(scene, reliable, dense, 3 * pixel)])
     return cloud, maps[-1], pixel
 

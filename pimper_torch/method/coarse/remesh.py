@@ -82,7 +82,8 @@ def remesh(
     mesh.
 
     Args:
-        coarse: The facets that ``surface`` is the subdivided mesh of.
+        coarse: The facets that ``surface`` is the subdivided mesh of; none of their vertices is a
+            point of the cloud.
         surface: Subdivided mesh vertices on shared edges shared.
         spacing: Of the samples that the next templates will have, scene units: the unit of the
             settings.
@@ -92,8 +93,8 @@ def remesh(
 
     Returns:
         The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
-        cloud follow :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
-        dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
+        cloud stay on their facets, or on parts of these. Unused vertices are dropped, and parts of
+        the mesh that met in a vertex alone have a copy of it each.
 
     A surface without support anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
@@ -110,7 +111,8 @@ def remesh(
         if inside is not None and bool((kept & inside).any()):
             kept = kept & inside
         severity = _severity(corners, faces, surface, spacing, residual, config)
-        side = _side(corners, faces) / spacing
+        # Of the equilateral triangle of each facet's area.
+        side = (2 / 3**0.5 * face_normals(corners, faces).norm(dim=1)).sqrt() / spacing
         small = (side < config.min_samples) | ~kept
         marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
         split = splitting.split_edges(old, faces, marked)
@@ -123,7 +125,7 @@ def remesh(
     index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
     mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
-    return splitting.with_points(coarse, mesh, split, index, source)
+    return splitting.with_points(coarse, mesh, split, index)
 
 
 def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
@@ -133,6 +135,12 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
         raise InputError(
             f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
             "surface that was made on this mesh. Hand over the two of the same round."
+        )
+    if bool(coarse.is_point.any()):
+        raise InputError(
+            f"remesh: {int(coarse.is_point.sum())} vertices of the coarse mesh are points of the "
+            "cloud, as Triangulate makes them, and would move; needed: a mesh with points on its "
+            "facets alone, as CoarseSurface and facets_of make it."
         )
 
 
@@ -244,11 +252,6 @@ def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     length = total.norm(dim=1) / torch.where(mass > 0, mass, 1)
     # Of small angles a from the mean, 1 - cos(a) is a^2 / 2.
     return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
-
-
-def _side(vertices: Vertices, faces: Faces) -> Float[Tensor, " face"]:
-    """Return the side of the equilateral triangle of each facet's area."""
-    return (2 / 3**0.5 * face_normals(vertices, faces).norm(dim=1)).sqrt()
 
 
 def _worst_first(

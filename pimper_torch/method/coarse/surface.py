@@ -13,11 +13,7 @@ from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_edges
 from pimper_torch.ground.shapes import Faces, Vertices
-from pimper_torch.method.coarse.coarse_config import (
-    CoarseSurfaceConfig,
-    DensifyConfig,
-    FineSurfaceConfig,
-)
+from pimper_torch.method.coarse.coarse_config import CoarseSurfaceConfig
 from pimper_torch.method.coarse.fine_surface import fine_surface
 from pimper_torch.method.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.method.coarse.oriented import pixel_size
@@ -40,16 +36,9 @@ _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
 class CoarseSurface(Stage):
     """Compute the coarse surface of the object, a few thousand facets; not differentiable."""
 
-    def __init__(
-        self,
-        config: CoarseSurfaceConfig | None = None,
-        densify: DensifyConfig | None = None,
-        fine: FineSurfaceConfig | None = None,
-    ) -> None:
+    def __init__(self, config: CoarseSurfaceConfig | None = None) -> None:
         super().__init__()
         self.config = config or CoarseSurfaceConfig()
-        self.densify = densify or DensifyConfig(levels=self.config.levels)
-        self.fine = fine or FineSurfaceConfig()
 
     @torch.no_grad()
     def forward(
@@ -72,7 +61,8 @@ class CoarseSurface(Stage):
         reliable, count = reliable_points(scene), self.config.num_facets
         if mesh is not None:
             vertices, faces = oriented_outward(mesh, scene.cameras)
-            vertices, faces = _facets(vertices, faces, count)
+            few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
+            vertices, faces = few.vertices_world, few.faces
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
             support = None
         else:
@@ -85,10 +75,10 @@ class CoarseSurface(Stage):
                     f"reliable ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
-            fine = fine_surface(scene, reliable, contours, self.densify, self.fine)
-            vertices, faces = _facets(fine.vertices_world, fine.faces, count)
-            crowded = len(faces)
-            faces = two_faces_an_edge(vertices, faces)
+            fine = fine_surface(scene, reliable, contours, self.config.levels)
+            few = reduced(Mesh(vertices_world=fine.vertices_world, faces=fine.faces), count)
+            vertices, crowded = few.vertices_world, len(few.faces)
+            faces = two_faces_an_edge(vertices, few.faces)
             leave_out("coarse.crowded", crowded - len(faces), total=crowded)
             whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
             kept = supported_components(vertices, faces, whole, min_fraction(contours))
@@ -182,13 +172,6 @@ def _with_points(
             facet=found.face[near],
         ),
     )
-
-
-def _facets(
-    vertices: Vertices, faces: Faces, count: int
-) -> tuple[Float[Tensor, "left 3"], Int[Tensor, "few 3"]]:
-    few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
-    return few.vertices_world, few.faces
 
 
 def point_covariances(

@@ -15,7 +15,6 @@ from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import FaceMask, Faces, Points, Vertices
-from pimper_torch.method.coarse.coarse_config import FineSurfaceConfig
 from pimper_torch.method.coarse.densify import DepthMaps
 from pimper_torch.method.coarse.oriented import OrientedPoints
 from pimper_torch.method.coarse.window_matching import MatchingLevel
@@ -25,6 +24,14 @@ from pimper_torch.runtime.parallel import num_workers, side_by_side
 
 # Of the surface's octree, pixels of the finest depth maps at the cloud's median depth. A choice.
 CELL_PX = 4.0
+
+# Side of a square as large as the largest hole that is closed whatever made it, in those pixels.
+# Strips along a border that are narrower go, where they are small or unsupported.
+HOLE_PX = 24.0
+
+# Fraction of the area seen up to which a hole is closed that only lack of views made, such as the
+# bottom of a deep concavity.
+MAX_UNSEEN = 0.02
 
 # Cosine between a face's normal and the ray to a camera, above which a view counts: at 84 degrees a
 # face is a tenth as wide as it is long.
@@ -125,11 +132,7 @@ def without_small_holes(
     vertices: Vertices, faces: Faces, kept: FaceMask, largest: float
 ) -> FaceMask:
     """Keep connected components of dropped faces too whose area is small, in scene units."""
-    pairs, _ = topology.face_pairs(faces)
-    dropped = pairs[~kept[pairs].any(dim=1)]
-    areas = surfaces.component_areas(
-        vertices, faces, topology.graph_components(dropped, len(faces))
-    )
+    areas = surfaces.component_areas(vertices, faces, topology.face_components(faces, ~kept))
     return kept | (~kept & (areas < largest))
 
 
@@ -138,16 +141,11 @@ def enclosed_holes(vertices: Vertices, faces: Faces, kept: FaceMask, largest: fl
 
     A component that reaches the border of the surface is not enclosed.
     """
-    found = torch.zeros_like(kept)
-    (dropped,) = torch.nonzero(~kept, as_tuple=True)
-    if not len(dropped):
-        return found
-    label = topology.face_components(faces[dropped])
+    label = topology.face_components(faces, ~kept)
     paired = torch.bincount(topology.face_pairs(faces)[0].flatten(), minlength=len(faces))
-    on_border = torch.zeros_like(label).index_add(0, label, (paired[dropped] < 3).long())
-    areas = surfaces.component_areas(vertices, faces[dropped], label)
-    found[dropped] = (on_border[label] == 0) & (areas <= largest)
-    return found
+    on_border = torch.zeros_like(label).index_add(0, label, (paired < 3).long())
+    areas = surfaces.component_areas(vertices, faces, label)
+    return ~kept & (on_border[label] == 0) & (areas <= largest)
 
 
 def fringes(
@@ -171,8 +169,7 @@ def fringes(
     """
     core = ~topology.dilated(faces, ~kept, rings, len(vertices))
     narrow = kept & ~topology.dilated(faces, core, rings, len(vertices))
-    pairs, _ = topology.face_pairs(faces)
-    label = topology.graph_components(pairs[narrow[pairs].all(dim=1)], len(faces))
+    label = topology.face_components(faces, narrow)
     area = surfaces.component_areas(vertices, faces, label)
     known = surfaces.component_areas(vertices, faces, label, supported)
     return narrow & ((area < smallest) | (known < area / 2))
@@ -242,8 +239,7 @@ def seen_surface(
     counts: ViewCounts,
     inside: FaceMask,
     pixel: float,
-    config: FineSurfaceConfig,
-    fraction: float = 0.01,
+    fraction: float,
 ) -> FaceMask:
     """Find the faces that stay: in the visual hull, and seen or supported.
 
@@ -257,7 +253,7 @@ def seen_surface(
         fraction: Of the supported area, that a component needs.
     """
     known = support >= Support.CONTOUR
-    small = (config.hole_px * pixel) ** 2
+    small = (HOLE_PX * pixel) ** 2
     bare = inside & (support != Support.POINTS)
     through = bare & (counts.behind >= _MIN_BEHIND)
     through |= regions_seen_through(faces, bare & (counts.seen > 0), through)
@@ -266,10 +262,10 @@ def seen_surface(
     kept = possible & ((counts.seen > 0) | known)
     leave_out("coarse.unseen", possible & ~kept, at=(vertices, faces))
     area = float(total(surfaces.face_normals(vertices, faces[kept]).norm(dim=1))) / 2
-    holes = enclosed_holes(vertices, faces, kept, config.max_unseen * area)
+    holes = enclosed_holes(vertices, faces, kept, MAX_UNSEEN * area)
     kept = kept | (holes & ~topology.connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
-    rings = int(config.hole_px / (2 * CELL_PX))
+    rings = int(HOLE_PX / (2 * CELL_PX))
     floating = regions_seen_through(faces, kept, bare & (counts.behind > 0))
     leave_out("coarse.floating", floating, at=(vertices, faces))
     kept &= ~floating
@@ -290,10 +286,9 @@ def regions_seen_through(faces: Faces, some: FaceMask, through: FaceMask) -> Fac
         some: True for faces that make up the regions.
         through: True for faces that views see through.
     """
-    (index,) = torch.nonzero(some, as_tuple=True)
-    region = topology.face_components(faces[index])
-    share = torch.bincount(region, through[index].double()) / torch.bincount(region)
-    return torch.zeros_like(some).index_put((index,), (share >= _MOST_THROUGH)[region])
+    region = topology.face_components(faces, some)
+    share = torch.bincount(region, through.double()) / torch.bincount(region)
+    return some & (share >= _MOST_THROUGH)[region]
 
 
 def min_fraction(contours: Contours) -> float:

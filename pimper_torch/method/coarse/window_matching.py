@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.ground.kernels.arrays import as_array
-from pimper_torch.ground.shapes import Map, Masks
+from pimper_torch.ground.shapes import Map, Maps, Masks
 from pimper_torch.records import Cameras, Record, SparseScene
 from pimper_torch.runtime.mapped import by_view, each
 
@@ -32,7 +32,7 @@ class MatchingLevel(Record):
         usable: False outside photographs and masks.
     """
 
-    tone: Float[Tensor, "view height width"]
+    tone: Maps
     usable: Masks
     cameras: Cameras
 
@@ -95,13 +95,23 @@ class Pairing(Record):
         return at[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
 
 
+View = int | Int[Tensor, " view"]
+
+
+def pixels_from_pixels(
+    cameras: Cameras, to: View, start: View
+) -> tuple[Float[Tensor, "pair 3 3"], Float[Tensor, "pair 3"]]:
+    """Return ``A`` and ``b`` of :class:`Pairing`, in double precision: of one view and many."""
+    frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
+    relative = frames[to] @ torch.linalg.inv(frames[start])
+    rotation = intrinsics[to] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[start])
+    return rotation, (intrinsics[to] @ relative[:, :3, 3:])[..., 0]
+
+
 def pair(level: MatchingLevel, view: int, sources: Int[Tensor, " source"]) -> Pairing:
     """Prepare the lookup of a view's pixels in others."""
-    cameras = level.cameras
     height, width = level.tone.shape[-2:]
-    frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
-    relative = frames[sources] @ torch.linalg.inv(frames[view])
-    rotation = intrinsics[sources] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[view])
+    rotation, shift = pixels_from_pixels(level.cameras, sources, view)
     pixels = pixel_centers(width, height, like=rotation)
     u, v = pixels[0, :, 0], pixels[:, 0, 1]
     across, down = rotation[:, :, :1] * u, rotation[:, :, 1:2] * v + rotation[:, :, 2:]
@@ -109,26 +119,15 @@ def pair(level: MatchingLevel, view: int, sources: Int[Tensor, " source"]) -> Pa
         view=view,
         sources=sources,
         ray=(down[..., None] + across[:, :, None]).to(level.tone),
-        shift=(intrinsics[sources] @ relative[:, :3, 3:])[..., 0].to(level.tone),
+        shift=shift.to(level.tone),
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Windows:
-    """Settings of the comparison of windows. The values are choices.
-
-    Attributes:
-        radius: Windows are squares of ``2 radius + 1`` pixels.
-        likeness: Difference of tone to the centre of the window at which a pixel's weight has
-            fallen to 0.6: different tones are often at different depths.
-        contrast: Standard deviation of the tone in a window below which its correlation fades.
-        best: Sources that count: the best ones of each pixel.
-    """
-
-    radius: int = 2
-    likeness: float = 0.2
-    contrast: float = 0.005
-    best: int = 3
+# How windows are compared; choices.
+RADIUS = 2  # they are squares of twice this and 1 pixels
+_LIKENESS = 0.2  # difference of tone to the centre at which a pixel's weight has fallen to 0.6
+_CONTRAST = 0.005  # standard deviation of the tone in a window below which its correlation fades
+_BEST = 3  # sources that count: the best ones of each pixel
 
 
 class Matcher:
@@ -138,14 +137,14 @@ class Matcher:
     Schönberger et al., Pixelwise view selection, ECCV 2016, for correlation with them.
     """
 
-    def __init__(self, level: MatchingLevel, pairing: Pairing, windows: Windows) -> None:
-        radius, tone = windows.radius, level.tone[pairing.view].detach().float()
+    def __init__(self, level: MatchingLevel, pairing: Pairing) -> None:
+        tone = level.tone[pairing.view].detach().float()
         here = level.usable[pairing.view]
-        around = torch.stack(shifted(tone, radius, "replicate"))
-        weight = _spatial(radius).to(tone)[:, None, None] * torch.exp(
-            -((around - tone) / windows.likeness).square() / 2
-        )
-        weight *= torch.stack(shifted(here.to(tone), radius, "replicate"))
+        around = torch.stack(shifted(tone, RADIUS, "replicate"))
+        along = torch.exp(-(torch.arange(-RADIUS, RADIUS + 1) / RADIUS).square() / 2)
+        spatial = (along[:, None] * along).reshape(-1, 1, 1).to(tone)
+        weight = spatial * torch.exp(-((around - tone) / _LIKENESS).square() / 2)
+        weight *= torch.stack(shifted(here.to(tone), RADIUS, "replicate"))
         weight /= weight.sum(dim=0).clamp_min(1e-12)
         # Around the mean, so that no difference of large numbers is left for single precision.
         around -= (weight * around).sum(dim=0)
@@ -155,7 +154,6 @@ class Matcher:
         self._ray, self._shift, self._tone = (as_array(one, torch.float32) for one in of_sources)
         self._usable, self._here = as_array(level.usable[pairing.sources]), as_array(here)
         self._weight, self._deviation, self._power = map(as_array, (weight, deviation, power))
-        self._windows = windows
 
     def scores(self, field: Map, offsets: Sequence[float]) -> Float[Tensor, "offset height width"]:
         """Score a field of inverse depths moved by each of some offsets.
@@ -177,8 +175,8 @@ class Matcher:
             self._deviation,
             self._power,
             self._here,
-            self._windows.contrast**2,
-            self._windows.best,
+            _CONTRAST**2,
+            _BEST,
             found.numpy(),
         )
         return found.to(field)
@@ -190,9 +188,3 @@ def shifted(values: Map, radius: int, padding: Literal["replicate", "constant"])
     wide = pad(values[None, None], (radius,) * 4, mode=padding)[0, 0]
     side = range(2 * radius + 1)
     return [wide[row : row + height, column : column + width] for row in side for column in side]
-
-
-def _spatial(radius: int) -> Float[Tensor, " pixel"]:
-    """Return a Gaussian over the window whose standard deviation is the radius."""
-    along = torch.exp(-(torch.arange(-radius, radius + 1) / radius).square() / 2)
-    return (along[:, None] * along).reshape(-1)
