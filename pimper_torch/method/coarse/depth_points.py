@@ -198,11 +198,7 @@ def _with(
 ) -> SparseScene:
     """Triangulate, and put points and tracks beside the scene's own."""
     cameras = scene.cameras
-    exact = Cameras(
-        intrinsics=cameras.intrinsics.double(),
-        cam_from_world=cameras.cam_from_world.double(),
-        sizes_px=cameras.sizes_px,
-    )
+    exact = cameras.to(torch.float64)
     points = triangulate_rays(exact, pixels.double(), seen)
     expected, depth = project(points, exact.cam_from_world, exact.intrinsics)
     error = (expected.movedim(0, 1) - pixels).norm(dim=-1)

@@ -61,9 +61,8 @@ def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
         # The noise of black pixels is not stretched without limit.
         tone=by_view(lambda one: (one / bright + 0.01).sqrt(), gray),
         usable=usable,
-        cameras=Cameras(
+        cameras=cameras.replace(
             intrinsics=scale_intrinsics(cameras.intrinsics, 1 / factor, 1 / factor),
-            cam_from_world=cameras.cam_from_world,
             sizes_px=cameras.sizes_px // factor,
         ),
     )

@@ -8,11 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry import topology
-from pimper_torch.ground.geometry.surfaces import (
-    face_normals,
-    side_lengths,
-    unit_face_normals,
-)
+from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.ground.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 
 # Angle between the normals of neighbouring faces above which they lie on each other. A choice: at

@@ -28,12 +28,7 @@ from pimper_torch.ground.geometry.opencv import (
 )
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
 from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Pixels, Scalar, ViewMask
-from pimper_torch.method.silhouettes.cues import (
-    FEW,
-    MIN_POINTS,
-    Cues,
-    pointed_at,
-)
+from pimper_torch.method.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
 from pimper_torch.method.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.records import Record, Silhouettes
 from pimper_torch.runtime.mapped import by_view
