@@ -228,7 +228,7 @@ def test_facets_without_data_go_except_holes_inside(generator):
     assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
 
 
-def test_points_stay_with_their_facets(generator):
+def test_points_stay_with_their_facets_and_moved_vertices_leave_theirs(generator):
     coarse = sheet(generator, side=9)
     count = 300
     facet = torch.randint(len(coarse.mesh.faces), (count,), generator=generator)
@@ -236,7 +236,11 @@ def test_points_stay_with_their_facets(generator):
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[facet]]
     places = (inside[:, :, None] * corners).sum(dim=1)
     spread = torch.rand(count, generator=generator, dtype=torch.float64)
+    is_point = torch.rand(len(coarse.mesh.vertices_world), generator=generator) < 0.5
+    known = torch.eye(3).double() * is_point[:, None, None]
     coarse = coarse.replace(
+        is_point=is_point,
+        covariance_world=known,
         points=FacetPoints(
             points_world=places,
             covariance_world=spread[:, None, None] * torch.eye(3).double(),
@@ -250,8 +254,17 @@ def test_points_stay_with_their_facets(generator):
     to_point = here[:, None] - new
     side = ahead[..., 0] * to_point[..., 1] - ahead[..., 1] * to_point[..., 0]
     assert (side > -1e-6).all()  # inside its facet, as seen from above
-    assert_close(found.points.points_world, places)
-    assert_close(found.points.covariance_world[:, 0, 0], spread)
+    assert_close(found.points.points_world[:count], places)
+    assert_close(found.points.covariance_world[:count, 0, 0], spread)
+    # What was a vertex and a point is one of the two still.
+    moved = len(found.points.facet) - count
+    assert moved > 0
+    assert moved + int(found.is_point.sum()) == int(is_point.sum())
+    old = torch.cdist(found.points.points_world[count:], coarse.mesh.vertices_world[is_point])
+    assert (old.amin(dim=1) == 0).all()
+    assert_close(found.points.covariance_world[count:], torch.eye(3).double().expand(moved, 3, 3))
+    on = found.covariance_world.diagonal(dim1=1, dim2=2).sum(dim=1) > 0
+    assert (on == found.is_point).all()
 
 
 @pytest.mark.parametrize(("axes", "far"), [([0, 1], 0.7), ([2], 20.0)])
@@ -270,11 +283,3 @@ def test_a_surface_of_another_mesh_is_refused(generator):
     coarse, other = sheet(generator), sheet(generator, side=9)
     with pytest.raises(InputError, match="facets"):
         remesh(coarse, surface_on(other, lambda points: points), SPACING)
-
-
-def test_a_mesh_through_points_of_the_cloud_is_refused(generator):
-    coarse = sheet(generator)
-    surface = surface_on(coarse, lambda points: points)
-    coarse = coarse.replace(is_point=~coarse.is_point)
-    with pytest.raises(InputError, match="49 vertices of the coarse mesh are points of the cloud"):
-        remesh(coarse, surface, SPACING)

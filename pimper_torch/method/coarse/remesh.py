@@ -82,8 +82,7 @@ def remesh(
     mesh.
 
     Args:
-        coarse: The facets that ``surface`` is the subdivided mesh of; none of their vertices is a
-            point of the cloud.
+        coarse: The facets that ``surface`` is the subdivided mesh of.
         surface: Subdivided mesh vertices on shared edges shared.
         spacing: Of the samples that the next templates will have, scene units: the unit of the
             settings.
@@ -93,8 +92,8 @@ def remesh(
 
     Returns:
         The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
-        cloud stay on their facets, or on parts of these. Unused vertices are dropped, and parts of
-        the mesh that met in a vertex alone have a copy of it each.
+        cloud follow :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
+        dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
 
     A surface without support anywhere drops no facet. Vertices and normals are differentiable in
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
@@ -125,7 +124,7 @@ def remesh(
     index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
     mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
-    return splitting.with_points(coarse, mesh, split, index)
+    return splitting.with_points(coarse, mesh, split, index, source)
 
 
 def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
@@ -135,12 +134,6 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
         raise InputError(
             f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
             "surface that was made on this mesh. Hand over the two of the same round."
-        )
-    if bool(coarse.is_point.any()):
-        raise InputError(
-            f"remesh: {int(coarse.is_point.sum())} vertices of the coarse mesh are points of the "
-            "cloud, as Triangulate makes them, and would move; needed: a mesh with points on its "
-            "facets alone, as CoarseSurface and facets_of make it."
         )
 
 

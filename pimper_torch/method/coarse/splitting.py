@@ -202,17 +202,50 @@ def fitted_normals(
 
 
 def with_points(
-    coarse: CoarseMesh, mesh: Mesh, split: Split, index: Int[Tensor, " child"]
+    coarse: CoarseMesh,
+    mesh: Mesh,
+    split: Split,
+    index: Int[Tensor, " child"],
+    source: Int[Tensor, " vertex"],
 ) -> CoarseMesh:
-    """Return the new mesh with the cloud's points on its facets, and the support of these."""
-    points, covariance = coarse.points, coarse.covariance_world
-    none = torch.zeros_like(mesh.vertices_world)
+    """Return the new mesh the points of the cloud on its facets, and the support of its facets.
+
+    A vertex that was a point of the cloud and has moved is none any more: the point lies on a
+    facet, at its own position with its own covariance.
+
+    Args:
+        source: The old vertex that each vertex is or is a copy of; new ones follow the old.
+    """
+    old, points, covariance = coarse.mesh.vertices_world, coarse.points, coarse.covariance_world
+    origin = source.clamp_max(len(old) - 1)
+    was_point = (source < len(old)) & coarse.is_point[origin]
+    is_point = was_point & (mesh.vertices_world == old[origin]).all(dim=1)
+    if points is not None:
+        points = _relocated(coarse, points, split, index)
+    if covariance is not None:
+        (left,) = torch.nonzero(was_point & ~is_point, as_tuple=True)
+        once = torch.ones_like(left, dtype=torch.bool)  # a vertex parted in two leaves one point
+        once[1:] = origin[left][1:] != origin[left][:-1]
+        left = left[once]
+        first_face = mesh.faces.new_full((len(source),), len(mesh.faces)).scatter_reduce(
+            0,
+            mesh.faces.flatten(),
+            torch.arange(len(mesh.faces), device=source.device).repeat_interleave(3),
+            "amin",
+        )
+        moved = FacetPoints(
+            points_world=old[origin[left]],
+            covariance_world=covariance[origin[left]],
+            facet=first_face[left],
+        )
+        points = moved if points is None else FacetPoints.cat([points, moved])
+        covariance = torch.where(is_point[:, None, None], covariance[origin], 0)
     return CoarseMesh(
         mesh=mesh,
         reference=coarse.reference,
-        is_point=torch.zeros_like(none[:, 0], dtype=torch.bool),
-        covariance_world=None if covariance is None else none[:, :, None].expand(-1, 3, 3),
-        points=None if points is None else _relocated(coarse, points, split, index),
+        is_point=is_point,
+        covariance_world=covariance,
+        points=points,
         support=None if coarse.support is None else coarse.support[split.parent[index >= 0]],
     )
 
