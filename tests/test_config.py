@@ -1,5 +1,4 @@
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from typing import Literal
 
@@ -21,11 +20,6 @@ from pimper_torch.runtime.config import (
 from pimper_torch.runtime.errors import ConfigError
 
 
-class Shade(Enum):
-    MATTE = 1
-    GLOSSY = 2
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inner:
     steps: int = 9
@@ -40,7 +34,6 @@ class Inner:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outer:
     name: str = "x"
-    shade: Shade = Shade.MATTE
     window: tuple[int, int] = (5, 5)
     scales: tuple[float, ...] = (0.25, 0.5, 1.0)
     cache: Path | None = None
@@ -50,7 +43,6 @@ class Outer:
 
 CHANGED = Outer(
     name="y",
-    shade=Shade.GLOSSY,
     window=(3, 7),
     scales=(1.0,),
     cache=Path("a/b"),
@@ -89,7 +81,6 @@ def test_a_whole_number_serves_as_a_number_and_becomes_one():
         ({"inner": {"solver": "newton"}}, "inner.solver", "'balm', 'descent'"),
         ({"inner": 3}, "inner", "steps, tolerance, robust, solver"),
         ({"name": 3}, "name", "a text"),
-        ({"shade": "SHINY"}, "shade", "MATTE, GLOSSY"),
         ({"window": [1, 2, 3]}, "window", "a list of a whole number, a whole number"),
         ({"window": 5}, "window", "a list"),
         ({"scales": [1.0, "a"]}, "scales[1]", "a number"),
@@ -106,30 +97,17 @@ def test_a_wrong_type_is_refused_with_place_and_need(mapping, field, needed):
     assert needed in message.partition("needed:")[2]
 
 
-def test_an_unknown_key_names_the_nearest_and_all_others():
-    with pytest.raises(ConfigError, match=r"section `inner`.*`step`.*mean `steps`") as refusal:
-        build(Outer, {"inner": {"step": 3}}, "mine.yaml")
-    for name in ("mine.yaml", "steps", "tolerance", "robust", "solver"):
-        assert name in str(refusal.value)
-
-
-def test_a_key_from_another_section_is_sent_home():
-    with pytest.raises(ConfigError, match=r"top level has no setting `solver`.*`inner\.solver`"):
-        build(Outer, {"solver": "balm"}, "mine.yaml")
-
-
-def test_an_impossible_value_names_file_and_section():
-    with pytest.raises(ConfigError, match=r"mine\.yaml: inner: steps is 0; needed: at least one"):
-        build(Outer, {"inner": {"steps": 0}}, "mine.yaml")
-
-
-def test_a_value_without_default_is_asked_for():
-    @dataclass(frozen=True)
-    class Needy:
-        size: int
-
-    with pytest.raises(ConfigError, match="lacks size"):
-        build(Needy, {}, "mine.yaml")
+@pytest.mark.parametrize(
+    ("mapping", "told"),
+    [
+        ({"inner": {"step": 3}}, "section `inner` .*`step`.*mean `steps`.*: steps, tol.*, solver"),
+        ({"solver": "balm"}, r"top level has no setting `solver`.*`inner\.solver`"),
+        ({"inner": {"steps": 0}}, "inner: steps is 0; needed: at least one"),
+    ],
+)
+def test_an_unknown_key_or_an_impossible_value_is_refused_by_file_and_section(mapping, told):
+    with pytest.raises(ConfigError, match=rf"mine\.yaml: .*{told}"):
+        build(Outer, mapping, "mine.yaml")
 
 
 def test_overlay_merges_sections_and_replaces_values_without_touching_its_inputs():
@@ -174,16 +152,23 @@ def test_presets_of_an_installed_package_come_before_a_checkout(tmp_path, monkey
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("a: 1\nb: 2\na: 3\n", "`a` is given twice"),
-        ("a: {b: 1, b: 2}\n", "`b` is given twice"),
-        ("a: [1\n", "no valid YAML"),
-        ("- a\n- b\n", "holds a list"),
-        ("!!python/object/apply:os.getcwd []\n", "no valid YAML"),
+        (b"a: 1\nb: 2\na: 3\n", "`a` is given twice"),
+        (b"a: {b: 1, b: 2}\n", "`b` is given twice"),
+        (b"a: [1\n", "no valid YAML"),
+        (b"- a\n- b\n", "holds a list"),
+        (b"!!python/object/apply:os.getcwd []\n", "no valid YAML"),
+        (b"\xff\xfe\x00a", "cannot be read"),
+        (b"a: &a [x, x]\nb: *a\n", "aliases .* are not read"),
+        (b"a: " + b"[" * 100_000, "nested too deeply"),
+        (b"a: " + b"9" * 5000, "holds a value that is none"),
+        (b"? [a, b]\n: 1\n", "a key is a list or a section"),
+        (b"a: 2001-99-99\n", "holds a value that is none"),
+        (b"# " + b"x" * 1_000_000, "1000002 bytes; needed: a file of settings"),
     ],
 )
 def test_a_file_that_holds_no_settings_is_refused_by_name(tmp_path, text, told):
     path = tmp_path / "mine.yaml"
-    path.write_text(text)
+    path.write_bytes(text)
     with pytest.raises(ConfigError, match=told) as refusal:
         read_mapping(path)
     assert str(path) in str(refusal.value)
@@ -193,13 +178,6 @@ def test_an_empty_file_changes_nothing(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("# only a remark\n")
     assert read_mapping(path) == {}
-
-
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_bytes(b"\xff\xfe\x00a")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_mapping(path)
 
 
 def leaves(mapping, section=""):
@@ -237,23 +215,6 @@ def test_changes_are_laid_over_a_preset():
     changed = load_config("fast", {"reconstruct": {"seed": 12}})
     assert changed.reconstruct.seed == 12
     assert changed.decompose == load_config("fast").decompose
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("a: &a [x, x]\nb: *a\n", "aliases .* are not read"),
-        ("a: " + "[" * 100_000, "nested too deeply"),
-        ("a: " + "9" * 5000, "holds a value that is none"),
-        ("? [a, b]\n: 1\n", "a key is a list or a section"),
-        ("a: 2001-99-99\n", "holds a value that is none"),
-        ("# " + "x" * 1_000_000, "1000002 bytes; needed: a file of settings"),
-    ],
-)
-def test_yaml_that_would_take_memory_or_is_none_is_refused(tmp_path, text, why):
-    (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=why):
-        read_mapping(tmp_path / "a.yaml")
 
 
 def test_a_number_beyond_the_range_of_floats_and_a_long_text_are_refused_shortly(tmp_path):

@@ -21,16 +21,19 @@ from pimper_torch.ground.shapes import Faces, PerVertex, Scalars, VertexMask, Ve
 from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
 from pimper_torch.records.value_checks import (
+    Faults,
     beyond,
+    faults_in,
     not_finite,
     not_unit,
-    once,
     outside,
     turned_away,
 )
 from pimper_torch.runtime.errors import InputError
 
 AnyPatches = TypeVar("AnyPatches", bound="OverPatches")
+
+_INFORMATION = "an inverse variance, 0 where unknown"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -82,13 +85,6 @@ class Templates(Record):
             return values
         shape = len(values), len(self.views), *values.shape[2:]
         return values.new_zeros(shape).index_copy(1, self.rows(len(self.views)), values)
-
-    def faults_of(self, num_facets: int) -> Iterator[tuple[str, str, str]]:
-        """List facets that are none of so many, and templates of no size."""
-        if found := once(self.facet, lambda: beyond(self.facet, num_facets), num_facets):
-            yield "facet", found, f"indices of {num_facets} facets"
-        if not bool((self.spacing > 0).all()):
-            yield "spacing", "is not above 0 everywhere", "scene units"
 
     @property
     def points_patch(self) -> Float[Tensor, "patch height width 3"]:
@@ -146,7 +142,7 @@ class OverPatches(Record):
         """Take rows of some buckets."""
         return self.replace(patches=self._templates._part(rows), buckets=_taken(self, rows))
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List buckets that are not those of the templates, and what is wrong in one."""
         yield from super(OverPatches, self).faults()
         buckets: tuple[Any, ...] = self.buckets  # type: ignore[attr-defined]
@@ -155,7 +151,8 @@ class OverPatches(Record):
             needed = f"one for each of {len(templates)} buckets of templates, in their order"
             yield "buckets", f"are {len(buckets)}", needed
         for index, (bucket, own) in enumerate(zip(buckets, templates, strict=False)):
-            shape = bucket.raster
+            lengths = bucket.lengths()
+            shape = tuple(lengths.get(axis, 0) for axis in ("patch", "height", "width"))
             if shape != tuple(own.inside.shape):
                 needed = f"{tuple(own.inside.shape)}, as its templates"
                 yield f"buckets[{index}]", f"has patches, height, width {shape}", needed
@@ -192,15 +189,17 @@ class PatchSet(OverPatches):
     def _part(self, rows: Mapping[int, Tensor]) -> "PatchSet":
         return self.replace(buckets=_taken(self, rows))
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List templates of facets that are none, and of no size."""
         yield from Record.faults(self)
         if not self.buckets:
             yield "buckets", "are none", "a bucket of templates at least"
         count = len(self.coarse.mesh.faces)
         for index, bucket in enumerate(self.buckets):
-            for name, found, needed in bucket.faults_of(count):
-                yield f"buckets[{index}].{name}", found, needed
+            name, needed = f"buckets[{index}]", f"indices of {count} facets"
+            yield from faults_in(f"{name}.facet", needed, beyond, bucket.facet, count)
+            if not bool((bucket.spacing > 0).all()):
+                yield f"{name}.spacing", "is not above 0 everywhere", "scene units"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -247,11 +246,6 @@ class Observations(Record):
     valid: Bool[Tensor, "patch view height width"]
     priors: PatchPriors | None = None
     viewers: Float[Tensor, "patch view 3"] | None = None
-
-    @property
-    def raster(self) -> tuple[int, ...]:
-        """Patches, height and width."""
-        return (len(self.valid), *self.valid.shape[-2:])
 
     @property
     def gray(self) -> Float[Tensor, "patch view height width"]:
@@ -353,24 +347,15 @@ class Photometry(Record):
     convergence: Convergence
     exposure: Float[Tensor, "patch view"] | None = None
 
-    @property
-    def raster(self) -> tuple[int, ...]:
-        """Patches, height and width."""
-        return tuple(self.valid.shape)
-
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List values that are no normals, albedo or information."""
         normals, valid = self.normals_patch, self.valid
-        known = id(valid)
-        if found := once(normals, lambda: not_unit(normals, valid), known):
-            yield "normals_patch", found, "unit normals where valid"
-        if found := once(normals, lambda: turned_away(normals, valid), known):
-            yield "normals_patch", found, "n_z < 0: x right, y down, z into the surface"
-        if found := once(self.albedo, lambda: not_finite(self.albedo, valid), known):
-            yield "albedo", found, "finite where valid"
-        information = self.information
-        if found := once(information, lambda: outside(information, torch.inf)):
-            yield "information", found, "an inverse variance, 0 where unknown"
+        needed = "unit normals where valid"
+        yield from faults_in("normals_patch", needed, not_unit, normals, valid)
+        needed = "n_z < 0: x right, y down, z into the surface"
+        yield from faults_in("normals_patch", needed, turned_away, normals, valid)
+        yield from faults_in("albedo", "finite where valid", not_finite, self.albedo, valid)
+        yield from faults_in("information", _INFORMATION, outside, self.information, torch.inf)
 
     @property
     def predicted(self) -> Float[Tensor, "patch view channel height width"]:
@@ -456,7 +441,7 @@ class PhotometricPatches(OverPatches):
         found.check("PhotometricPatches.of")
         return found
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List normals of another floating-point type than the templates, too."""
         yield from super(PhotometricPatches, self).faults()
         for index, (bucket, own) in enumerate(
@@ -553,18 +538,10 @@ class Heights(Record):
     num_views: Int[Tensor, " patch"]
     priors: PatchPriors | None = None
 
-    @property
-    def raster(self) -> tuple[int, ...]:
-        """Patches, height and width."""
-        return tuple(self.offset.shape)
-
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List heights that are nowhere, and weights that are none."""
-        if found := once(self.offset, lambda: not_finite(self.offset)):
-            yield "offset", found, "finite, 0 where unknown"
-        information = self.information
-        if found := once(information, lambda: outside(information, torch.inf)):
-            yield "information", found, "an inverse variance, 0 where unknown"
+        yield from faults_in("offset", "finite, 0 where unknown", not_finite, self.offset)
+        yield from faults_in("information", _INFORMATION, outside, self.information, torch.inf)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -606,16 +583,9 @@ class Depths(Record):
     transform: Float[Tensor, "patch 4"]
     status: Int[Tensor, " patch"] | None = None
 
-    @property
-    def raster(self) -> tuple[int, ...]:
-        """Patches, height and width."""
-        return tuple(self.depth.shape)
-
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List depths that are nowhere."""
-        depth, valid = self.depth, self.valid
-        if found := once(depth, lambda: not_finite(depth, valid), id(valid)):
-            yield "depth", found, "finite where valid"
+        yield from faults_in("depth", "finite where valid", not_finite, self.depth, self.valid)
 
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
@@ -670,12 +640,10 @@ class Surface(Record):
     convergence: Convergence
     expected_error: PerVertex | None = None
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List faces that name no vertex, vertices that are nowhere, and what is no normal."""
         yield from self.mesh.faults()
-        normals = self.normals_world
-        if found := once(normals, lambda: not_unit(normals, None)):
-            yield "normals_world", found, "unit, outward"
+        yield from faults_in("normals_world", "unit, outward", not_unit, self.normals_world, None)
 
     @property
     def supported(self) -> VertexMask:

@@ -6,7 +6,6 @@ guessed. Axes of a camera are x right, y down, z forward: what faces it has norm
 What is left open, or has other axes, :func:`~pimper_torch.priors.settled.settled` decides.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +13,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.records.record import Record
-from pimper_torch.records.value_checks import not_finite, not_unit, once, outside
+from pimper_torch.records.value_checks import (
+    Faults,
+    faults_in,
+    faults_of_names,
+    not_above_zero,
+    not_finite,
+    not_unit,
+    outside,
+)
 
 Axes = Literal["opengl", "opencv", "lub"]
 AXES: dict[Axes, tuple[tuple[int, int, int], str]] = {
@@ -23,6 +30,8 @@ AXES: dict[Axes, tuple[tuple[int, int, int], str]] = {
     "lub": ((-1, -1, -1), "x left, y up, z to the viewer"),
 }
 """Signs that turn normals of a camera's axes to ours, and back; and where the axes point."""
+
+_VARIANCE = "above 0, infinite where nothing is guessed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -39,11 +48,12 @@ class MapPrior(Record):
     sizes_px: Int[Tensor, "map 2"]
     undistorted: bool = False
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List names that are not one a map."""
-        if len(self.names) != len(self.sizes_px) or len(set(self.names)) < len(self.names):
-            found = f"are {len(self.names)}, {len(set(self.names))} of them different"
-            yield "names", found, f"a name of its own for each of {len(self.sizes_px)} maps"
+    def faults(self) -> Faults:
+        """List names that are not one a map, and what is no variance."""
+        yield from faults_of_names(self.names, len(self.sizes_px), "maps")
+        variance = getattr(self, "variance", None)
+        if variance is not None:  # of chances it follows
+            yield from faults_in("variance", _VARIANCE, not_above_zero, variance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -62,13 +72,11 @@ class NormalPrior(MapPrior):
     frame: Literal["camera", "world"] = "camera"
     axes: Axes | None = "opencv"
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List what is no normal, and what is no variance."""
+    def faults(self) -> Faults:
+        """List what is no normal, too."""
         yield from super(NormalPrior, self).faults()
-        normals, known = self.normals, self.variance.isfinite()
-        if found := once(normals, lambda: not_unit(normals, known), id(self.variance)):
-            yield "normals", found, "unit normals where the variance is finite"
-        yield from _no_variance(self.variance)
+        needed = "unit normals where the variance is finite"
+        yield from faults_in("normals", needed, _not_unit, self.normals, self.variance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -91,13 +99,11 @@ class DepthPrior(MapPrior):
     inverse: bool | None = False
     gauge: Literal["scene", "scale", "affine"] = "affine"
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List depth that is nowhere, and what is no variance."""
+    def faults(self) -> Faults:
+        """List depth that is nowhere, too."""
         yield from super(DepthPrior, self).faults()
-        depth, known = self.depth, self.variance.isfinite()
-        if found := once(depth, lambda: not_finite(depth, known), id(self.variance)):
-            yield "depth", found, "finite where the variance is"
-        yield from _no_variance(self.variance)
+        needed = "finite where the variance is"
+        yield from faults_in("depth", needed, _not_finite, self.depth, self.variance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -112,11 +118,6 @@ class AlbedoPrior(MapPrior):
     albedo: Float[Tensor, "map channel height width"]
     variance: Float[Tensor, "map height width"]
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List what is no variance."""
-        yield from super(AlbedoPrior, self).faults()
-        yield from _no_variance(self.variance)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class InlierPrior(MapPrior):
@@ -130,12 +131,10 @@ class InlierPrior(MapPrior):
 
     probability: Float[Tensor, "map height width"]
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List what is no probability."""
+    def faults(self) -> Faults:
+        """List what is no probability, too."""
         yield from super(InlierPrior, self).faults()
-        probability = self.probability
-        if found := once(probability, lambda: outside(probability, 1.0)):
-            yield "probability", found, "probabilities"
+        yield from faults_in("probability", "probabilities", outside, self.probability, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -148,12 +147,10 @@ class SilhouettePrior(MapPrior):
 
     inside: Float[Tensor, "map height width"]
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
-        """List what is no probability."""
+    def faults(self) -> Faults:
+        """List what is no probability, too."""
         yield from super(SilhouettePrior, self).faults()
-        inside = self.inside
-        if found := once(inside, lambda: outside(inside, 1.0)):
-            yield "inside", found, "probabilities"
+        yield from faults_in("inside", "probabilities", outside, self.inside, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -172,26 +169,20 @@ class LightPrior(Record):
     names: tuple[str, ...]
     frame: Literal["camera", "world"] = "camera"
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List lights that are none, and what is no variance."""
-        if len(self.names) != len(self.lights) or len(set(self.names)) < len(self.names):
-            found = f"are {len(self.names)}, {len(set(self.names))} of them different"
-            yield "names", found, f"a name of its own for each of {len(self.lights)} lights"
-        lights = self.lights
-        if found := once(lights, lambda: not_finite(lights)):
-            yield "lights", found, "finite"
-        yield from _no_variance(self.variance)
+        yield from faults_of_names(self.names, len(self.lights), "lights")
+        yield from faults_in("lights", "finite", not_finite, self.lights)
+        yield from faults_in("variance", _VARIANCE, not_above_zero, self.variance)
 
 
 Prior = NormalPrior | DepthPrior | AlbedoPrior | InlierPrior | SilhouettePrior | LightPrior
 """Kinds of guesses that views carry in ``priors``."""
 
 
-def _no_variance(variance: Float[Tensor, "..."]) -> Iterator[tuple[str, str, str]]:
-    if found := once(variance, lambda: _not_above_zero(variance)):
-        yield "variance", found, "above 0, infinite where nothing is guessed"
+def _not_unit(normals: Tensor, variance: Tensor) -> str:
+    return not_unit(normals, variance.isfinite())
 
 
-def _not_above_zero(variance: Float[Tensor, "..."]) -> str:
-    count = int((~(variance > 0)).sum())
-    return f"has {count} of {variance.numel()} values that are not above 0" if count else ""
+def _not_finite(depth: Tensor, variance: Tensor) -> str:
+    return not_finite(depth, variance.isfinite())

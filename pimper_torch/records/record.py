@@ -3,8 +3,9 @@
 import dataclasses
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
@@ -12,14 +13,12 @@ from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from pimper_torch.records.value_checks import Faults
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import taken
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Index = Sequence[int] | slice | Tensor
-_ARRAYS: dict[object, dict[str, Any]] = {}
-_HINTS: dict[object, dict[str, Any]] = {}
-_NODES: dict[object, set[str]] = {}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +62,7 @@ class Record:
         for name, found, needed in self.faults():
             raise InputError(f"{where}: {type(self).__name__}.{name} {found}; needed: {needed}.")
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List what is wrong with the values: the field, what was found, what is needed."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -189,37 +188,27 @@ class Record:
         return f"{type(self).__name__}({fields})"
 
 
+@cache
 def _hints(cls: type[Record]) -> dict[str, Any]:
-    if cls not in _HINTS:
-        _HINTS[cls] = typing.get_type_hints(cls)
-    return _HINTS[cls]
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
+@cache
 def _arrays(cls: type[Record]) -> dict[str, Any]:
     """Return the fields that are tensors of a stated shape, or may be."""
-    if cls not in _ARRAYS:
-        hints = _hints(cls)
-        fields = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-        _ARRAYS[cls] = {
-            name: hint
-            for name, hint in fields.items()
-            if _is_array(hint) or any(_is_array(part) for part in _choices(hint))
-        }
-    return _ARRAYS[cls]
+    return {name: hint for name, hint in _hints(cls).items() if _array_of(hint) is not None}
 
 
 def _choices(hint: object) -> tuple[object, ...]:
-    """Return the types of a union."""
+    """Return the types of a union, or the one type."""
     blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return typing.get_args(hint) if blend else ()
-
-
-def _is_array(hint: object) -> bool:
-    return isinstance(hint, type) and issubclass(hint, AbstractArray)
+    return typing.get_args(hint) if blend else (hint,)
 
 
 def _array_of(hint: Any) -> Any:  # noqa: ANN401 - jaxtyping's types have no name of their own
-    return next(part for part in (hint, *_choices(hint)) if _is_array(part))
+    arrays = (one for one in _choices(hint) if isinstance(one, type))
+    return next((one for one in arrays if issubclass(one, AbstractArray)), None)
 
 
 def _axis(hint: Any) -> str:  # noqa: ANN401
@@ -250,17 +239,14 @@ def _nodes(record: Record) -> tuple[list[tuple[str, Any]], tuple[object, ...]]:
     cls = type(record)
     children: list[tuple[str, Any]] = []
     rest: list[tuple[str, Any]] = []
-    if cls not in _NODES:
-        hints = _hints(cls)
-        names = (field.name for field in dataclasses.fields(cls))
-        _NODES[cls] = {name for name in names if _holds_tensors(hints[name])}
-    for field in dataclasses.fields(cls):
-        value = getattr(record, field.name)
-        place = children if field.name in _NODES[cls] and value is not None else rest
-        place.append((field.name, value))
+    for name, hint in _hints(cls).items():
+        value = getattr(record, name)
+        place = children if _holds_tensors(hint) and value is not None else rest
+        place.append((name, value))
     return children, (cls, tuple(name for name, _ in children), tuple(rest))
 
 
+@cache
 def _holds_tensors(hint: object) -> bool:
     if isinstance(hint, type) and issubclass(hint, AbstractArray | Tensor | Record):
         return True

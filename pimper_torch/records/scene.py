@@ -1,6 +1,5 @@
 """Results of structure from motion, and triangle meshes."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.record import Record
-from pimper_torch.records.value_checks import beyond, not_finite, once
+from pimper_torch.records.value_checks import Faults, beyond, faults_in, not_finite
 from pimper_torch.records.views import Cameras, Views
 
 
@@ -82,35 +81,27 @@ class SparseScene(Record):
     offset_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
     series: Int[Tensor, " divided"] = field(default_factory=no_series)
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List what does not belong together."""
         yield from super(SparseScene, self).faults()
-        cameras, count = self.cameras, len(self.points_world)
-        if self.views.num_views != cameras.num_views:
-            needed = f"one for each of {self.views.num_views} views"
-            yield "cameras", f"are {cameras.num_views}", needed
-        if found := once(self.points_world, lambda: not_finite(self.points_world)):
-            yield "points_world", found, "finite points"
-        point, view = self.observation_point, self.observation_view
-        if found := once(point, lambda: beyond(point, count), count):
-            yield "observation_point", found, f"indices of {count} points"
-        if found := once(view, lambda: beyond(view, cameras.num_views), cameras.num_views):
-            yield "observation_view", found, f"indices of {cameras.num_views} views"
-        if len(self.background_from_view) not in (0, cameras.num_views):
-            needed = f"none, or one for each of {cameras.num_views} views"
-            yield "background_from_view", f"are {len(self.background_from_view)}", needed
-        if len(self.series) not in (0, cameras.num_views):
-            needed = f"none, or one for each of {cameras.num_views} views"
-            yield "series", f"are {len(self.series)}", needed
+        count, views = len(self.points_world), self.cameras.num_views
+        if self.views.num_views != views:
+            yield "cameras", f"are {views}", f"one for each of {self.views.num_views} views"
+        yield from faults_in("points_world", "finite points", not_finite, self.points_world)
+        for what, of in (("point", count), ("view", views)):
+            name, needed = f"observation_{what}", f"indices of {of} {what}s"
+            yield from faults_in(name, needed, beyond, getattr(self, name), of)
+        for name in ("background_from_view", "series"):
+            if len(found := getattr(self, name)) not in (0, views):
+                yield name, f"are {len(found)}", f"none, or one for each of {views} views"
         if count:
-            pose, points = cameras.cam_from_world.detach(), self.points_world.detach()
+            pose, points = self.cameras.cam_from_world.detach(), self.points_world.detach()
             depth = pose[:, 2, :3] @ points.mT + pose[:, 2, 3:]
             behind = float((depth <= 0).float().mean())
             if behind > 0.5:
-                found = f"look away from the cloud: {behind:.0%} of its points are behind them"
                 yield (
                     "cameras.cam_from_world",
-                    found,
+                    f"look away from the cloud: {behind:.0%} of its points are behind them",
                     "axes x right, y down, z forward; those of OpenGL and Blender have y up and z "
                     "back: negate the second and third row",
                 )
@@ -150,13 +141,11 @@ class Mesh(Record):
     confidence: PerVertex | None = None
     expected_error: PerVertex | None = None
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List faces that name no vertex, and vertices that are nowhere."""
         count = len(self.vertices_world)
-        if found := once(self.faces, lambda: beyond(self.faces, count), count):
-            yield "faces", found, f"indices of {count} vertices"
-        if found := once(self.vertices_world, lambda: not_finite(self.vertices_world)):
-            yield "vertices_world", found, "finite vertices"
+        yield from faults_in("faces", f"indices of {count} vertices", beyond, self.faces, count)
+        yield from faults_in("vertices_world", "finite vertices", not_finite, self.vertices_world)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,6 +1,6 @@
 """Checks of the values of a record; each tensor is read once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -13,23 +13,37 @@ from pimper_torch.ground.shapes import Vectors
 _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
 
-def once(tensor: Tensor, test: Callable[[], str], context: object = None) -> str:
-    """Return what ``test`` finds wrong with a tensor, or nothing where it found nothing before.
+Faults = Iterator[tuple[str, str, str]]
+"""What is wrong with a record: the field, what was found, what is needed."""
+
+
+def faults_in(
+    field: str, needed: str, test: Callable[..., str], tensor: Tensor, *context: object
+) -> Faults:
+    """List what ``test(tensor, *context)`` finds wrong with the values of a field.
 
     Args:
+        test: Returns what it found; nothing if all is well.
         tensor: Looked through again only if it is another one, not if it was written into.
-        test: Says what was found; nothing if all is well.
-        context: What else the answer depends on, such as a number of vertices.
+        context: What else the answer depends on, such as a number of vertices or a mask.
     """
-    key = (test.__code__, context)
+    key = (test, *(id(one) if isinstance(one, Tensor) else one for one in context))
     known = _sound.setdefault(tensor, set())
     if key in known:
-        return ""
+        return
     with torch.no_grad():
-        found = test()
-    if not found:
+        found = test(tensor, *context)
+    if found:
+        yield field, found, needed
+    else:
         known.add(key)
-    return found
+
+
+def faults_of_names(names: Sequence[str], count: int, what: str) -> Faults:
+    """List names that are not one of its own for each of so many."""
+    if len(names) != count or len(set(names)) < len(names):
+        found = f"are {len(names)}, {len(set(names))} of them different"
+        yield "names", found, f"a name of its own for each of {count} {what}"
 
 
 def beyond(index: Int[Tensor, "..."], count: int) -> str:
@@ -80,6 +94,12 @@ def not_unit(normals: Vectors, where: Bool[Tensor, "*batch"] | None) -> str:
         f"has {count} of {bad.numel()} normals that are not unit, of length "
         f"{float(length[bad].min()):.3g} to {float(length[bad].max()):.3g}{hint}"
     )
+
+
+def not_above_zero(variance: Float[Tensor, "..."]) -> str:
+    """State how many variances are not above 0."""
+    count = int((~(variance > 0)).sum())
+    return f"has {count} of {variance.numel()} values that are not above 0" if count else ""
 
 
 def turned_away(normals: Vectors, where: Bool[Tensor, "*batch"]) -> str:

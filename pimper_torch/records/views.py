@@ -1,6 +1,5 @@
 """Photographs and the cameras that took them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +9,13 @@ from torch import Tensor
 from pimper_torch.ground.shapes import Masks
 from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
-from pimper_torch.records.value_checks import no_pinhole, not_rigid, once
+from pimper_torch.records.value_checks import (
+    Faults,
+    faults_in,
+    faults_of_names,
+    no_pinhole,
+    not_rigid,
+)
 from pimper_torch.runtime.mapped import by_view
 
 
@@ -51,11 +56,9 @@ class Views(Record):
         """Number of photographs."""
         return self.images.shape[0]
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List what is wrong with names and sizes; radiance may be anything, stages mask it."""
-        if len(self.names) != self.num_views or len(set(self.names)) < len(self.names):
-            found = f"are {len(self.names)}, {len(set(self.names))} of them different"
-            yield "names", found, f"a name of its own for each of {self.num_views} views"
+        yield from faults_of_names(self.names, self.num_views, "views")
         raster = self.sizes_px.new_tensor([self.images.shape[3], self.images.shape[2]])
         if bool(((self.sizes_px < 1) | (self.sizes_px > raster)).any()):
             low, high = self.sizes_px.aminmax()
@@ -93,13 +96,12 @@ class Cameras(Record):
         """Number of cameras."""
         return self.intrinsics.shape[0]
 
-    def faults(self) -> Iterator[tuple[str, str, str]]:
+    def faults(self) -> Faults:
         """List matrices that are no pinhole's."""
-        K, pose = self.intrinsics, self.cam_from_world
-        if found := once(K, lambda: no_pinhole(K)):
-            yield "intrinsics", found, "f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 in pixels, f above 0"
-        if found := once(pose, lambda: not_rigid(pose)):
-            yield "cam_from_world", found, "a rotation and a shift, camera axes x right, y down"
+        needed = "f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 in pixels, f above 0"
+        yield from faults_in("intrinsics", needed, no_pinhole, self.intrinsics)
+        needed = "a rotation and a shift, camera axes x right, y down"
+        yield from faults_in("cam_from_world", needed, not_rigid, self.cam_from_world)
 
     @property
     def centers_world(self) -> Float[Tensor, "view 3"]:

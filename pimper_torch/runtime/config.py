@@ -13,7 +13,7 @@ import re
 import types
 import typing
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from enum import Enum
+from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import Literal, TypeVar, Union
@@ -25,6 +25,15 @@ from pimper_torch.runtime.errors import ConfigError
 Config = TypeVar("Config")
 
 _UNITS = {"MB": 10**6, "GB": 10**9}
+# What values are called in messages, by their type.
+_WORDS: dict[object, str] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    Path: "a path",
+    types.NoneType: "null",
+}
 
 
 def require(ok: bool, field: str, value: object, needed: str) -> None:
@@ -98,15 +107,15 @@ def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Confi
 
     Fields that the mapping leaves out keep their defaults. An int serves as a float; no
     other type stands in for another, and a bool is no number. Understood annotations are
-    bool, int, float, str, ``Path``, ``Literal``, enums (by name), tuples (from lists),
-    unions, and dataclasses of these. Inverse of :func:`to_mapping`.
+    bool, int, float, str, ``Path``, ``Literal``, tuples (from lists), unions of these, and
+    dataclasses of all. Inverse of :func:`to_mapping`.
 
     Args:
         where: What the mapping is, for messages; a file's name for instance.
 
     Raises:
         ConfigError: For an unknown key (names the nearest and all valid ones), a wrong
-            type, a missing value, or a value that the dataclass itself refuses.
+            type, or a value that the dataclass itself refuses.
     """
     return _build(cls, mapping, where, "", cls)
 
@@ -274,86 +283,46 @@ def _build(
             continue
         if key not in _names(cls):
             raise ConfigError(_unknown(key, cls, where, section, root))
-        values[key] = _convert(hints[key], value, where, _join(section, key), root)
-    missing = [name for name in _required(cls) if name not in values]
-    if missing:
-        raise ConfigError(
-            f"{where}: {section or 'the whole'} lacks {', '.join(missing)}, which has no default."
-        )
+        hint, field = hints[key], _join(section, key)
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            values[key] = _build(hint, {} if value is None else value, where, field, root)
+        else:
+            values[key] = _convert(hint, value, f"{where}: {field}")
     try:
         return cls(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}: {section + ': ' if section else ''}{error}") from error
 
 
-def _convert(hint: object, value: object, where: str, field: str, root: type[object]) -> object:
+def _convert(hint: object, value: object, field: str) -> object:
     """Turn a YAML value into what the annotation of its field asks for, or refuse it."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return _build(hint, {} if value is None else value, where, field, root)
     if origin in (Union, types.UnionType):
-        return _convert_union(args, value, where, field, root)
-    if origin is tuple and isinstance(value, list | tuple):
+        for choice in args:
+            with suppress(ConfigError):
+                return _convert(choice, value, field)
+    elif origin is tuple and isinstance(value, list | tuple):
         if len(args) == 2 and args[1] is Ellipsis:
             args = args[:1] * len(value)
         if len(args) == len(value):
             return tuple(
-                _convert(arg, item, where, f"{field}[{place}]", root)
+                _convert(arg, item, f"{field}[{place}]")
                 for place, (arg, item) in enumerate(zip(args, value, strict=True))
             )
     elif origin is Literal:
-        for choice in args:
-            if choice == value and type(choice) is type(value):
-                return value
-    elif isinstance(hint, type):
-        converted = _scalar(hint, value)
-        if converted is not None:
-            return converted
-    raise ConfigError(f"{where}: {field} is {_shown(value)}; needed: {_needed(hint)}.")
-
-
-def _convert_union(
-    choices: tuple[object, ...], value: object, where: str, field: str, root: type[object]
-) -> object:
-    if value is None and types.NoneType in choices:
-        return None
-    offered = [choice for choice in choices if choice is not types.NoneType]
-    refusals = []
-    for choice in offered:
-        try:
-            return _convert(choice, value, where, field, root)
-        except ConfigError as error:
-            refusals.append(error)
-    if len(refusals) == 1:
-        raise refusals[0]
-    needed = " or ".join(_needed(choice) for choice in choices)
-    raise ConfigError(f"{where}: {field} is {_shown(value)}; needed: {needed}.")
-
-
-def _scalar(hint: type[object], value: object) -> object | None:
-    """Return the value as a ``hint``, or None where it is something else."""
-    if issubclass(hint, Enum):
-        return hint.__members__.get(value) if isinstance(value, str) else None
-    if hint is bool or isinstance(value, bool):
-        return value if hint is bool and isinstance(value, bool) else None
-    if hint is float:
-        return _number(value)
-    if issubclass(hint, Path):
-        return hint(value) if isinstance(value, str | Path) else None
-    assert hint in (int, str), f"settings cannot be of type {hint!r}"
-    return value if isinstance(value, hint) else None
-
-
-def _number(value: object) -> float | None:
-    if isinstance(value, str) and "e" in value.lower():
-        try:
-            return float(value)  # YAML 1.1 takes 1e-3, without a dot, for a text
-        except ValueError:
-            return None
-    try:
-        return float(value) if isinstance(value, int | float) else None
-    except OverflowError:  # a whole number of 310 digits
-        return None
+        if any(choice == value and type(choice) is type(value) for choice in args):
+            return value
+    elif hint is float:
+        exponent = isinstance(value, str) and "e" in value.lower()
+        # YAML 1.1 takes 1e-3, without a dot, for a text; a whole number may have 310 digits.
+        with suppress(ValueError, OverflowError):
+            if type(value) in (int, float) or exponent:
+                return float(value)  # type: ignore[arg-type]
+    elif hint is Path and isinstance(value, str | Path):
+        return Path(value)
+    elif type(value) is hint:
+        return value
+    raise ConfigError(f"{field} is {_shown(value)}; needed: {_needed(hint)}.")
 
 
 def _shown(value: object) -> str:
@@ -391,14 +360,6 @@ def _kind_names(cls: type[object]) -> tuple[str, ...]:
     return tuple(name for name in hints if typing.get_origin(hints[name]) is typing.ClassVar)
 
 
-def _required(cls: type[object]) -> Iterator[str]:
-    assert dataclasses.is_dataclass(cls), f"{cls!r} is no dataclass"
-    for field in dataclasses.fields(cls):
-        without = field.default is field.default_factory is dataclasses.MISSING
-        if field.init and without:
-            yield field.name
-
-
 def _paths(cls: type[object], section: str) -> Iterator[str]:
     """List every setting of a config and of those inside it."""
     for name, hint in typing.get_type_hints(cls).items():
@@ -416,8 +377,6 @@ def _plain(value: object) -> object:
         return to_mapping(value)
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, Enum):
-        return value.name
     return str(value) if isinstance(value, Path) else value
 
 
@@ -432,21 +391,10 @@ def _needed(hint: object) -> str:
         if len(args) == 2 and args[1] is Ellipsis:
             return f"a list, each entry {_needed(args[0])}"
         return "a list of " + ", ".join(_needed(arg) for arg in args)
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return "one of " + ", ".join(hint.__members__)
-    words: dict[object, str] = {
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-        str: "a text",
-        Path: "a path",
-        types.NoneType: "null",
-    }
-    return words.get(hint, "a section")
+    return _WORDS[hint]
 
 
 def _kind(value: object) -> str:
     if value is None:
         return "nothing"
-    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-    return names.get(type(value), "a list" if isinstance(value, list | tuple) else "a section")
+    return _WORDS.get(type(value), "a list" if isinstance(value, list | tuple) else "a section")
