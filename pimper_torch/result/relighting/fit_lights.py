@@ -83,11 +83,9 @@ def shrunk(cameras: Cameras, view: int) -> Cameras:
     """Return the camera of a view's shrunk photograph."""
     width, height = (int(side) for side in cameras.sizes_px[view])
     factor = shrinking((width, height))
-    return Cameras(
-        intrinsics=scale_intrinsics(cameras.intrinsics[view : view + 1], 1 / factor, 1 / factor),
-        cam_from_world=cameras.cam_from_world[view : view + 1],
-        sizes_px=cameras.sizes_px[view : view + 1] // factor,
-    )
+    own = cameras.take([view])
+    intrinsics = scale_intrinsics(own.intrinsics, 1 / factor, 1 / factor)
+    return own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor)
 
 
 def observe_all(

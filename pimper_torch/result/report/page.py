@@ -5,7 +5,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -80,9 +79,7 @@ def asset_within(asset: Textured, path: Path) -> bytes:
 
 
 def _read(name: str) -> str:
-    return (resources.files("pimper_torch") / "result" / "report" / name).read_text(
-        encoding="utf-8"
-    )
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 Json = dict[str, object]
@@ -118,15 +115,10 @@ def _relighting(summary: Summary) -> Json | None:
         return None
     held_out = found["photographs"] == "held out"
     rows = [
-        [one["name"], _decibels(one["psnr_db"]), _decibels(one["psnr_matte_db"])]
+        [one["name"], _decibels(one["psnr_db"]), _decibels(one["psnr_matte_db"]), ""]
         for one in ({"name": "mean", **found}, *found["views"])
     ]
-    columns = [
-        {"title": "photograph", "kind": "name"},
-        {"title": "PSNR with materials, dB", "kind": "number"},
-        {"title": "matte, dB", "kind": "number"},
-        {"title": "", "kind": "text"},
-    ]
+    columns = {"photograph": "name", "PSNR with materials, dB": "number", "matte, dB": "number"}
     materials = "; ".join(
         f"{100 * one['vertices']:.0f} % metallic {one['metallic']:.2g}, roughness "
         f"{one['roughness']:.2g}, specular {one['specular']:.2g}"
@@ -139,7 +131,7 @@ def _relighting(summary: Summary) -> Json | None:
         "title": "Photographs predicted from the surface",
         "folded": True,
         "text": f"Each under its own fitted light, of photographs {whose}. Materials: {materials}.",
-        "table": {"columns": columns, "rows": [[*row, ""] for row in rows]},
+        "table": _table(columns | {"": "text"}, rows),
     }
 
 
@@ -150,13 +142,7 @@ def _decibels(value: float | None) -> str:
 def _stages(summary: Summary) -> Json:
     stages = summary["stages"]
     longest = max([stage["seconds"] for stage in stages if not stage["kept"]], default=0) or 1
-    columns = [
-        {"title": "stage", "kind": "name"},
-        {"title": "seconds", "kind": "number"},
-        {"title": "", "kind": "bar"},
-        {"title": "peak MB", "kind": "number"},
-        {"title": "figures", "kind": "text"},
-    ]
+    columns = {"stage": "name", "seconds": "number", "": "bar", "peak MB": "number"}
     rows = [
         [
             stage["name"],
@@ -168,30 +154,21 @@ def _stages(summary: Summary) -> Json:
         for stage in stages
     ]
     total = f"{summary['seconds']:.0f} s, {summary['peak_memory_mb'] or 0:.0f} MB at most"
-    return {"title": "Stages", "text": total, "table": {"columns": columns, "rows": rows}}
+    return {"title": "Stages", "text": total, "table": _table(columns | {"figures": "text"}, rows)}
 
 
 def _figures(stage: Mapping[str, Any]) -> str:
     aside = ("name", "seconds", "peak_memory_mb", "kept")
-    told = {name: value for name, value in stage.items() if name not in aside and value is not None}
     return ", ".join(
-        f"{name.replace('_', ' ')} {value:,}"
-        if isinstance(value, int)
-        else f"{name.replace('_', ' ')} {value:.4g}"
-        for name, value in told.items()
+        f"{name.replace('_', ' ')} {value:{',' if isinstance(value, int) else '.4g'}}"
+        for name, value in stage.items()
+        if name not in aside and value is not None
     )
 
 
 def _left_out(summary: Summary) -> Json | None:
-    acted = [entry for entry in summary["left_out"] if entry["count"]]
     idle = [entry["guard"] for entry in summary["left_out"] if not entry["count"]]
-    columns = [
-        {"title": "guard", "kind": "name"},
-        {"title": "left out", "kind": "number"},
-        {"title": "of", "kind": "number"},
-        {"title": "", "kind": "name"},
-        {"title": "reason", "kind": "text"},
-    ]
+    columns = {"guard": "name", "left out": "number", "of": "number", "": "name", "reason": "text"}
     rows = [
         [
             entry["guard"],
@@ -200,13 +177,14 @@ def _left_out(summary: Summary) -> Json | None:
             entry["what"],
             entry["reason"] + (f": {some(entry['names'])}" if entry["names"] else ""),
         ]
-        for entry in acted
+        for entry in summary["left_out"]
+        if entry["count"]
     ]
     return {
         "title": "Left out, and by whom",
         "folded": True,
         "text": f"Guards that left out nothing: {', '.join(dict.fromkeys(idle)) or 'none'}.",
-        "table": {"columns": columns, "rows": rows},
+        "table": _table(columns, rows),
     }
 
 
@@ -215,5 +193,10 @@ def _failures(summary: Summary) -> Json | None:
         [one["stage"], f"{one['what']} {some(one['names'])}", one["reason"], one["done"]]
         for one in summary["failures"]
     ]
-    columns = [{"title": title, "kind": "text"} for title in ("stage", "what", "reason", "done")]
-    return {"title": "Failed", "table": {"columns": columns, "rows": rows}} if rows else None
+    columns = dict.fromkeys(("stage", "what", "reason", "done"), "text")
+    return {"title": "Failed", "table": _table(columns, rows)} if rows else None
+
+
+def _table(kinds: Mapping[str, str], rows: Sequence[Sequence[object]]) -> Json:
+    columns = [{"title": title, "kind": kind} for title, kind in kinds.items()]
+    return {"columns": columns, "rows": rows}

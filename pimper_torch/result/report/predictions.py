@@ -44,9 +44,13 @@ def shrunk(
 ) -> Float[Tensor, "channel shorter narrower"]:
     """Average a picture down until its longer side is ``longest`` pixels; small ones stay."""
     height, width = picture.shape[-2:]
-    factor = min(1.0, longest / max(height, width))
-    size = (max(1, round(factor * height)), max(1, round(factor * width)))
-    return interpolate(picture[None], size=size, mode="area")[0]
+    return interpolate(picture[None], size=_sides(height, width, longest), mode="area")[0]
+
+
+def _sides(first: int, second: int, longest: int) -> tuple[int, int]:
+    """Return the sides of a picture that is shrunk until both are at most ``longest``."""
+    factor = min(1.0, longest / max(first, second))
+    return max(1, round(factor * first)), max(1, round(factor * second))
 
 
 def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
@@ -114,12 +118,10 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
 
 def _smaller(camera: Cameras, longest: int) -> Cameras:
     """Return a camera whose picture is at most ``longest`` pixels wide and high."""
-    width, height = (int(side) for side in camera.sizes_px[0])
-    factor = min(1.0, longest / max(width, height))
-    sides = [max(1, round(factor * side)) for side in (width, height)]
-    return Cameras(
+    width, height = camera.sizes_px[0].tolist()
+    sides = _sides(width, height, longest)
+    return camera.replace(
         intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
-        cam_from_world=camera.cam_from_world,
         sizes_px=torch.tensor([sides]),
     )
 
@@ -138,7 +140,7 @@ def view_entries(
     longest = longest_px(scene.views.num_views)
     cameras, entries = scene.cameras.to("cpu"), []
     for view, (name, predicted) in enumerate(zip(scene.views.names, predictions, strict=True)):
-        width, height = (int(side) for side in cameras.sizes_px[view])
+        width, height = cameras.sizes_px[view].tolist()
         intrinsics = cameras.intrinsics[view]
         entry: Json = {
             "name": name,
@@ -154,21 +156,15 @@ def view_entries(
             small = shrunk(silhouettes.inside[view, :height, :width][None], longest)[0]
             entry["outline"] = outline(small, width / small.shape[1])
         if predicted is not None:
-            entry |= {"light": _light(predicted.light), "figure": predicted.figure}
+            light = predicted.light
+            entry["light"] = {
+                "direction": light.direction_world[0].tolist(),
+                "closeness": float(light.closeness[0]),
+                "directed": light.directed[0].expand(3).tolist(),
+                "ambient": light.ambient[0].expand(3).tolist(),
+            }
+            entry["figure"] = predicted.figure
             entry["prediction"] = jpeg(shrunk(predicted.radiance, longest))
         entries.append(entry)
         drop_pages()
     return entries
-
-
-def _light(light: ViewLights) -> Json:
-    return {
-        "direction": light.direction_world[0].tolist(),
-        "closeness": float(light.closeness[0]),
-        "directed": _three(light.directed[0]),
-        "ambient": _three(light.ambient[0]),
-    }
-
-
-def _three(values: Float[Tensor, " channel"]) -> list[float]:
-    return values.expand(3).tolist()

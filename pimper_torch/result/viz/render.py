@@ -34,10 +34,8 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
     Returns:
         sRGB in [0, 1], white where nothing is seen.
     """
-    fine = Cameras(
-        intrinsics=scale_intrinsics(camera.intrinsics, 2.0, 2.0),
-        cam_from_world=camera.cam_from_world,
-        sizes_px=camera.sizes_px * 2,
+    fine = camera.replace(
+        intrinsics=scale_intrinsics(camera.intrinsics, 2.0, 2.0), sizes_px=camera.sizes_px * 2
     )
     hits = cast_view(mesh, fine, 0)
     seen = hits.face >= 0
@@ -118,11 +116,8 @@ def crop(
     cropped = camera.intrinsics.clone()
     cropped[:, :2, 2] = cropped[:, :2, 2] - low
     sides = ((high - low) * factor).round().clamp_min(1).long()
-    return Cameras(
-        intrinsics=scale_intrinsics(cropped, factor, factor),
-        cam_from_world=camera.cam_from_world,
-        sizes_px=sides[None],
-    )
+    intrinsics = scale_intrinsics(cropped, factor, factor)
+    return camera.replace(intrinsics=intrinsics, sizes_px=sides[None])
 
 
 def bounding_box(
