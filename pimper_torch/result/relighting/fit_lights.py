@@ -8,7 +8,6 @@ values, under Cauchy's loss, so that highlights and shadows of other objects hav
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,7 +20,6 @@ from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, med
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import (
-    Cameras,
     Materials,
     Mesh,
     Record,
@@ -74,63 +72,45 @@ class Observed(Record):
         return self.take(slice(None, None, step)) if step > 1 else self
 
 
-def shrinking(sizes_px: tuple[int, int]) -> int:
-    """Return the side of the blocks of pixels that are averaged."""
-    return max(1, -(-max(sizes_px) // _SIZE_PX))
-
-
-def shrunk(cameras: Cameras, view: int) -> Cameras:
-    """Return the camera of a view's shrunk photograph."""
-    width, height = (int(side) for side in cameras.sizes_px[view])
-    factor = shrinking((width, height))
-    own = cameras.take([view])
-    intrinsics = scale_intrinsics(own.intrinsics, 1 / factor, 1 / factor)
-    return own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor)
-
-
 def observe_all(
     surface: LitSurface, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> list[Observed]:
-    """Look at the surface through every photograph; see :func:`observe`."""
-    look = partial(observe, surface, scene, silhouettes=silhouettes)
-    return list(side_by_side(look, range(scene.cameras.num_views), tracked=False))
-
-
-def observe(
-    surface: LitSurface, scene: SparseScene, view: int, silhouettes: Silhouettes | None
-) -> Observed:
-    """Return the pixels of a photograph that show the surface and nothing else.
+    """Return the pixels of every photograph that show the surface and nothing else.
 
     Args:
-        silhouettes: Of all views; by default the surface's own outline.
+        silhouettes: Of all views; by default the masks of the views, or the surface's own outline.
     """
-    camera = shrunk(scene.cameras, view)
-    width, height = (int(side) for side in scene.cameras.sizes_px[view])
-    factor = shrinking((width, height))
-    image = scene.views.images[view, :, :height, :width].detach().cpu().float()
-    radiance = avg_pool2d(image, factor).flatten(1).mT
-    saturated = avg_pool2d((image.amax(dim=0, keepdim=True) >= SATURATED).float(), factor)
-    pixels = surface.pixels(camera, 0)
-    kept = pixels.inner & radiance[pixels.pixel].isfinite().all(dim=1)
-    for mask in _masks(scene, view, silhouettes):
-        inside = avg_pool2d(mask[None, :height, :width].cpu().float(), factor)
-        kept &= inside.flatten()[pixels.pixel] > 0.99
-    pixels = pixels.take(kept)
-    radiance = radiance[pixels.pixel].clamp(0, 1)
-    # The slope of sRGB but for its factor.
-    return Observed(
-        pixels=pixels,
-        radiance=radiance,
-        weight=radiance.clamp_min(_DARK) ** (2 / 2.4 - 2),
-        saturated=saturated.flatten()[pixels.pixel] > 0,
-    )
+    masks = scene.views.masks
 
+    def observed(view: int) -> Observed:
+        own = scene.cameras.take([view])
+        width, height = own.sizes_px[0].tolist()
+        factor = max(1, -(-max(width, height) // _SIZE_PX))
+        intrinsics = scale_intrinsics(own.intrinsics, 1 / factor, 1 / factor)
+        pixels = surface.pixels(
+            own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor), 0
+        )
+        image = scene.views.images[view, :, :height, :width].detach().cpu().float()
+        radiance = avg_pool2d(image, factor).flatten(1).mT
+        saturated = avg_pool2d((image.amax(dim=0, keepdim=True) >= SATURATED).float(), factor)
+        kept = pixels.inner & radiance[pixels.pixel].isfinite().all(dim=1)
+        shown = None if masks is None else masks[view]
+        if silhouettes is not None:
+            shown = silhouettes.inside[view] > 0.5
+        if shown is not None:
+            inside = avg_pool2d(shown[None, :height, :width].cpu().float(), factor)
+            kept &= inside.flatten()[pixels.pixel] > 0.99
+        pixels = pixels.take(kept)
+        radiance = radiance[pixels.pixel].clamp(0, 1)
+        # The slope of sRGB but for its factor.
+        return Observed(
+            pixels=pixels,
+            radiance=radiance,
+            weight=radiance.clamp_min(_DARK) ** (2 / 2.4 - 2),
+            saturated=saturated.flatten()[pixels.pixel] > 0,
+        )
 
-def _masks(scene: SparseScene, view: int, silhouettes: Silhouettes | None) -> list[Tensor]:
-    """List what says where a view shows the object."""
-    if silhouettes is not None:
-        return [silhouettes.masks[view]]
-    return [] if scene.views.masks is None else [scene.views.masks[view]]
+    return list(side_by_side(observed, range(scene.cameras.num_views), tracked=False))
 
 
 # Ambient and directed strengths of every light and channel, and the mean loss.
@@ -170,17 +150,17 @@ def fit_strengths(
     Returns:
         Both, neither below 0, and the mean loss.
     """
-    base, radiance = diffuse, seen.radiance
+    radiance = seen.radiance
     used = (~seen.saturated)[:, None].expand_as(response).float()
     robust = torch.ones_like(response[..., 0])
     for _ in range(3):
         weight = robust[..., None] * seen.weight * used
-        aa, ab = (weight * base**2).sum(dim=1), (weight * base * response).sum(dim=1)
+        aa, ab = (weight * diffuse**2).sum(dim=1), (weight * diffuse * response).sum(dim=1)
         bb = (weight * response**2).sum(dim=1)
-        ay = (weight * base * radiance).sum(dim=1)
+        ay = (weight * diffuse * radiance).sum(dim=1)
         by = (weight * response * radiance).sum(dim=1)
         ambient, directed = _non_negative(aa, ab, bb, ay, by)
-        error = seen.errors(ambient[:, None] * base + directed[:, None] * response)
+        error = seen.errors(ambient[:, None] * diffuse + directed[:, None] * response)
         used = (error != 0).float()
         size = (seen.weight * error**2).sum(dim=-1).sqrt()
         robust = cauchy_weights(size, torch.full_like(size[:1, :1], scale))
@@ -293,9 +273,11 @@ def _fit(
     for step in _FINE:
         lights = best(many, _neighbours(lights[0], step)[None])[0]
     ambient, directed, _ = fit_strengths(many, *rendered(many, lights[:1]), scale)
-    direction_world, closeness = lights[:1, :3], lights[:1, 3]
     return ViewLights(
-        direction_world=direction_world, closeness=closeness, ambient=ambient, directed=directed
+        direction_world=lights[:1, :3],
+        closeness=lights[:1, 3],
+        ambient=ambient,
+        directed=directed,
     )
 
 

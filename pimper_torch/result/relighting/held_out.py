@@ -115,8 +115,8 @@ def judge_textures(
     """Judge the textured surface, too, under the same lights."""
     surface = TexturedSurface(asset)
     observed = observe_all(surface, scene, silhouettes)
-    materials = surface.materials(relighting.materials)
-    judged = relighting.judged
+    judged, few = relighting.judged, relighting.materials
+    materials = few.replace(cluster=few.cluster[asset.vertex])
     found = judge(surface, observed, judged.names, judged.lights, materials)
     return relighting.replace(textured=found)
 

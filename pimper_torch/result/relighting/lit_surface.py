@@ -26,7 +26,7 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.ground.shapes import Scalars
-from pimper_torch.records import Cameras, Materials, Mesh, Record, Textured
+from pimper_torch.records import Cameras, Mesh, Record, Textured
 from pimper_torch.result.asset.tangents import frames
 from pimper_torch.result.viz.maps import base_color
 
@@ -231,10 +231,6 @@ class TexturedSurface(LitSurface):
         relative = 2 * _sampled(asset.normal, uv) - 1
         normals = normalize((axes * relative[:, None]).sum(dim=-1), dim=-1)
         return normals, linear_from_srgb(_sampled(asset.base_color, uv))
-
-    def materials(self, few: Materials) -> Materials:
-        """Return the materials of the copied vertices."""
-        return few.replace(cluster=few.cluster[self.asset.vertex])
 
 
 def _sampled(
