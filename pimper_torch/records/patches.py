@@ -418,25 +418,21 @@ class PhotometricPatches(OverPatches):
             InputError: A number of buckets, a shape or a value that does not belong to the patches.
         """
         templates = patches._templates.buckets
-        lights = [lights] * len(templates) if isinstance(lights, Tensor) else lights
-        columns: dict[str, Sequence[Any]] = {
-            "normals": normals,
-            "lights": lights,
-            "albedo": [None] * len(templates) if albedo is None else albedo,
-            "information": information
-            if isinstance(information, Sequence)
-            else [information] * len(templates),
-            "views": patches.buckets
-            if isinstance(patches, PatchViews)
-            else [None] * len(templates),
-        }
-        for name, values in columns.items():
-            if len(values) != len(templates):
+
+        def each(name: str, values: Any) -> Sequence[Any]:  # noqa: ANN401
+            """Return one value a bucket: those given, or the one for all."""
+            several = values if isinstance(values, Sequence) else [values] * len(templates)
+            if len(several) != len(templates):
                 raise InputError(
-                    f"PhotometricPatches.of: {name} are {len(values)}; needed: one tensor for each "
-                    f"of {len(templates)} buckets of patches, in their order."
+                    f"PhotometricPatches.of: {name} are {len(several)}; needed: one tensor for "
+                    f"each of {len(templates)} buckets of patches, in their order."
                 )
-        rows = zip(templates, *columns.values(), strict=True)
+            return several
+
+        views = patches.buckets if isinstance(patches, PatchViews) else None
+        columns = {"normals": normals, "lights": lights, "albedo": albedo}
+        columns |= {"information": information, "views": views}
+        rows = zip(templates, *(each(*column) for column in columns.items()), strict=True)
         found = cls(patches=patches._templates, buckets=tuple(_given(*row) for row in rows))
         found.check("PhotometricPatches.of")
         return found

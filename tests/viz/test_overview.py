@@ -1,15 +1,27 @@
 import itertools
-import warnings
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from scipy import ndimage
+from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.records import Silhouettes
-from pimper_torch.result.viz.overview import _selected, draw_overview, headline, tiles
+from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.records import Silhouettes, Views
+from pimper_torch.result.viz.overview import (
+    DOUBTED,
+    RELIABLE,
+    _selected,
+    border,
+    draw_overview,
+    draw_preview,
+    headline,
+    thumbnails,
+    tiles,
+)
+from pimper_torch.result.viz.render import frame, shade
 
 
 def drawn(path):
@@ -107,14 +119,6 @@ def test_all_views_are_shown_and_of_many_a_selection_with_all_that_are_not_trust
     assert len(_selected(torch.zeros(count, dtype=torch.bool))) == min(count, 64)
 
 
-def test_names_that_the_font_has_no_glyphs_for_are_no_reason_to_warn(reconstruction, tmp_path):
-    scene = reconstruction.scene
-    named = scene.replace(views=scene.views.replace(names=("\u672c.png", "\u5929.png", "c.png")))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        draw_overview(reconstruction.replace(scene=named), tmp_path / "overview.png", 60)
-
-
 def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
     vertices = reconstruction.mesh.vertices_world.clone().requires_grad_()
     mesh = reconstruction.mesh.replace(vertices_world=vertices)
@@ -127,3 +131,63 @@ def test_the_headline_counts(reconstruction):
     assert headline(reconstruction) == "3 of 4 photographs, 2 facets, 225 vertices, 2 s"
     doubted = reconstruction.replace(scene=reconstruction.scene.replace(doubt="All is flat."))
     assert headline(doubted).startswith("3 of 4 photographs (cameras doubtful), 2 facets")
+
+
+def test_the_photograph_and_the_surface_from_three_sides_stand_side_by_side(
+    reconstruction, tmp_path
+):
+    path = tmp_path / "preview.png"
+    coarse = reconstruction.coarse
+    draw_preview(reconstruction.scene, coarse, path, 90)
+    sheet = drawn(path)
+    assert sheet.shape[0] == 90
+    own = reconstruction.cameras.take([coarse.reference])
+    front = shade(coarse.mesh, frame(own, coarse.mesh.vertices_world, 90, 0.05)).numpy()
+    width, height = own.sizes_px[0].tolist()
+    left, top = round(90 * width / height), (90 - front.shape[0]) // 2
+    found = sheet[top : top + front.shape[0], left : left + front.shape[1]]
+    assert np.abs(found - front).max() <= 0.5 / 255 + 1e-6  # rounding to bytes
+    image = reconstruction.scene.views.images[coarse.reference]
+    assert sheet[:, :left].mean() ** 2.2 == pytest.approx(float(image.mean()), abs=0.1)
+    sides = sheet[:, left + front.shape[1] :]
+    assert sides.min() < 0.9  # something is seen there
+    assert [path.name for path in tmp_path.iterdir()] == ["preview.png"]
+
+
+def test_the_border_of_a_square_is_its_outermost_pixels():
+    mask = torch.zeros(9, 9, dtype=torch.bool)
+    mask[2:7, 2:7] = True
+    wanted = mask.clone()
+    wanted[3:6, 3:6] = False
+    assert torch.equal(border(mask), wanted)
+    assert not border(torch.ones_like(mask)).any()  # the picture's edge is none
+
+
+def test_every_view_has_its_tile_and_its_silhouette():
+    images = torch.linspace(0.1, 0.5, 3)[:, None, None, None].expand(3, 1, 40, 60)
+    inside = torch.zeros(3, 40, 60)
+    for view in range(3):
+        inside[view, 10:30, 20 : 30 + 10 * view] = 0.9
+    silhouettes = Silhouettes(
+        inside=inside, reliable=torch.tensor([True, True, False]), source="found"
+    )
+    views = Views(
+        images=images,
+        sizes_px=torch.tensor([[60, 40]]).expand(3, 2),
+        names=("a", "b", "c"),
+        focals_px=torch.ones(3),
+    )
+    sheet = thumbnails(views, silhouettes, range(3), width_px=60, across=2)
+    assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
+    assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))
+    for view, colour in enumerate((RELIABLE, RELIABLE, DOUBTED)):
+        top, left = 20 * (view // 2), 30 * (view % 2)
+        tile = sheet[top : top + 20, left : left + 30]
+        drawn = (tile - torch.tensor(colour)).abs().amax(dim=-1) < 1e-6
+        wanted = torch.zeros(20, 30, dtype=torch.bool)
+        wanted[5:15, 10 : 15 + 5 * view] = True
+        assert torch.equal(drawn, border(wanted))
+        grey = srgb_from_linear(images[view, 0, 0, 0])
+        assert_close(tile[~drawn], grey.expand(int((~drawn).sum()), 3))
+    last = thumbnails(views, silhouettes, [2, 0], width_px=60, across=2)
+    assert torch.equal(last, torch.cat([sheet[20:, :30], sheet[:20, :30]], dim=1))
