@@ -8,7 +8,7 @@ its batch alone: neither the number of workers nor who is first changes it.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from contextvars import copy_context
 from dataclasses import replace
 from functools import cache
@@ -102,7 +102,9 @@ def _in_threads(
     waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
     # A worker's setting reaches other threads of the process too: theirs is put back.
-    with _threads(torch.get_num_threads()), _closing(pool):
+    with _threads(torch.get_num_threads()), ExitStack() as leaving:
+        # Nothing more starts once the block is left, and what runs is waited for.
+        leaving.callback(pool.shutdown, cancel_futures=True)
         for item in items:
             if len(waiting) > workers:
                 yield waiting.popleft().result()
@@ -125,12 +127,3 @@ def _threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def _closing(pool: ThreadPoolExecutor) -> Iterator[None]:
-    """Start nothing more once the block is left, and wait for what runs."""
-    try:
-        yield
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 import pytest
 import torch
 from torch.utils import _pytree as pytree
-from torch.utils.data import DataLoader
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.records import Cameras, Convergence, Photometry, Record, SparseScene, Views
@@ -34,26 +33,20 @@ def views_of(num_views, height=4, width=6):
     )
 
 
-def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras):
-    box = Box(inside=cameras, many=(torch.zeros(2), torch.ones(3)), label="box")
-    moved = box.to("meta")
-    assert moved.inside.intrinsics.device.type == "meta"
-    assert [tensor.device.type for tensor in moved.many] == ["meta", "meta"]
-    assert moved.label == "box"
-    assert moved.nothing is None
-    assert box.inside.intrinsics.device.type == "cpu"
-
-
-def test_only_floating_point_tensors_change_their_type(cameras):
+@pytest.mark.parametrize("device", [None, "cpu", "meta"])
+@pytest.mark.parametrize("dtype", [None, torch.float64])
+def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras, device, dtype):
     many = (torch.zeros(2), torch.ones(3) > 0, torch.arange(4))
     box = Box(inside=cameras.to(torch.float32), many=many, label="box")
-    for moved in (box.to(torch.float64), box.to("cpu", torch.float64)):
-        assert moved.inside.intrinsics.dtype == torch.float64
-        assert moved.inside.sizes_px.dtype == torch.int64
-        assert [tensor.dtype for tensor in moved.many] == [torch.float64, torch.bool, torch.int64]
-    both = box.to("meta", torch.float64).inside.intrinsics
-    assert (both.device.type, both.dtype) == ("meta", torch.float64)
-    assert box.to("meta").inside.intrinsics.dtype == torch.float32
+    moved = box.to(device or dtype or "cpu", dtype if device else None)
+    kind = dtype or torch.float32  # of floating-point tensors alone
+    assert moved.inside.intrinsics.dtype == kind
+    assert moved.inside.sizes_px.dtype == torch.int64
+    assert [tensor.dtype for tensor in moved.many] == [kind, torch.bool, torch.int64]
+    tensors = (moved.inside.intrinsics, moved.inside.sizes_px, *moved.many)
+    assert {tensor.device.type for tensor in tensors} == {device or "cpu"}
+    assert (moved.label, moved.nothing) == ("box", None)
+    assert box.inside.intrinsics.device.type == "cpu"
 
 
 def test_replace_changes_a_copy_alone(cameras):
@@ -140,14 +133,6 @@ def test_a_record_is_a_pytree(cameras):
 def test_detached_records_are_cut_off(cameras):
     moved = cameras.replace(intrinsics=cameras.intrinsics.requires_grad_())
     assert not moved.detach().intrinsics.requires_grad
-
-
-def test_a_loader_of_batches_puts_records_together(cameras):
-    loader = DataLoader(
-        [cameras.take([0]), cameras.take([1])], batch_size=2, collate_fn=Cameras.cat
-    )
-    (batch,) = loader
-    assert torch.equal(batch.cam_from_world, cameras.cam_from_world)
 
 
 def test_camera_centres_are_transferred_to_the_origin_of_their_camera(cameras):

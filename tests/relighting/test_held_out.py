@@ -20,29 +20,18 @@ def scene():
     return photographed(GLOSSY, views=6)[0]
 
 
-def test_every_nth_photograph_by_name_is_held_out(scene):
+def test_every_nth_photograph_by_name_is_held_out_but_for_what_is_needed(scene):
     used, held = held_apart(scene, 3)
     assert held.views.names == ("002", "005")
     assert used.views.names == ("000", "001", "003", "004")
     assert used.unregistered == held.unregistered == ()
     assert torch.equal(held.cameras.cam_from_world, scene.cameras.cam_from_world[[2, 5]])
     assert torch.equal(used.points_world, scene.points_world)
-
-
-def test_names_and_not_their_order_choose(scene):
     turned = scene.replace(views=scene.views.replace(names=("5", "4", "3", "2", "1", "0")))
     assert held_apart(turned, 3)[1].views.names == ("5", "2")
-
-
-def test_without_holding_out_the_scene_is_the_same_object(scene):
-    used, held = held_apart(scene, 0)
-    assert used is scene
-    assert held is None
-
-
-def test_what_is_needed_is_not_held_out(scene):
     assert held_apart(scene, 3, ["005"])[1].views.names == ("002",)
     assert held_apart(scene, 6, ["005"])[0] is scene
+    assert held_apart(scene, 0) == (scene, None)
 
 
 def test_too_few_photographs_are_refused(scene):

@@ -12,7 +12,6 @@ from pimper_torch.result.relighting.fit_lights import fit_lights
 from pimper_torch.result.relighting.held_out import predict
 from pimper_torch.result.relighting.lit_surface import LitSurface
 from tests.relighting.ball import ball_mesh, photographed
-from tests.threads import on_threads
 
 MATTE, GLOSSY = (0.0, 1.0, 0.0), (0.0, 0.3, 1.0)
 
@@ -50,14 +49,6 @@ def test_a_photograph_without_the_object_gets_no_light(ball):
     assert torch.allclose(found.direction_world.norm(dim=1), torch.ones(3))
 
 
-def test_lights_have_the_same_bits_on_any_number_of_threads(ball):
-    scene, _ = photographed(GLOSSY, views=3)
-    first, *others = on_threads(lambda: fit_lights(ball, scene), 1, 2, 3)
-    for other in others:
-        assert torch.equal(first.direction_world, other.direction_world)
-        assert torch.equal(first.directed, other.directed)
-
-
 @pytest.fixture(scope="module")
 def ball_over_table():
     vertices, faces = icosphere(4)
@@ -70,21 +61,26 @@ def ball_over_table():
     return mesh.replace(albedo=torch.full_like(mesh.vertices_world, 0.5))
 
 
-def from_above():
+@pytest.fixture(scope="module")
+def camera():
+    """From above."""
     eye = torch.tensor([[0.0, -4, 6]])
     pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1]))
     return pinholes(pose, 200.0, 160, 120)
 
 
-def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table):
-    direction = normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1)
-    light = ViewLights(
-        direction_world=direction,
+@pytest.fixture(scope="module")
+def light():
+    return ViewLights(
+        direction_world=normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1),
         ambient=torch.full((1, 3), 0.1),
         closeness=torch.zeros(1),
         directed=torch.full((1, 3), 0.8),
     )
-    surface, camera = LitSurface(ball_over_table), from_above()
+
+
+def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table, camera, light):
+    surface, direction = LitSurface(ball_over_table), light.direction_world
     picture = predict(surface, camera, light)
     pixels = surface.pixels(camera, 0)
     on_table = pixels.points_world[:, 2] < 1e-3
@@ -98,19 +94,11 @@ def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table):
     assert (apart < 0.48).sum() > 100
 
 
-def test_cast_shadows_tell_a_light_that_shading_leaves_open(ball_over_table):
+def test_cast_shadows_tell_a_light_that_shading_leaves_open(ball_over_table, camera, light):
     """A plane alone is lit alike by all lights round its normal."""
-    direction = normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1)
-    light = ViewLights(
-        direction_world=direction,
-        ambient=torch.full((1, 3), 0.1),
-        closeness=torch.zeros(1),
-        directed=torch.full((1, 3), 0.8),
-    )
-    camera = from_above()
     picture = predict(ball_over_table, camera, light).nan_to_num(0)
     scene = scene_of(picture.movedim(-1, 0)[None], camera.intrinsics, camera.cam_from_world)
     found = fit_lights(ball_over_table, scene)
     # A pixel of the table is 0.036 wide or more, and the ball's centre 1.4 from its shadow.
     half_a_pixel_deg = math.degrees(0.018 / 1.4)
-    assert angles_deg(found.direction_world, direction).max() < half_a_pixel_deg
+    assert angles_deg(found.direction_world, light.direction_world).max() < half_a_pixel_deg

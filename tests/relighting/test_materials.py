@@ -52,9 +52,13 @@ def test_one_photograph_determines_no_material():
     assert found.values.tolist() == [list(MATTE)]
 
 
-def test_materials_have_the_same_bits_on_any_number_of_threads():
-    first, *others = on_threads(lambda: relit((0.0, 0.3, 1.0), views=3)[2].values, 1, 2)
-    assert all(torch.equal(first, other) for other in others)
+def test_materials_and_lights_have_the_same_bits_on_any_number_of_threads():
+    first, *others = on_threads(lambda: relit((0.0, 0.3, 1.0), views=3), 1, 2, 3)
+    for _, _, materials, matte, found, _ in others:
+        assert torch.equal(materials.values, first[2].values)
+        for lights, own in ((matte, first[3]), (found, first[4])):
+            assert torch.equal(lights.direction_world, own.direction_world)
+            assert torch.equal(lights.directed, own.directed)
 
 
 def test_radiance_is_that_of_the_specification():

@@ -134,10 +134,6 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     assert abs(picture.mean() - 255 * float(srgb_from_linear(torch.tensor(0.2)))) < 1.5
 
 
-def judged(names, figures, lights):
-    return Judged(psnr_db=torch.tensor(figures), lights=lights, names=names)
-
-
 def test_predictions_are_of_every_photograph(reconstruction):
     scene, mesh = reconstruction.scene, reconstruction.mesh
     lights = ViewLights(
@@ -147,7 +143,9 @@ def test_predictions_are_of_every_photograph(reconstruction):
         directed=torch.zeros(3, 1),
     )
     materials = Materials.of(torch.zeros(len(mesh.vertices_world)).long(), torch.tensor([MATTE]))
-    worth = judged(scene.views.names[:2], [30.04, torch.nan], lights)
+    worth = Judged(
+        psnr_db=torch.tensor([30.04, torch.nan]), lights=lights, names=scene.views.names[:2]
+    )
     relighting = Relighting(
         lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
     )
@@ -193,8 +191,13 @@ def test_an_outline_is_where_the_silhouette_ends():
     assert len(numbers) < 2 * math.pi * 20
 
 
+def sections_of(**changed):
+    entries = section_entries({**SUMMARY, **changed}, "zeta: 0.5\n")
+    return {one["title"]: one for one in entries}
+
+
 def test_sections_tell_stages_guards_and_warnings():
-    sections = {one["title"]: one for one in section_entries(SUMMARY, "zeta: 0.5\n")}
+    sections = sections_of()
     assert sections["Warnings"]["items"] == SUMMARY["warnings"]
     rows = sections["Stages"]["table"]["rows"]
     assert [row[1] for row in rows] == ["4.0", "8.0", "kept"]
@@ -205,6 +208,12 @@ def test_sections_tell_stages_guards_and_warnings():
     assert "repair" in guards["text"]
     assert sections["Settings"]["code"] == "zeta: 0.5\n"
     assert not {"Failed", "Photographs predicted from the surface"} & set(sections)
+    failure = {"stage": "fuse", "what": "patch", "names": ["3", "5"], "reason": "no light",
+               "done": "left out"}  # fmt: skip
+    sections = sections_of(doubt="cameras doubtful", failures=[failure])
+    assert sections["Warnings"]["items"][0] == "cameras doubtful"
+    assert sections["Failed"]["table"]["rows"] == [["fuse", "patch 3, 5", "no light", "left out"]]
+    assert sections_of(warnings=[])["Warnings"] == {"title": "Warnings", "text": "None."}
 
 
 def test_what_predictions_are_worth_is_told_with_the_materials():
@@ -212,26 +221,14 @@ def test_what_predictions_are_worth_is_told_with_the_materials():
     material = {"vertices": 1.0, "metallic": 0.0, "roughness": 0.35, "specular": 1.2}
     told = {"photographs": "held out", "psnr_db": 31.0, "psnr_matte_db": 29.0, "views": views,
             "materials": [material]}  # fmt: skip
-    sections = {one["title"]: one for one in section_entries({**SUMMARY, "relighting": told}, "")}
-    found = sections["Photographs predicted from the surface"]
+    found = sections_of(relighting=told)["Photographs predicted from the surface"]
     assert "held out" in found["text"]
     assert "roughness 0.35" in found["text"]
     assert [row[:3] for row in found["table"]["rows"]] == [
         ["mean", "31.00", "29.00"],
         ["a.png", "31.00", ""],
     ]
-    used = section_entries({**SUMMARY, "relighting": {**told, "photographs": "used"}}, "")
-    assert any("made from" in one.get("text", "") for one in used)
-    unknown = {**SUMMARY, "relighting": {**told, "psnr_db": None}}
-    assert "relighting" not in str(section_entries(unknown, "")).lower()
-
-
-def test_a_doubt_stands_first_and_failures_have_their_table():
-    failure = {"stage": "fuse", "what": "patch", "names": ["3", "5"], "reason": "no light",
-               "done": "left out"}  # fmt: skip
-    told = {**SUMMARY, "doubt": "cameras doubtful", "failures": [failure]}
-    sections = {one["title"]: one for one in section_entries(told, "")}
-    assert sections["Warnings"]["items"][0] == "cameras doubtful"
-    assert sections["Failed"]["table"]["rows"] == [["fuse", "patch 3, 5", "no light", "left out"]]
-    calm = {**SUMMARY, "warnings": []}
-    assert section_entries(calm, "")[0] == {"title": "Warnings", "text": "None."}
+    used = sections_of(relighting={**told, "photographs": "used"})
+    assert "made from" in used["Photographs predicted from the surface"]["text"]
+    unknown = sections_of(relighting={**told, "psnr_db": None})
+    assert "Photographs predicted from the surface" not in unknown
