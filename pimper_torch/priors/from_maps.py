@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -30,15 +30,26 @@ class Maps(NamedTuple):
     Attributes:
         values: Padded with NaN.
         variance: NaN where nothing is said of it.
+        undistorted: Whether they are of the photographs as a run undistorts them.
     """
 
     names: tuple[str, ...]
     sizes_px: Int[Tensor, "map 2"]
     values: Float[Tensor, "map height width channel"]
     variance: Float[Tensor, "map height width"]
+    undistorted: bool
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What every kind of prior has."""
+        return {
+            "names": self.names,
+            "sizes_px": self.sizes_px,
+            "undistorted": self.undistorted,
+        }
 
 
-def stacked(found: Mapping[str, tuple[Tensor, Tensor | None]]) -> Maps:
+def stacked(found: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool = False) -> Maps:
     """Put maps into one raster.
 
     Args:
@@ -54,15 +65,11 @@ def stacked(found: Mapping[str, tuple[Tensor, Tensor | None]]) -> Maps:
         values[index, :height, :width] = one
         if spread is not None:
             variance[index, :height, :width] = spread
-    return Maps(tuple(found), sizes, values, variance)
+    return Maps(tuple(found), sizes, values, variance, undistorted)
 
 
 def normals_from(
-    maps: Maps,
-    axes: NormalAxes = "auto",
-    *,
-    error_deg: float = NORMALS_ERROR_DEG,
-    undistorted: bool = False,
+    maps: Maps, axes: NormalAxes = "auto", *, error_deg: float = NORMALS_ERROR_DEG
 ) -> NormalPrior:
     """Make a prior of normals; arrays without a negative value hold ``(n + 1) / 2``."""
     require(0 < error_deg <= 180, "error_deg", error_deg, "above 0, at most 180 degrees")
@@ -71,9 +78,7 @@ def normals_from(
     length = values.norm(dim=-1)
     known = (length > _SHORTEST) & (length < _LONGEST)
     return NormalPrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        undistorted=undistorted,
+        **maps.about,
         normals=torch.where(known[..., None], normalize(values, dim=-1), 0),
         variance=variance_of(maps, known, math.radians(error_deg) ** 2),
         frame="world" if axes == "world" else "camera",
@@ -88,7 +93,6 @@ def depth_from(
     along: Literal["axis", "ray"] = "axis",
     gauge: Literal["scene", "scale", "affine"] = "affine",
     error: float = DEPTH_ERROR,
-    undistorted: bool = False,
 ) -> DepthPrior:
     """Make a prior of depth; 0, NaN and infinity say nothing."""
     require(error > 0, "error", error, "above 0")
@@ -106,9 +110,7 @@ def depth_from(
         ]
         deviation = (error * values.new_tensor(spans)[:, None, None]).expand_as(values)
     return DepthPrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        undistorted=undistorted,
+        **maps.about,
         depth=values,
         variance=variance_of(maps, known, deviation.square()),
         along=along,
@@ -117,14 +119,9 @@ def depth_from(
     )
 
 
-def silhouettes_from(maps: Maps, *, undistorted: bool = False) -> SilhouettePrior:
+def silhouettes_from(maps: Maps) -> SilhouettePrior:
     """Make a prior of silhouettes; NaN says nothing."""
-    return SilhouettePrior(
-        names=maps.names,
-        sizes_px=maps.sizes_px,
-        undistorted=undistorted,
-        inside=maps.values[..., 0].nan_to_num(0.5),
-    )
+    return SilhouettePrior(**maps.about, inside=maps.values[..., 0].nan_to_num(0.5))
 
 
 def variance_of(maps: Maps, known: Tensor, default: Tensor | float) -> Tensor:

@@ -59,7 +59,6 @@ def priors_of(
             "it yourself: `torch.export.load(path).module()` if you trust it, as files of torch "
             "may hold pickles, which run any program; or call onnxruntime in a function."
         )
-    undistorted = isinstance(views, SparseScene)
     photographs = views.views if isinstance(views, SparseScene) else views
     means, deviations = (
         photographs.images.new_tensor(list(part))[:, None, None] for part in (mean, std)
@@ -75,8 +74,7 @@ def priors_of(
         return _map(network((picture - means) / deviations), kind)
 
     found = {name: guess(view) for view, name in enumerate(photographs.names)}
-    maps = from_maps.stacked(found)
-    return _prior(maps, kind, undistorted, meaning)
+    return _prior(from_maps.stacked(found, photographs is not views), kind, meaning)
 
 
 def _map(found: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN401
@@ -98,22 +96,20 @@ def _map(found: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN40
     return values[0].movedim(0, -1), None if variance is None else variance[0, 0]
 
 
-def _prior(maps: from_maps.Maps, kind: Kind, undistorted: bool, meaning: dict[str, Any]) -> Prior:
+def _prior(maps: from_maps.Maps, kind: Kind, meaning: dict[str, Any]) -> Prior:
     makers: dict[Kind, Callable[..., Prior]] = {
         "normals": from_maps.normals_from,
         "depth": from_maps.depth_from,
         "silhouettes": from_maps.silhouettes_from,
     }
     if kind in makers:
-        return makers[kind](maps, **meaning, undistorted=undistorted)
+        return makers[kind](maps, **meaning)
     known = maps.values.isfinite().all(dim=-1)
     values = torch.where(known[..., None], maps.values, 0)
-    about: dict[str, Any] = {"names": maps.names, "sizes_px": maps.sizes_px}
-    about["undistorted"] = undistorted
     if kind == "albedo":
         error = meaning.pop("error", torch.nan)
         told = error > 0 or bool(maps.variance.isfinite().any())
         require(told, "error", error, "above 0, where the network returns no variance")
         variance = from_maps.variance_of(maps, known, error**2)
-        return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **about, **meaning)
-    return InlierPrior(probability=values[..., 0], **about, **meaning)
+        return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **maps.about, **meaning)
+    return InlierPrior(probability=values[..., 0], **maps.about, **meaning)

@@ -30,6 +30,7 @@ def read_maps(
     kinds: tuple[str, ...],
     check: Callable[[Path, np.ndarray], np.ndarray],
     *,
+    undistorted: bool,
     cut_out: bool = False,
 ) -> Maps:
     """Read the maps of photographs, matched by name.
@@ -37,6 +38,7 @@ def read_maps(
     Args:
         kinds: How names of arrays begin that hold the maps, such as ``normal``.
         check: Refuses a map that cannot be of that kind, and returns the channels that count.
+        undistorted: Whether they are of the photographs as a run undistorts them.
         cut_out: Whether pictures that are somewhere transparent hold the map as their opacity.
 
     Raises:
@@ -59,7 +61,7 @@ def read_maps(
             )
         spread = None if variance is None else torch.from_numpy(variance)
         found[name] = torch.from_numpy(values), spread
-    return stacked(found)
+    return stacked(found, undistorted)
 
 
 def single(path: Path, values: np.ndarray) -> np.ndarray:

@@ -34,8 +34,8 @@ def read_normals(
         error_deg: Root mean square of the angular error, where no file has a variance.
         undistorted: Whether they are of the photographs as a run undistorts them.
     """
-    maps = read_maps(folder, views, ("normal",), _vectors)
-    return from_maps.normals_from(maps, axes, error_deg=error_deg, undistorted=undistorted)
+    maps = read_maps(folder, views, ("normal",), _vectors, undistorted=undistorted)
+    return from_maps.normals_from(maps, axes, error_deg=error_deg)
 
 
 def _vectors(path: Path, values: np.ndarray) -> np.ndarray:
@@ -70,7 +70,6 @@ def read_depth(
             of a map's values where these have an offset of their own.
         undistorted: Whether they are of the photographs as a run undistorts them.
     """
-    maps = read_maps(folder, views, ("depth", "disp", "dist", "z"), single)
-    return from_maps.depth_from(
-        maps, inverse, along=along, gauge=gauge, error=error, undistorted=undistorted
-    )
+    kinds = ("depth", "disp", "dist", "z")
+    maps = read_maps(folder, views, kinds, single, undistorted=undistorted)
+    return from_maps.depth_from(maps, inverse, along=along, gauge=gauge, error=error)

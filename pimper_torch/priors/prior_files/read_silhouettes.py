@@ -27,9 +27,8 @@ def read_silhouettes(
     Args:
         undistorted: Whether they are of the photographs as a run undistorts them.
     """
-    return silhouettes_from(
-        read_maps(folder, views, _KINDS, _chance, cut_out=True), undistorted=undistorted
-    )
+    maps = read_maps(folder, views, _KINDS, _chance, undistorted=undistorted, cut_out=True)
+    return silhouettes_from(maps)
 
 
 def _chance(path: Path, values: np.ndarray) -> np.ndarray:
