@@ -430,7 +430,7 @@ class PhotometricPatches(OverPatches):
             return several
 
         views = patches.buckets if isinstance(patches, PatchViews) else None
-        columns = {"normals": normals, "lights": lights, "albedo": albedo}
+        columns: dict[str, Any] = {"normals": normals, "lights": lights, "albedo": albedo}
         columns |= {"information": information, "views": views}
         rows = zip(templates, *(each(*column) for column in columns.items()), strict=True)
         found = cls(patches=patches._templates, buckets=tuple(_given(*row) for row in rows))

@@ -3,7 +3,7 @@
 import dataclasses
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -18,6 +18,7 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import taken
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
+Function = TypeVar("Function", bound=Callable[..., Any])
 Index = Sequence[int] | slice | Tensor
 
 
@@ -188,13 +189,18 @@ class Record:
         return f"{type(self).__name__}({fields})"
 
 
-@cache
+def _remembered(function: Function) -> Function:
+    """Ask a function once for each class; mypy takes classes of dataclasses for unhashable."""
+    return cache(function)  # type: ignore[return-value]
+
+
+@_remembered
 def _hints(cls: type[Record]) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-@cache
+@_remembered
 def _arrays(cls: type[Record]) -> dict[str, Any]:
     """Return the fields that are tensors of a stated shape, or may be."""
     return {name: hint for name, hint in _hints(cls).items() if _array_of(hint) is not None}
@@ -246,7 +252,7 @@ def _nodes(record: Record) -> tuple[list[tuple[str, Any]], tuple[object, ...]]:
     return children, (cls, tuple(name for name, _ in children), tuple(rest))
 
 
-@cache
+@_remembered
 def _holds_tensors(hint: object) -> bool:
     if isinstance(hint, type) and issubclass(hint, AbstractArray | Tensor | Record):
         return True

@@ -275,8 +275,8 @@ def _build(
             f"{where}: {section or 'the whole'} is {_shown(mapping)}; "
             f"needed: a section with some of {', '.join(_names(cls))}."
         )
-    hints, values = typing.get_type_hints(cls), {}
-    kinds = _kind_names(cls)
+    hints, kinds = typing.get_type_hints(cls), _kind_names(cls)
+    values: dict[str, typing.Any] = {}
     for key, value in mapping.items():
         if key in kinds:
             require(value == getattr(cls, key), f"{where}: {key}", value, repr(getattr(cls, key)))

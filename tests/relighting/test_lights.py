@@ -8,12 +8,17 @@ from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
 from pimper_torch.doors.io.tensors import scene_of
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh, ViewLights
-from pimper_torch.result.relighting.fit_lights import fit_lights
+from pimper_torch.result.relighting.fit_lights import lights_of, observe_all
 from pimper_torch.result.relighting.held_out import predict
 from pimper_torch.result.relighting.lit_surface import LitSurface
 from tests.relighting.ball import ball_mesh, photographed
 
 MATTE, GLOSSY = (0.0, 1.0, 0.0), (0.0, 0.3, 1.0)
+
+
+def fit_lights(mesh, scene):
+    surface = LitSurface(mesh)
+    return lights_of(surface, observe_all(surface, scene, None))
 
 
 def angles_deg(one, other):
@@ -82,7 +87,7 @@ def light():
 def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table, camera, light):
     surface, direction = LitSurface(ball_over_table), light.direction_world
     picture = predict(surface, camera, light)
-    pixels = surface.pixels(camera, 0)
+    pixels = surface.pixels(camera)
     on_table = pixels.points_world[:, 2] < 1e-3
     points = pixels.points_world[on_table]
     centre = torch.tensor([0.0, 0, 1.2]) - points

@@ -64,7 +64,7 @@ def test_materials_and_lights_have_the_same_bits_on_any_number_of_threads():
 def test_radiance_is_that_of_the_specification():
     scene, lights = photographed((0.0, 0.4, 1.5), views=3)
     surface = LitSurface(ball_mesh())
-    pixels = surface.pixels(scene.cameras, 0)
+    pixels = surface.pixels(scene.cameras.take([0]))
     incidence = surface.incidence(pixels, lights.direction_world[:1], torch.zeros(1))
     for material in [(0.0, 0.4, 1.5), (0.5, 0.3, 0.7), (1.0, 0.6, 1.0)]:
         found = response(pixels, incidence, torch.tensor(material).expand(len(pixels.pixel), 3))[0]

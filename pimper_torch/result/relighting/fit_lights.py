@@ -21,7 +21,6 @@ from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import (
     Materials,
-    Mesh,
     Record,
     Silhouettes,
     SparseScene,
@@ -87,9 +86,8 @@ def observe_all(
         width, height = own.sizes_px[0].tolist()
         factor = max(1, -(-max(width, height) // _SIZE_PX))
         intrinsics = scale_intrinsics(own.intrinsics, 1 / factor, 1 / factor)
-        pixels = surface.pixels(
-            own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor), 0
-        )
+        smaller = own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor)
+        pixels = surface.pixels(smaller)
         image = scene.views.images[view, :, :height, :width].detach().cpu().float()
         radiance = avg_pool2d(image, factor).flatten(1).mT
         saturated = avg_pool2d((image.amax(dim=0, keepdim=True) >= SATURATED).float(), factor)
@@ -197,31 +195,16 @@ _CLOSENESS, _CLOSEST = (0.0, 0.25, 0.5), 0.7
 _COARSE, _FINE = (0.1, 0.1, 0.05, 0.05, 0.025, 0.025), (0.04, 0.02, 0.01, 0.005, 0.0025)
 
 
-def fit_lights(
-    mesh: Mesh,
-    scene: SparseScene,
-    silhouettes: Silhouettes | None = None,
-    materials: Materials | None = None,
-) -> ViewLights:
-    """Fit the light of every photograph of a scene.
-
-    Args:
-        mesh: In the scene's frame, with albedo.
-        silhouettes: Of the scene's views; by default the mesh's outline.
-    """
-    surface = LitSurface(mesh)
-    return lights_of(surface, observe_all(surface, scene, silhouettes), materials)
-
-
 def lights_of(
     surface: LitSurface,
     observed: Sequence[Observed],
     materials: Materials | None = None,
     start: ViewLights | None = None,
 ) -> ViewLights:
-    """Fit the light of every photograph; see :func:`fit_lights`.
+    """Fit the light of every photograph, see above.
 
     Args:
+        observed: Of each photograph, see :func:`observe_all`.
         start: Lights nearby; by default the whole sphere is searched.
     """
     material = None if materials is None else materials.at_vertices()
@@ -230,8 +213,7 @@ def lights_of(
         near = None if start is None else start.take([view])
         return _fit(surface, observed[view], material, near)
 
-    fits = side_by_side(fit, range(len(observed)), tracked=False)
-    return ViewLights.cat(list(fits))
+    return ViewLights.cat(list(side_by_side(fit, range(len(observed)), tracked=False)))
 
 
 def _fit(

@@ -37,7 +37,7 @@ def predict(
         mesh: With albedo; prepared where several pictures of it are wanted.
     """
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
-    pixels = surface.pixels(camera, 0)
+    pixels = surface.pixels(camera)
     width, height = (int(side) for side in camera.sizes_px[0])
     radiance = shaded(surface, pixels, light, materials)
     picture = torch.full((height * width, radiance.shape[1]), torch.nan)

@@ -102,7 +102,7 @@ class LitSurface:
     """A mesh prepared to be seen and to cast shadows; a constant to autograd, on the CPU."""
 
     def __init__(self, mesh: Mesh) -> None:
-        mesh = mesh.detach().to("cpu").to(torch.float32)
+        mesh = mesh.detach().to("cpu", torch.float32)
         self.mesh = mesh
         normals = mesh.normals_world
         if normals is None:
@@ -114,10 +114,10 @@ class LitSurface:
         self.center_world = (low + high) / 2
         self.radius = float((high - low).norm()) / 2
 
-    def pixels(self, cameras: Cameras, view: int) -> SurfacePixels:
-        """Return what a view shows."""
-        cameras = cameras.detach().to("cpu").to(torch.float32)
-        hits = cast_view(self._caster, cameras, view)
+    def pixels(self, camera: Cameras) -> SurfacePixels:
+        """Return what one camera shows."""
+        camera = camera.detach().to("cpu", torch.float32)
+        hits = cast_view(self._caster, camera, 0)
         seen = hits.face >= 0
         faces, met = self.mesh.faces, hits.take(seen)
         points = met.interpolate(self.mesh.vertices_world, faces)
@@ -128,7 +128,7 @@ class LitSurface:
             pixel=seen.reshape(-1).nonzero()[:, 0],
             points_world=points,
             normals_world=normals_world,
-            to_eye=normalize(cameras.centers_world[view] - points, dim=-1),
+            to_eye=normalize(camera.centers_world[0] - points, dim=-1),
             base_color=base_color,
             vertex=faces[met.face].gather(1, nearest)[:, 0],
             inner=~elsewhere[seen],
