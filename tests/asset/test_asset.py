@@ -14,7 +14,6 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.doors.io.meshes import write_glb
-from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Mesh, Textured
@@ -115,13 +114,6 @@ def test_the_number_of_threads_changes_no_bit(full, few, asset):
     assert torch.equal(again.normal, asset.normal)
     assert torch.equal(again.uv, asset.uv)
     assert torch.equal(again.base_color, asset.base_color)
-
-
-def test_a_surface_of_many_faces_is_reduced(full):
-    asset = textured(full, reduced(full, 12_000))
-    assert 11_500 < len(asset.mesh.faces) <= 12_000
-    points, normals, _ = seen(asset)
-    assert angles_deg(normals, of_surface(full, points)[0]).max() < 1.0
 
 
 @pytest.mark.parametrize("packed", ["xatlas", "triangles"])

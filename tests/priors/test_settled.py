@@ -206,6 +206,7 @@ def test_maps_of_photographs_that_were_left_out_since_are_not_looked_at(rendered
     none = scene.replace(views=scene.views.replace(names=tuple("abcdefghijkl")))
     alone = none.replace(views=none.views.replace(priors=(depth,)))
     assert settled(alone) == alone
+    assert settled(rendered.scene) is rendered.scene
 
 
 def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
@@ -289,7 +290,3 @@ def test_gradients_reach_what_was_given(rendered):
     found = settle(rendered.scene, of_normals(rendered.scene, normals, axes="lub"))
     found.normals.sum().backward()
     assert (normals.grad == -1).all()
-
-
-def test_without_priors_a_scene_stays_as_it_is(rendered):
-    assert settled(rendered.scene) is rendered.scene
