@@ -19,7 +19,7 @@ from pimper_torch.ground.shapes import Mask, Vertices
 from pimper_torch.records import Mesh, Textured
 from pimper_torch.result.asset.atlas import Atlas
 from pimper_torch.result.asset.tangents import frames, tangents
-from pimper_torch.result.viz.maps import albedo_scale, base_color
+from pimper_torch.result.viz.maps import albedo_scale, base_color, carried_normals
 from pimper_torch.runtime.parallel import side_by_side
 
 
@@ -51,25 +51,18 @@ def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = No
         few: The mesh that was laid out, its normals those that the normal map is relative to.
         reflectance: Metallic, roughness and specular of the mesh's vertices.
     """
-    normals = _normals(few)[atlas.vertex]
+    normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
-    values, surface, laid = (
-        torch.cat([_normals(full), colors], dim=1),
-        _Surface(full, few),
-        _laid(atlas),
-    )
+    values = torch.cat([carried_normals(full), colors], dim=1)
+    surface, laid = _Surface(full, few), _laid(atlas)
     own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
         """Return the values of texels, and whether the surface was met."""
-        here = Hits(
-            face=laid.face[texels],
-            distance=laid.distance[texels],
-            barycentric=laid.barycentric[texels],
-        )
+        here = laid.take(texels)
         points = here.interpolate(mesh.vertices_world, mesh.faces)
         met = surface.nearest(points, here.interpolate(shape, mesh.faces))
         found = met.interpolate(values, full.faces)
@@ -173,9 +166,3 @@ def _nearest_known(known: Mask) -> tuple[Int[Tensor, " texel"], Float[Tensor, " 
     away, (row, column) = distance_transform_edt(~known.numpy(), return_indices=True)
     index = torch.from_numpy(row).long() * known.shape[1] + torch.from_numpy(column)
     return index.flatten(), torch.from_numpy(away).flatten()
-
-
-def _normals(mesh: Mesh) -> Vertices:
-    if mesh.normals_world is None:
-        return vertex_normals(mesh.vertices_world, mesh.faces)
-    return mesh.normals_world

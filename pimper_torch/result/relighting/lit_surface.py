@@ -22,13 +22,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
-from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Cameras, Mesh, Record, Textured
 from pimper_torch.result.asset.tangents import frames
-from pimper_torch.result.viz.maps import base_color
+from pimper_torch.result.viz.maps import base_color, carried_normals
 
 
 def facet_density(cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]) -> Scalars:
@@ -104,10 +103,7 @@ class LitSurface:
     def __init__(self, mesh: Mesh) -> None:
         mesh = mesh.detach().to("cpu", torch.float32)
         self.mesh = mesh
-        normals = mesh.normals_world
-        if normals is None:
-            normals = vertex_normals(mesh.vertices_world, mesh.faces)
-        self.normals_world = normals
+        self.normals_world = carried_normals(mesh)
         self.base_color = base_color(mesh)
         self._caster = RayCaster(mesh.vertices_world, mesh.faces)
         low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import Hits, cast_view
-from pimper_torch.ground.shapes import Map, Mask, Vectors
+from pimper_torch.ground.shapes import Map, Mask, Vectors, Vertices
 from pimper_torch.records import Cameras, Mesh, Record
 
 _GREY = 0.5  # colour of a mesh of unknown albedo
@@ -48,14 +48,11 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     """
     hits = hits or cast_view(mesh, cameras, view)
     vertices = mesh.vertices_world
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(vertices, mesh.faces)
     albedo = torch.full_like(vertices, _GREY) if mesh.albedo is None else mesh.albedo
     confidence = torch.ones_like(vertices[:, 0]) if mesh.confidence is None else mesh.confidence
     error = mesh.expected_error
     seen = hits.face >= 0
-    shown = normalize(hits.interpolate(normals, mesh.faces), dim=-1)
+    shown = normalize(hits.interpolate(carried_normals(mesh), mesh.faces), dim=-1)
     return ViewMaps(
         seen=seen,
         depth=torch.where(seen, hits.distance, torch.nan),
@@ -66,6 +63,13 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
         if error is None
         else hits.interpolate(error[:, None], mesh.faces)[..., 0],
     )
+
+
+def carried_normals(mesh: Mesh) -> Vertices:
+    """Return a mesh's normals; without, those of its faces, averaged round the vertices."""
+    if mesh.normals_world is None:
+        return vertex_normals(mesh.vertices_world, mesh.faces)
+    return mesh.normals_world
 
 
 def normal_colors(normals_cam: Vectors) -> Vectors:
