@@ -145,15 +145,20 @@ def test_what_is_no_folder_of_photographs_is_refused(tmp_path, photos, name, why
         load_views(tmp_path / name)
 
 
-def test_black_photographs_are_refused_by_name(photos):
-    save(photos / "2.png", np.full((8, 12, 3), 2, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"2\.png is black"):
-        load_views(photos)
-
-
-def test_two_files_of_one_stem_are_refused(photos, pixels):
-    save(photos / "2.jpg", pixels)
-    with pytest.raises(InputError, match=r"2\.(jpg|png) and 2\.(jpg|png) differ only in"):
+@pytest.mark.parametrize(
+    ("name", "array", "why"),
+    [
+        ("2.png", np.full((8, 12, 3), 2, dtype=np.uint8), r"2\.png is black"),
+        (
+            "2.jpg",
+            np.full((8, 12, 3), 90, dtype=np.uint8),
+            r"2\.(jpg|png) and 2\.(jpg|png) differ only in",
+        ),
+    ],
+)
+def test_photographs_black_or_of_one_stem_are_refused(photos, name, array, why):
+    save(photos / name, array)
+    with pytest.raises(InputError, match=why):
         load_views(photos)
 
 
@@ -220,10 +225,6 @@ def test_two_folders_inside_are_no_poses(tmp_path, pixels):
     save(tmp_path / "c" / "1.tif", pixels)
     with pytest.raises(InputError, match=r"c: 1.png and 1.tif differ only in their suffix"):
         load_views(tmp_path)
-
-
-def as_planes(array):
-    return torch.from_numpy(array.astype(np.float32) / 255).permute(2, 0, 1)
 
 
 def test_a_folder_is_known_by_the_path_that_was_given(photos, tmp_path, monkeypatch):

@@ -22,10 +22,9 @@ from pimper_torch.doors.outputs.folders import prepare_output
 from pimper_torch.doors.outputs.marker import MARKER
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.records import Mesh, Silhouettes
+from pimper_torch.records import Mesh
 from pimper_torch.result.asset.finish import written_channels
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import albedo_scale
@@ -192,28 +191,20 @@ def test_numbers_that_json_cannot_hold_become_null(reconstruction):
     assert (summary["missing_fraction"], summary["stages"][0]["mean_residual"]) == (None, None)
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-@pytest.mark.parametrize("former", [False, True])
-def test_a_failure_in_the_centre_leaves_nothing_or_the_former_result(
-    reconstruction, tmp_path, monkeypatch, error, former
-):
-    out = tmp_path / "deep" / "out"
-    if former:
-        write_result(reconstruction, Config(zeta=1.0), out)
-        with pytest.raises(OutputError, match=r"already holds albedo\.png"):
-            write_result(reconstruction, Config(zeta=2.0), out)
+def test_a_failure_in_the_centre_leaves_the_former_result(reconstruction, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write_result(reconstruction, Config(zeta=1.0), out)
+    with pytest.raises(OutputError, match=r"already holds albedo\.png"):
+        write_result(reconstruction, Config(zeta=2.0), out)
 
     def fail(*_):
-        raise error
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(results, "write_model", fail)
-    told = "No space left" if isinstance(error, OSError) else None
-    with pytest.raises((OutputError, KeyboardInterrupt), match=told):
+    with pytest.raises(OutputError, match="No space left"):
         write_result(reconstruction, Config(zeta=2.0), out, overwrite=True)
-    assert names(tmp_path) == (["deep"] if former else [])
-    if former:
-        assert names(out.parent) == ["out"]
-        assert "1.0" in (out / "config.yaml").read_text()
+    assert names(tmp_path) == ["out"]
+    assert "1.0" in (out / "config.yaml").read_text()
 
 
 def test_a_page_that_nobody_wants_is_not_written(reconstruction, tmp_path):
@@ -254,31 +245,6 @@ def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeyp
         monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
     with pytest.raises(OutputError, match=why):
         prepare_output(tmp_path / name, "result")
-
-
-def test_the_sparse_model_shares_the_meshs_frame(reconstruction, tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
-    write_result(reconstruction, Config(), tmp_path / "out")
-    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse")
-    (image,) = [image for image in model.images.values() if image.name == "b.png"]
-    vertex = reconstruction.mesh.vertices_world[112].double()
-    wanted = transform(reconstruction.cameras.cam_from_world[1].double(), vertex[None])[0]
-    assert np.allclose(image.cam_from_world() * vertex.numpy(), wanted, atol=1e-5)
-
-
-def test_silhouettes_are_written_as_masks_that_can_be_given(reconstruction, tmp_path):
-    inside = torch.zeros(3, 40, 60)
-    inside[:, 5:30, 10:50] = 0.9
-    inside[:, :, 50:] = 0.4
-    reliable = torch.tensor([True, True, False])
-    silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
-    write_result(
-        reconstruction.replace(silhouettes=silhouettes), Config(zeta=2.0), tmp_path / "out"
-    )
-    found = sorted(path.name for path in (tmp_path / "out" / "masks").iterdir())
-    assert found == ["a.png", "b.png", "c.png"]
-    drawn = np.array(Image.open(tmp_path / "out" / "masks" / "b.png"))
-    assert np.array_equal(drawn > 0, inside[1].numpy() > 0.5)
 
 
 def test_the_written_mesh_is_simplified_and_the_summary_says_how_far(reconstruction, tmp_path):

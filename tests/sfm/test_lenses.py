@@ -43,6 +43,7 @@ def test_one_lens_and_one_each_are_what_was_asked_for():
     assert choose_lenses(views, own=True) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_every_other_photograph_zoomed_as_exif_says_is_of_a_lens_of_its_own():
     cameras, focals = cameras_on_an_arc(10), torch.tensor([840.0, 1176.0] * 5).double()
     K = cameras.intrinsics.clone()

@@ -71,6 +71,7 @@ def compare(views, scene):
     return tuple(float(center_errors(found, scene).median()) for found in (without, masked))
 
 
+@pytest.mark.slow
 def test_cameras_before_a_room_and_a_table_at_rest_are_those_of_the_object(solid):
     scene = furnished(solid, fixed_table=True)
     without, masked = compare(photographs(scene, list(range(6))), scene)

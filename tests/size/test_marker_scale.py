@@ -80,9 +80,13 @@ def scene_of(images, cameras):
 
 
 @pytest.fixture(scope="module")
-def scene(sheet):
-    cameras = cameras_of()
-    return scene_of(photographed(sheet, cameras), cameras)
+def images(sheet):
+    return photographed(sheet, cameras_of())
+
+
+@pytest.fixture(scope="module")
+def scene(images):
+    return scene_of(images, cameras_of())
 
 
 def test_a_photographed_sheet_tells_the_size(scene):
@@ -136,31 +140,26 @@ def test_markers_of_a_sheet_lie_on_it_apart_from_each_other_and_have_their_own_n
         layout(37, paper)
 
 
-def test_one_photograph_alone_tells_nothing(sheet):
-    cameras = cameras_of(2)
-    images = photographed(sheet, cameras)
-    images[1] = 0.2
-    assert scale_of_markers(scene_of(images, cameras)) is None
+def test_one_photograph_alone_tells_nothing(images):
+    one = torch.stack([images[0], torch.full_like(images[0], 0.2)])
+    assert scale_of_markers(scene_of(one, cameras_of().take([0, 1]))) is None
 
 
-def test_markers_that_stand_still_before_an_object_that_turns_are_left_out(sheet):
-    cameras = cameras_of()
-    still = photographed(sheet, cameras.take([0])).expand(6, -1, -1, -1)
-    assert scale_of_markers(scene_of(still, cameras)) is None
+def test_markers_that_stand_still_before_an_object_that_turns_are_left_out(images):
+    still = images[:1].expand(6, -1, -1, -1)
+    assert scale_of_markers(scene_of(still, cameras_of())) is None
 
 
-def test_a_photograph_that_shows_a_marker_elsewhere_is_outvoted(sheet):
-    cameras = cameras_of()
-    images = photographed(sheet, cameras)
-    images[2] = images[2].roll(25, dims=2)
-    scale = scale_of_markers(scene_of(images, cameras))
+def test_a_photograph_that_shows_a_marker_elsewhere_is_outvoted(images):
+    shifted = images.clone()
+    shifted[2] = images[2].roll(25, dims=2)
+    scale = scale_of_markers(scene_of(shifted, cameras_of()))
     assert scale.factor * MM == pytest.approx(1, rel=2e-3)
 
 
-def test_overexposed_paper_makes_no_marker_smaller(sheet):
+def test_overexposed_paper_makes_no_marker_smaller(images):
     """Blurred edges of saturated paper move into the black: 2 % of these markers."""
     cameras = cameras_of()
-    images = photographed(sheet, cameras)
     soft = torch.nn.functional.avg_pool2d(images, 3, stride=1, padding=1)
     soft[[0, 2, 4, 5]] = (2.5 * soft[[0, 2, 4, 5]]).clamp(max=1)
     scale = scale_of_markers(scene_of(soft, cameras))
@@ -205,12 +204,8 @@ def test_the_bundled_photographs_show_no_marker():
         assert not find_squares(grey)
 
 
-def result_of(reconstruction, scene):
-    return reconstruction.replace(scene=scene)
-
-
 def test_cameras_in_a_frame_of_their_own_are_not_scaled_by_markers_alone(scene, reconstruction):
-    result = result_of(reconstruction, scene)
+    result = reconstruction.replace(scene=scene)
     assert find_scale(result, own_frame=True) is None
     assert find_scale(result, own_frame=True, markers=30.0).factor * MM == pytest.approx(1, 2e-3)
     assert find_scale(result, markers="off") is None
@@ -225,7 +220,7 @@ def test_markers_that_were_asked_for_and_are_not_there_are_missed(reconstruction
 def test_sources_that_disagree_are_told_and_the_most_accurate_is_taken(scene, reconstruction):
     centers = scene.cameras.centers_world
     true = float((centers[0] - centers[5]).norm()) / MM
-    result = result_of(reconstruction, scene)
+    result = reconstruction.replace(scene=scene)
     near = [CameraDistance(first="000", second="005", length=1.01 * true)]
     assert find_scale(result, camera_distances=near).source == "markers"
     far = [CameraDistance(first="000", second="005", length=1.1 * true)]

@@ -110,7 +110,7 @@ def alike(first, second, tolerance):
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_a_scene_of_another_unit_gives_the_result_in_that_unit():
     """A length that was left out, or a setting in scene units, would be off by a factor."""
-    scene, coarse = (record.to(torch.float32) for record in small_scene(num_views=6, width=64))
+    scene, coarse = (record.to(torch.float32) for record in small_scene(num_views=5, width=40))
     settings = {"silhouettes": {"object": "everything"}, "scales": [1.0]}
     chain = pt.load_chain("default", settings)
     plain = chain(scene, mesh=coarse.mesh)

@@ -1,5 +1,7 @@
 """Videos of a patterned plane that passes by."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -8,6 +10,7 @@ av = pytest.importorskip("av")
 WIDTH, HEIGHT, COUNT = 320, 240, 90
 
 
+@cache
 def texture(seed=3):
     noise = np.random.default_rng(seed).random((HEIGHT + 40, 900, 3))
     smooth = gaussian_filter(noise, (1.5, 1.5, 0))
@@ -24,7 +27,6 @@ def written(
     path,
     blur=lambda number: 0.0,
     gain=lambda number: 1.0,
-    still=False,
     curve=0,
     shape=None,
     field_step=0,
@@ -44,11 +46,11 @@ def written(
         if curve:
             stream.codec_context.color_trc = curve
         for number, at in enumerate(positions() if places is None else places):
-            at = 0 if still else at
             picture = plane[20 : 20 + HEIGHT, at : at + WIDTH].astype(float) * gain(number)
             late = slice(at + field_step, at + field_step + WIDTH)
             picture[::2] = plane[20 : 20 + HEIGHT : 2, late] * gain(number)
-            picture = gaussian_filter(picture, (0, blur(number), 0))
+            if blur(number):
+                picture = gaussian_filter(picture, (0, blur(number), 0))
             frame = av.VideoFrame.from_ndarray(
                 picture.clip(0, 255).astype(np.uint8), format="rgb24"
             )

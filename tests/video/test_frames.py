@@ -19,6 +19,11 @@ from tests.video.clips import COUNT, HEIGHT, WIDTH, positions, texture, written
 PLAIN = "Convert it: ffmpeg -i clip.mkv -vf bwdif=0,scale=iw*sar:ih,setsar=1"
 
 
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return written(tmp_path_factory.mktemp("videos") / "clip.mp4")
+
+
 def test_frames_that_are_chosen_are_sharp_and_equally_far_apart(tmp_path, capsys):
     video = written(tmp_path / "clip.mp4", blur=lambda number: 0.0 if number % 3 == 1 else 2.5)
     line = ["frames", str(video), "-o", str(tmp_path / "photos"), "--count", "12", "--json"]
@@ -45,8 +50,8 @@ def test_frames_that_show_the_same_are_not_written_to_make_up_the_number(tmp_pat
     assert "has 5 frames that differ, of 11 that were asked for" in capsys.readouterr().err
 
 
-def test_light_that_changes_is_not_taken_for_motion(tmp_path):
-    moving = scanned(luma_frames(written(tmp_path / "a.mp4")))
+def test_light_that_changes_is_not_taken_for_motion(clip, tmp_path):
+    moving = scanned(luma_frames(clip))
     video = written(tmp_path / "b.mp4", gain=lambda number: 0.75 + 0.25 * np.sin(number / 9))
     lit = scanned(luma_frames(video))
     assert moving.way[-1] == pytest.approx(500 / WIDTH, rel=0.05)
@@ -62,8 +67,11 @@ def test_light_that_changes_is_not_taken_for_motion(tmp_path):
         (lambda path: path.mkdir(), "cannot be decoded as a video (Is a directory)"),
         (lambda path: path.write_bytes(b"\x00" * 5000), "cannot be decoded as a video"),
         (lambda path: path.write_text("#EXTM3U\n#EXTINF:1,\n/etc/hostname\n"), "clip.mkv: "),
-        (lambda path: written(path).write_bytes(path.read_bytes()[:300]), "cannot be decoded"),
-        (lambda path: written(path, still=True), "nothing moves in the 90 frames"),
+        (
+            lambda path: written(path, places=[0]).write_bytes(path.read_bytes()[:300]),
+            "cannot be decoded",
+        ),
+        (lambda path: written(path, places=[0] * 12), "nothing moves in the 12 frames"),
         (lambda path: written(path, field_step=8, places=range(0, 160, 16)), PLAIN),
         (lambda path: written(path, shape=Fraction(4, 3), places=range(3)), PLAIN),
     ],
@@ -77,7 +85,7 @@ def test_what_is_no_plain_video_is_refused(make, said, tmp_path, capsys):
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
-    video = written(tmp_path / "clip.mp4")
+    video = written(tmp_path / "clip.mp4", places=range(0, 300, 12))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "a.png").write_bytes(b"mine")
     line = ["frames", str(video), "-o", str(tmp_path / "mine"), "--count", "5", "--overwrite"]
@@ -103,17 +111,16 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
         ((0.1, 0.99, -0.99, 0.1), lambda picture: np.rot90(picture, -1)),
     ],
 )
-def test_pictures_are_turned_and_mirrored_as_the_video_says(matrix, wanted, tmp_path):
+def test_pictures_are_turned_and_mirrored_as_the_video_says(matrix, wanted, clip, tmp_path):
     """The matrix of the track's header: (x, y) is shown at (a x + c y, b x + d y)."""
-    plain = written(tmp_path / "clip.mp4")
     turned = tmp_path / "turned.mp4"
-    data = bytearray(plain.read_bytes())
+    data = bytearray(clip.read_bytes())
     a, b, c, d = (round(65536 * value) for value in matrix)
     place = data.index(b"tkhd") + 4 + 40
     for index, value in enumerate((a, b, 0, c, d)):
         data[place + 4 * index : place + 4 * index + 4] = int(value).to_bytes(4, "big", signed=True)
     turned.write_bytes(data)
-    ((_, before),) = frame_pictures(plain, [40])
+    ((_, before),) = frame_pictures(clip, [40])
     ((number, after),) = frame_pictures(turned, [40])
     assert number == 40
     assert np.array_equal(after, wanted(before))
@@ -142,8 +149,8 @@ def test_an_object_that_turns_before_a_wall_moves():
 
 @pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
 def test_high_dynamic_range_is_warned_of(curve, name, tmp_path):
-    video = written(tmp_path / "clip.mp4", curve=curve)
+    video = written(tmp_path / "clip.mp4", curve=curve, places=range(2))
     with pytest.warns(PimperWarning, match=f"clip.mp4: is of high dynamic range, {name}"):
         next(iter(luma_frames(video)))
-    plain = written(tmp_path / "plain.mp4", curve=1)
+    plain = written(tmp_path / "plain.mp4", curve=1, places=range(2))
     assert next(iter(luma_frames(plain))).shape == (HEIGHT, WIDTH)
