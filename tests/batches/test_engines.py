@@ -55,6 +55,22 @@ def test_objects_end_on_workers_of_dask(world, cluster, own):
     assert [one.tries for one in found.values()] == [1, 2, 1]
 
 
+@pytest.mark.slow
+def test_a_worker_of_dask_that_dies_loses_no_object(world, tmp_path, monkeypatch):
+    from distributed import LocalCluster
+
+    monkeypatch.setenv("PYTHONPATH", children_stand_in(tmp_path))
+    kills = "if tries < 1: os.kill(os.getppid(), signal.SIGKILL); sys.exit()\nend()"
+    for name in "abc":
+        world.add(name, kills if name == "b" else "end()")
+    with (
+        LocalCluster(2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster,
+        dask_workers(cluster.scheduler_address) as executor,
+    ):
+        assert {*world.statuses(executor=executor).values()} <= {"ended", "kept"}
+    assert world.begun("b") == 2
+
+
 @pytest.mark.usefixtures("slurm")
 def test_objects_end_as_jobs_of_slurm(world, tmp_path):
     world.add("bad", "fail('InputError', 2)")

@@ -33,8 +33,9 @@ RUNS = {
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
         "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
-        "{photos} --out {out} --sparse {sparse} --max-size-px 48 --scales (0.5,) "
-        "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25",
+        "{photos} --out {out} --sparse {sparse} --mesh {ball} --preset {preset} --max-size-px 48 "
+        "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25 "
+        "--no-report",
     ],
     "batch": [
         "{table} --out {out} --jobs 1 --time-limit 30 --mem-gb 2 --cpus-per-task 1 --overwrite",
@@ -145,12 +146,12 @@ def world(tmp_path_factory, dtu):
 
 @pytest.fixture
 def engines(request, monkeypatch, tmp_path):
-    """Start engines where a line names one; runs are stand-ins there."""
+    """Start engines where a line names one; runs of a batch are stand-ins."""
     line = request.getfixturevalue("line")
+    monkeypatch.setattr(task, "_CHILD", CHILD)
     if "{scheduler}" in line:
         from distributed import LocalCluster
 
-        monkeypatch.setattr(task, "_CHILD", CHILD)
         options = {"processes": False, "dashboard_address": None, "protocol": "tcp"}
         with LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", **options) as one:
             yield {"scheduler": one.scheduler_address}
@@ -173,6 +174,16 @@ def run(command, line, world, tmp_path):
 @pytest.mark.usefixtures("small_pictures", "ctrl_c")
 def test_every_option_of_a_command_runs(command, line, world, engines, tmp_path):
     assert run(command, line, world | engines, tmp_path) == 0
+
+
+@pytest.mark.slow
+def test_a_batch_ends_with_the_bits_of_a_run(world, tmp_path):
+    assert main(["batch", str(world["table"]), "-o", str(tmp_path / "all")]) == 0
+    alone = "{photos} --out {out} --sparse {sparse} --masks {masks} --preset {preset} --no-report"
+    assert run("reconstruct", alone, world, tmp_path) == 0
+    for name in ("mesh.ply", "mesh.glb", "depth.npz", "lights.json"):
+        (found,) = (tmp_path / "all").glob(f"*/{name}")
+        assert found.read_bytes() == (tmp_path / "out" / name).read_bytes()
 
 
 @pytest.mark.usefixtures("ctrl_c")

@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -156,7 +155,7 @@ def _pictures() -> dict[str, Callable[[Path], object]]:
         raw = np.tile(DEEP[..., 1] // 16, (2, 2))
         pictures["a.dng"] = lambda path: write_dng(path, raw, equivalent=50)
     if find_spec("pi_heif") or find_spec("pillow_heif"):
-        pictures["a.heic"] = lambda path: path.write_bytes(b64decode(UPRIGHT))
+        pictures["a.heic"] = lambda path: path.write_bytes(UPRIGHT)
     return pictures
 
 

@@ -1,6 +1,5 @@
 """HEIC and camera raw as files of the two extras: absent, damaged, huge, or called otherwise."""
 
-import base64
 import importlib.util
 
 import numpy as np
@@ -22,7 +21,7 @@ def write(path, **options):
     if path.suffix == ".dng":
         write_dng(path, np.random.default_rng(0).integers(256, 4000, (40, 60)), **options)
     else:
-        path.write_bytes(base64.b64decode(DEEP))
+        path.write_bytes(DEEP)
     return path
 
 

@@ -1,4 +1,3 @@
-import base64
 import importlib.util
 
 import numpy as np
@@ -30,8 +29,8 @@ def stored():
     return np.stack([40 + 3 * u, 60 + 3 * v, 60 + u + v], axis=-1).astype(np.uint8)
 
 
-def write(path, text):
-    path.write_bytes(base64.b64decode(text))
+def write(path, data):
+    path.write_bytes(data)
     return path
 
 
