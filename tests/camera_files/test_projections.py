@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 
 
-@settings(deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31))
 def test_a_projection_is_split_into_a_camera_that_projects_the_same(seed):
     """Which is unique: so it is the camera that a projection was made of, whatever the factor."""

@@ -1,158 +1,42 @@
 """One rig in the words of every program: the cameras that `--sparse` takes are the same."""
 
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import torch
+from camera_writers import (
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    of_colmap,
+    of_idr,
+    of_matrices,
+    of_meshroom,
+    of_metashape,
+    of_named_poses,
+    of_projections,
+    of_sfm_json,
+    of_transforms,
+    rig_of,
+    saved,
+    views_of,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.exchange.alicevision import write_sfm
-from pimper_torch.doors.exchange.nerfstudio import write_transforms
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.method.sfm import colmap
 from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import pinholes_for
-from pimper_torch.records import Cameras, Views
+from pimper_torch.records import Cameras
 from pimper_torch.runtime.errors import InputError, PimperWarning
-
-WIDTH, HEIGHT = 64, 48
-NAMES = ("10.png", "2.png", "a b.png")
-
-
-def rig_of(seed: int) -> Cameras:
-    """Three cameras with one lens, anywhere and looking anywhere."""
-    generator = torch.Generator().manual_seed(seed)
-    rotation, _ = torch.linalg.qr(torch.randn(3, 3, 3, generator=generator).double())
-    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
-    fx, fy, cx, cy = (0.5 + torch.rand(4, generator=generator).double()).tolist()
-    K = torch.tensor([[90 * fx, 0, 32 * cx], [0, 90 * fy, 24 * cy], [0, 0, 1]])
-    return Cameras(
-        intrinsics=K.double().expand(3, 3, 3),
-        cam_from_world=rigid(rotation, 5 * torch.randn(3, 3, generator=generator).double()),
-        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * 3),
-    )
 
 
 @pytest.fixture
 def rig() -> Cameras:
     return rig_of(7)
-
-
-def views_of(scale: float = 1.0, folder: Path | None = None) -> Views:
-    width, height = round(WIDTH * scale), round(HEIGHT * scale)
-    return Views(
-        images=torch.full((3, 1, height, width), 0.5),
-        sizes_px=torch.tensor([[width, height]] * 3),
-        names=NAMES,
-        focals_px=torch.full((3,), torch.nan),
-        folder=str(folder or ""),
-    )
-
-
-def of_colmap(
-    rig: Cameras, folder: Path, *, text: bool = False, names: tuple[str, ...] = NAMES
-) -> Path:
-    model = SparseModel(
-        names=names,
-        lenses=pinhole_lenses(rig),
-        cam_from_world=rig.cam_from_world,
-        points_world=torch.zeros(0, 3, dtype=torch.float64),
-        observation_point=torch.zeros(0, dtype=torch.long),
-        observation_view=torch.zeros(0, dtype=torch.long),
-        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
-    )
-    path = folder / "model"
-    colmap.write_binary(model, torch.zeros(0, 3, dtype=torch.uint8), path)
-    if text:
-        colmap.reconstruction_of(model, torch.zeros(0, 3, dtype=torch.uint8)).write_text(str(path))
-        for binary in path.glob("*.bin"):
-            binary.unlink()
-    return path
-
-
-def of_transforms(rig: Cameras, folder: Path, *, sizes: bool = True) -> Path:
-    write_transforms(views_of(), rig, folder)
-    path = folder / "transforms.json"
-    whole = json.loads(path.read_text())
-    if not sizes:
-        del whole["w"], whole["h"]
-    path.write_text(json.dumps({**whole, "frames": whole["frames"][::-1]}))
-    return path
-
-
-def of_metashape(rig: Cameras, folder: Path) -> Path:
-    K = rig.intrinsics[0]
-    cameras = "".join(
-        f'<camera id="{index}" sensor_id="0" label="{name.removesuffix(".png")}"><transform>'
-        + " ".join(map(repr, matrix.flatten().tolist()))
-        + "</transform></camera>"
-        for index, (name, matrix) in enumerate(
-            zip(NAMES, invert_rigid(rig.cam_from_world), strict=True)
-        )
-    )
-    path = folder / "cameras.xml"
-    f, b1 = float(K[1, 1]), float(K[0, 0] - K[1, 1])
-    path.write_text(
-        '<document version="2.0.0"><chunk label="1"><sensors><sensor id="0" type="frame">'
-        f'<resolution width="{WIDTH}" height="{HEIGHT}"/><calibration class="adjusted">'
-        f"<f>{f}</f><b1>{b1}</b1><cx>{float(K[0, 2]) - WIDTH / 2}</cx>"
-        f"<cy>{float(K[1, 2]) - HEIGHT / 2}</cy></calibration></sensor></sensors>"
-        f"<cameras>{cameras}</cameras></chunk></document>"
-    )
-    return path
-
-
-def of_meshroom(rig: Cameras, folder: Path) -> Path:
-    write_sfm(rig, [f"C:\\theirs\\{name}" for name in NAMES], folder / "cameras.sfm")
-    return folder / "cameras.sfm"
-
-
-def of_sfm_json(rig: Cameras, folder: Path) -> Path:
-    return of_meshroom(rig, folder).rename(folder / "sfm.json")
-
-
-def saved(folder: Path, **arrays: object) -> Path:
-    path = folder / "cameras.npz"
-    np.savez(path, **{name: np.asarray(value) for name, value in arrays.items()})
-    return path
-
-
-def of_idr(rig: Cameras, folder: Path) -> Path:
-    K = rig.intrinsics.clone()
-    K[:, :2, 2] -= 0.5  # which counts centres from 0
-    order = np.argsort(NAMES)
-    world = rig.cam_from_world.clone()
-    world[:, :3] = 2.5 * K @ rig.cam_from_world[:, :3]
-    arrays = {f"world_mat_{rank}": world[view].numpy() for rank, view in enumerate(order)}
-    arrays |= {f"scale_mat_{rank}": np.eye(4) for rank in range(3)}
-    return saved(folder, **arrays)
-
-
-def of_matrices(rig: Cameras, folder: Path) -> Path:
-    pose = rig.cam_from_world
-    return saved(folder, K=rig.intrinsics[0], R=pose[:, :3, :3], t=pose[:, :3, 3])
-
-
-def of_named_poses(rig: Cameras, folder: Path) -> Path:
-    backwards = list(range(3))[::-1]
-    return saved(
-        folder,
-        intrinsics=rig.intrinsics[backwards],
-        cam_from_world=rig.cam_from_world[backwards],
-        names=NAMES[::-1],
-    )
-
-
-def of_projections(rig: Cameras, folder: Path) -> Path:
-    return saved(folder, P=-0.7 * rig.intrinsics @ rig.cam_from_world[:, :3])
 
 
 WAYS = [

@@ -1,7 +1,7 @@
 """Small valid files of every kind that the package reads, and their readers."""
 
-import json
 import warnings
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -12,12 +12,22 @@ import scipy.io
 import tifffile
 import torch
 import trimesh
-from PIL import Image, ImageCms, PngImagePlugin
-
-from pimper_bench.datasets import (
-    read_rendered,
-    write_transforms,
+from camera_writers import (
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    of_idr,
+    of_matrices,
+    of_meshroom,
+    of_metashape,
+    of_projections,
+    of_transforms,
+    rig_of,
 )
+from PIL import Image, ImageCms, PngImagePlugin
+from sparse_models import observed, views_of
+
+from pimper_bench.datasets import read_rendered
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
@@ -26,21 +36,17 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.video.read import luma_frames
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.read_cameras import read_cameras
-from pimper_torch.doors.exchange.alicevision import write_sfm
 from pimper_torch.doors.exchange.openexr import write_exr
 from pimper_torch.doors.io.decode import decode, write_deep_png
 from pimper_torch.doors.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.io.responses import read_curve
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.colmap import reconstruction_of, write_binary
 from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
-from pimper_torch.records import Mesh, Views
+from pimper_torch.records import Cameras, Mesh
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.config import build, read_mapping, to_yaml
 from tests.io.dng import write_dng
@@ -61,12 +67,8 @@ PIXELS = np.random.default_rng(7).integers(60, 200, (18, 24, 3), dtype=np.uint8)
 DEEP = PIXELS.astype(np.uint16) * 256
 MASK = np.pad(np.full((10, 14), 255, dtype=np.uint8), ((4, 4), (5, 5)))
 CAMERAS = arc_cameras(4, width=24, height=18, focal_px=30.0, distance=5.0)
-VIEWS = Views(
-    images=torch.full((4, 3, 18, 24), 0.5),
-    sizes_px=torch.tensor([[24, 18]] * 4),
-    names=("0.png", "1.png", "2.png", "3.png"),
-    focals_px=torch.full((4,), torch.nan),
-    masks=torch.from_numpy(MASK > 0).expand(4, -1, -1),
+VIEWS = views_of(
+    torch.full((4, 3, 18, 24), 0.5), masks=torch.from_numpy(MASK > 0).expand(4, -1, -1)
 )
 
 
@@ -133,21 +135,16 @@ def _pictures() -> dict[str, Callable[[Path], object]]:
 
     pictures = {
         "a.jpg": saved(plain, exif=exif, quality=90),
-        "progressive.jpg": saved(plain, progressive=True),
         "a.png": saved(plain),
         "palette.png": saved(plain.quantize(16), transparency=bytes([0, 255])),
         "rgba.png": saved(rgba),
         "deep.png": lambda path: write_deep_png(DEEP, path),
-        "deep_grey.png": saved(Image.fromarray(DEEP[..., 0])),
         "a.tif": saved(plain, compression="tiff_lzw", exif=exif),
         "deep.tif": tiff(DEEP),
-        "deep_deflate.tif": tiff(DEEP, compression="zlib"),
         "planes.tif": tiff(np.moveaxis(DEEP, -1, 0), planarconfig="separate"),
         "tiled.tif": tiff(DEEP, tile=(16, 16)),
         "pages.tif": pages,
-        "profile.jpg": saved(plain, icc_profile=profile),
         "profile.png": saved(plain, icc_profile=profile),
-        "profile.tif": saved(plain, icc_profile=profile),
         "a.bmp": saved(plain),
         "a.ppm": saved(plain),
     }
@@ -198,17 +195,7 @@ def _meshes(root: Path) -> list[Seed]:
 def _models(root: Path) -> list[Seed]:
     generator = torch.Generator().manual_seed(1)
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64) * 0.5
-    pixels, _ = project(points, CAMERAS.cam_from_world, CAMERAS.intrinsics)
-    point, view = torch.arange(30).repeat_interleave(4), torch.arange(4).repeat(30)
-    model = SparseModel(
-        names=VIEWS.names,
-        lenses=pinhole_lenses(CAMERAS),
-        cam_from_world=CAMERAS.cam_from_world.double(),
-        points_world=points,
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point].double(),
-    )
+    model = observed(CAMERAS, points)
     colors = torch.zeros(30, 3, dtype=torch.uint8)
     write_binary(model, colors, root / "bin")
     (root / "txt").mkdir()
@@ -278,65 +265,30 @@ def _maps(root: Path) -> list[Seed]:
 
 def _camera_files(root: Path) -> list[Seed]:
     """Write cameras that come with photographs of other folders, as `--sparse FILE` reads them."""
-    K, poses = CAMERAS.intrinsics.numpy(), CAMERAS.cam_from_world.numpy()
-    placed = "".join(
-        f'<camera id="{index}" sensor_id="0" label="{name}"><transform>'
-        f"{' '.join(map(str, np.linalg.inv(pose).reshape(-1)))}</transform></camera>"
-        for index, (name, pose) in enumerate(zip(VIEWS.names, poses, strict=True))
-    )
-    xml = (
-        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
-        '<sensor id="0" type="frame"><resolution width="24" height="18"/><calibration type="frame"'
-        ' class="adjusted"><resolution width="24" height="18"/><f>30</f><k1>0.01</k1>'
-        f"</calibration></sensor></sensors><cameras>{placed}</cameras></chunk></document>"
-    )
-    names = [f"/x/{name}" for name in VIEWS.names]
-    radial = {"distortionType": "radialk3", "distortionParams": ["0.01", "0", "0"]}
 
-    def meshroom(path: Path) -> None:
-        write_sfm(CAMERAS, names, path)
-        whole = json.loads(path.read_text())
-        whole["intrinsics"] = [one | radial for one in whole["intrinsics"]]
-        path.write_text(json.dumps(whole))
-
-    def idr(path: Path) -> None:
-        last = np.broadcast_to([[[0.0, 0, 0, 1]]], (4, 1, 4))
-        whole = np.concatenate([K @ poses[:, :3], last], axis=1)
-        named = {f"world_mat_{view}": matrix for view, matrix in enumerate(whole)}
-        np.savez(path, **named, **{f"scale_mat_{view}": np.eye(4) for view in range(4)})
-
-    writers: dict[str, Callable[[Path], object]] = {
-        "turned.npz": lambda path: np.savez(path, K=K, cam_from_world=poses),
-        "projections.npz": lambda path: np.savez_compressed(path, P=K @ poses[:, :3]),
-        "idr.npz": idr,
-        "transforms.json": lambda path: write_transforms(VIEWS, CAMERAS, path.parent),
-        "cameras.sfm": meshroom,
-        "cameras.xml": lambda path: path.write_text(xml),
-    }
+    def seed(write: Callable[[Cameras, Path], Path]) -> Seed:
+        folder = root / write.__name__
+        folder.mkdir(parents=True)
+        name = write(rig_of(7), folder).name
+        return Seed(f"cameras {write.__name__}", folder, (name,), lambda copy: read(copy / name))
 
     def read(path: Path) -> object:
-        return read_cameras(path, VIEWS.names, lambda names: [(24, 18)] * len(names))
+        return read_cameras(path, NAMES, lambda names: [(WIDTH, HEIGHT)] * len(names))
 
-    return [_alone(root, name, write, read) for name, write in writers.items()]
+    ways = of_matrices, of_projections, of_idr, of_transforms, of_meshroom, of_metashape
+    return [seed(write) for write in ways]
 
 
 def _videos(root: Path) -> list[Seed]:
     if not find_spec("av"):
         return []
-    import av
+    from tests.video.clips import written
 
-    def write(path: Path) -> None:
-        with av.open(str(path), "w") as container:
-            stream = container.add_stream("mpeg4", rate=30)
-            stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-            for shift in range(8):
-                picture = np.roll(np.tile(PIXELS, (2, 2, 1))[:32, :48], shift, axis=1)
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode())
+    def read(path: Path) -> None:
+        deque(luma_frames(path), maxlen=0)
 
     return [
-        _alone(root, name, write, lambda path: [*luma_frames(path)] and None)
+        _alone(root, name, lambda path: written(path, places=range(8)), read)
         for name in ("a.mp4", "a.mkv")
     ]
 

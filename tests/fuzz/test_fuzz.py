@@ -233,7 +233,7 @@ def tried(seed, copy: Path) -> None:
     assert [path for path in outside if not os.path.realpath(path).startswith(allowed)] == []
 
 
-@pytest.mark.parametrize("count", [250, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [150, pytest.param(5000, marks=pytest.mark.slow)])
 def test_damaged_files_end_in_clean_errors_or_sound_results(count, tmp_path):
     sys.addaudithook(_watch)
     seeds = make_seeds(tmp_path / "seeds")
