@@ -33,7 +33,7 @@ RUNS = {
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
         "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
-        "{photos} --out {out} --sparse {sparse} --mesh {ball} --preset {preset} --max-size-px 48 "
+        "{photos} -o {out} --sparse {sparse} --mesh {true_mesh} --preset {preset} --max-size-px 48 "
         "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25 "
         "--no-report",
     ],

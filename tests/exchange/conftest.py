@@ -1,3 +1,5 @@
+import shutil
+
 import av
 import numpy as np
 import pytest
@@ -74,12 +76,16 @@ def without_pictures(monkeypatch, lit_before):
 
 
 @pytest.fixture
-def folder(run, photographs, tmp_path, without_pictures):
-    """The folder of results of that run."""
-    config = CoarseToFineConfig(photographs=ENCODING)
-    about = {"photographs": str(photographs), "masks": None}
-    results.write_result(run, config, tmp_path / "out", about=about)
-    return tmp_path / "out"
+def folder(run, photographs, tmp_path, tmp_path_factory, without_pictures):
+    """The folder of results of that run, a copy of one that is written once."""
+    kept, out = tmp_path_factory.getbasetemp() / "exchange", tmp_path / "out"
+    if not kept.exists():
+        config = CoarseToFineConfig(photographs=ENCODING)
+        results.write_result(run, config, kept, about={"photographs": "HERE", "masks": None})
+    shutil.copytree(kept, out)
+    summary = (out / "summary.json").read_text().replace("HERE", str(photographs))
+    (out / "summary.json").write_text(summary)
+    return out
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ import os
 import sys
 import tempfile
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 from pimper_torch.cli.main import main as pimper
@@ -24,29 +23,19 @@ _SCENE = "--num-views 8 --width 240 --height 180 --processes 1 --supersample 1 -
 MOST_GROWTH = 0.03
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Held:
-    """What the process holds after a run."""
-
-    megabytes: float
-    threads: int
-    handles: int
-    temporary: int
-
-
-def held() -> Held:
-    """Look at this process and at its folder of temporary files."""
+def held() -> dict[str, float]:
+    """Count what this process holds, and what its folder of temporary files does."""
     gc.collect()
     release_memory()
-    return Held(
-        megabytes=resident_bytes() / 1e6,
-        threads=len(list(Path("/proc/self/task").iterdir())),
-        handles=len(list(Path("/proc/self/fd").iterdir())),
-        temporary=len(list(Path(tempfile.gettempdir()).iterdir())),
-    )
+    return {
+        "memory": resident_bytes() / 1e6,
+        "threads": len(list(Path("/proc/self/task").iterdir())),
+        "handles": len(list(Path("/proc/self/fd").iterdir())),
+        "temporary files": len(list(Path(tempfile.gettempdir()).iterdir())),
+    }
 
 
-def soak(runs: int, command: list[str], folder: Path) -> list[Held]:
+def soak(runs: int, command: list[str], folder: Path) -> list[dict[str, float]]:
     """Run a command so many times, and look after each; its result is replaced every time."""
     found = []
     for run in range(runs):
@@ -57,18 +46,14 @@ def soak(runs: int, command: list[str], folder: Path) -> list[Held]:
     return found
 
 
-def grown(found: list[Held]) -> list[str]:
+def grown(found: list[dict[str, float]]) -> list[str]:
     """Say what the last run holds more of than the second."""
     settled, last = found[1], found[-1]
-    told = [
-        f"{name}: {getattr(settled, name)} after two runs, {getattr(last, name)} at the end"
-        for name in ("threads", "handles", "temporary")
-        if getattr(last, name) > getattr(settled, name)
+    return [
+        f"{name}: {settled[name]} after two runs, {last[name]} at the end"
+        for name in settled
+        if last[name] > settled[name] * (1 + MOST_GROWTH * (name == "memory"))
     ]
-    growth = last.megabytes / settled.megabytes - 1
-    if growth > MOST_GROWTH:
-        told.append(f"memory grew by {growth:.1%}")
-    return told
 
 
 def small_scene(folder: Path) -> list[str]:
