@@ -25,9 +25,7 @@ def helped(capsys):
 
 
 @pytest.mark.parametrize("name", OF_BENCH)
-def test_where_the_distribution_is_missing_a_sentence_says_what_to_install(
-    name, capsys, monkeypatch
-):
+def test_without_the_distribution_a_sentence_says_so(name, capsys, monkeypatch):
     offer(monkeypatch)
     assert main([name, "mug"]) == 2
     message = capsys.readouterr().err

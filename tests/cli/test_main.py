@@ -133,9 +133,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--log-level"], "--log-level is nothing"),
     ],
 )
-def test_what_the_user_can_mend_is_one_message_and_code_2(
-    photos, chain, tmp_path, capsys, arguments, told
-):
+def test_what_the_user_can_mend_is_one_message(photos, chain, tmp_path, capsys, arguments, told):
     assert run("reconstruct", photos, "-o", tmp_path / "out", *arguments) == 2
     message = capsys.readouterr().err
     assert message.startswith("error: ")
@@ -221,9 +219,7 @@ def test_a_misspelt_command_names_the_nearest(capsys):
     assert "Did you mean `reconstruct`?" in capsys.readouterr().err
 
 
-def test_what_is_unexpected_is_told_in_one_paragraph_and_kept(
-    photos, chain, tmp_path, capsys, monkeypatch
-):
+def test_what_is_unexpected_is_told_and_kept(photos, chain, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(chain, "work", lambda self: 1 / 0)
     assert run("reconstruct", photos, "-o", tmp_path / "out", "-q") == 1
@@ -272,9 +268,7 @@ def test_a_report_that_cannot_be_written_is_told(photos, chain, tmp_path, capsys
 
 
 @pytest.mark.parametrize("place", ["out", "photos", "photograph"])
-def test_names_that_are_not_utf_8_are_refused_before_any_work(
-    photos, chain, tmp_path, capsys, place
-):
+def test_names_that_are_not_utf_8_are_refused(photos, chain, tmp_path, capsys, place):
     strange = "caf\udce9"  # of another encoding
     given = {"out": tmp_path / "out", "photos": photos}
     if place == "photograph":
@@ -369,7 +363,7 @@ def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monk
     assert (lines[0], lines[-2:]) == ("import", ["between stages", "write"])
 
 
-def test_a_run_that_tells_events_does_not_wait_for_who_looks_at_it(
+def test_a_run_that_tells_events_does_not_wait(
     photos, chain, reconstruction, tmp_path, capsys, monkeypatch
 ):
     pytest.importorskip("viser")
@@ -396,9 +390,7 @@ def test_a_run_that_is_looked_at_stays_until_ctrl_c(
     assert capsys.readouterr().out.rstrip().endswith("until Ctrl-C.")
 
 
-def test_a_run_is_refused_before_it_begins_where_there_is_no_viewer(
-    photos, tmp_path, capsys, monkeypatch
-):
+def test_without_a_viewer_a_run_is_refused(photos, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pimper_torch.result.viewer.server.find_spec", lambda _: None)
     assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 2
     assert "pip install 'pimper_torch[view]'" in " ".join(capsys.readouterr().err.split())

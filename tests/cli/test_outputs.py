@@ -31,7 +31,7 @@ def project(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["--sparse", "--mesh", "--masks", "--cache"])
-def test_an_input_in_the_folder_of_the_result_is_refused(
+def test_an_input_in_the_results_folder_is_refused(
     photos, chain, project, capsys, tmp_path, option
 ):
     before = contents(project)

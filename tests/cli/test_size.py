@@ -46,9 +46,7 @@ def line(photos, out, *more):
 
 @pytest.mark.filterwarnings(UNSURE)
 @pytest.mark.parametrize("orientation", TURNED)
-def test_clicks_in_files_are_those_in_photographs_as_they_were_loaded(
-    orientation, reconstruction, tmp_path
-):
+def test_clicks_in_files_are_those_in_views(orientation, reconstruction, tmp_path):
     photos = saved(tmp_path / "photos", orientation)
     more = ["--max-size-px", "60", "--scale-bar", "a,55,40", "c.png,66,50+b,60,45", "80"]
     job = parse("reconstruct", [str(photos), "-o", "out", *more])

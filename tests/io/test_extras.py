@@ -32,9 +32,7 @@ def stored():
 
 
 @pytest.mark.parametrize("suffix", KINDS)
-def test_without_its_package_a_format_is_refused_with_what_to_install(
-    tmp_path, monkeypatch, pixels, suffix
-):
+def test_without_its_package_a_format_is_refused(tmp_path, monkeypatch, pixels, suffix):
     extra, kind, package = KINDS[suffix]
     for index in range(3):
         write(tmp_path / f"{index}{suffix}")
@@ -80,7 +78,7 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
     ("suffix", "name", "lossy"),
     [(".heic", "TIFF", False), (".cr2", "JPEG", True), (".png", "JPEG", True)],
 )
-def test_other_images_are_read_whatever_they_are_called(
+def test_images_are_read_whatever_they_are_called(
     tmp_path, stored, monkeypatch, suffix, name, lossy
 ):
     monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # none is needed

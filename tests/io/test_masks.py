@@ -218,9 +218,7 @@ def test_masks_are_turned_by_their_own_exif_or_where_their_sizes_tell(tmp_path_f
         ("Fu\u0308\u00df.png", "F\u00fc\u00df.png"),
     ],
 )
-def test_masks_are_found_whatever_a_program_made_of_the_name(
-    photos, tmp_path, pixels, photograph, mask
-):
+def test_masks_are_found_by_changed_names(photos, tmp_path, pixels, photograph, mask):
     for name in ("1.png", "2.png", mask):
         save(tmp_path / "masks" / name, box())
     (photos / "10.png").unlink()

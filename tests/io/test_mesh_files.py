@@ -78,9 +78,7 @@ def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path
     assert bool((loaded.face_normals[:, 2] > -0.01).all())
 
 
-def test_far_from_the_origin_an_obj_stands_there_and_an_stl_tells_the_offset(
-    reconstruction, tmp_path
-):
+def test_far_away_an_obj_stands_and_an_stl_tells_the_offset(reconstruction, tmp_path):
     offset = (448231.0, 5411923.0, 312.0)
     far = reconstruction.scene.replace(offset_world=offset)
     files = MeshFiles(faces="all", formats=("stl", "obj"))

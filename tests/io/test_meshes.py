@@ -219,9 +219,7 @@ def fine_mesh(offset=(0.0, 0.0, 0.0), scale=1.0):
 
 @pytest.mark.parametrize("offset", [UTM, (4.2e6, 1.7e5, -4.78e6)])
 @pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
-def test_a_mesh_is_written_far_from_the_origin_without_losing_a_digit(
-    write, suffix, offset, tmp_path
-):
+def test_far_from_the_origin_no_digit_is_lost(write, suffix, offset, tmp_path):
     mesh = fine_mesh()
     local = mesh.replace(vertices_world=mesh.vertices_world.float())
     write(local, tmp_path / f"a{suffix}", offset)

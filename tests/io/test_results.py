@@ -67,9 +67,7 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
 
-def test_depth_leads_back_to_the_surface_and_is_as_far_off_as_the_result_tells(
-    reconstruction, tmp_path
-):
+def test_depth_leads_back_to_the_surface_with_its_error(reconstruction, tmp_path):
     told = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
     found = {}
     for name, mesh in (("untold", reconstruction.mesh), ("told", told)):
@@ -92,9 +90,7 @@ def test_depth_leads_back_to_the_surface_and_is_as_far_off_as_the_result_tells(
     assert (found["expected_error"][~found["mask"]] == 0).all()
 
 
-def test_normals_and_albedo_are_pictures_of_the_reference_photographs_size(
-    reconstruction, tmp_path
-):
+def test_normals_and_albedo_are_pictures_of_the_reference(reconstruction, tmp_path):
     write_result(reconstruction, Config(), tmp_path / "out")
     for name in ("normals.png", "albedo.png"):
         with Image.open(tmp_path / "out" / name) as picture:
@@ -289,9 +285,7 @@ def test_channels_are_in_units_of_what_they_may_be_off(reconstruction):
     assert written_channels(bare).shape == (225, 0)
 
 
-def test_a_result_far_from_the_origin_is_written_in_the_frame_of_its_cameras(
-    reconstruction, tmp_path
-):
+def test_a_far_result_is_written_in_the_frame_of_its_cameras(reconstruction, tmp_path):
     offset = (448231.0, 5411923.0, 312.0)
     shift = torch.tensor(offset, dtype=torch.float64)
     far = reconstruction.replace(scene=reconstruction.scene.replace(offset_world=offset))

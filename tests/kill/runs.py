@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -40,18 +40,6 @@ LONGEST, HANGS = 300.0, 71
 DISK_MB = 24  # the kept stages of a run take 3 MB, a former result and a new one 1 MB each
 
 
-@dataclass(frozen=True)
-class Ended:
-    """How a run ended, and what was wrong after it."""
-
-    ending: str
-    over_former: bool
-    moment: float
-    exit_code: int
-    kept: int
-    faults: tuple[str, ...]
-
-
 def main() -> int:
     """Print a line a run; 1 where one lost or changed something."""
     options = argparse.ArgumentParser(description=__doc__)
@@ -59,58 +47,55 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--endings", nargs="+", choices=ENDINGS, default=ENDINGS)
     given = options.parse_args()
-    failed = 0
-    with tempfile.TemporaryDirectory(prefix="pimper-kill-") as folder:
-        for number, ended in enumerate(
-            ended_runs(Path(folder), given.count, given.seed, given.endings)
-        ):
-            where = "over a former result" if ended.over_former else "into a new folder"
-            print(
-                f"{number:3} {ended.ending:7} at {ended.moment:5.2f} {where:20} "
-                f"exit {ended.exit_code:4}, {ended.kept} stages kept: "
-                f"{'; '.join(ended.faults) or 'the same bits'}",
-                flush=True,
-            )
-            failed += bool(ended.faults)
+    failed, random_moments = 0, random.Random(given.seed)
+    with tempfile.TemporaryDirectory(prefix="pimper-kill-") as name:
+        folder = Path(name)
+        command, seconds = undisturbed(folder)
+        for number in range(given.count):
+            ending = given.endings[number % len(given.endings)]
+            over_former, moment = random_moments.random() < 0.5, random_moments.random()
+            with place(folder / f"run{number}", ending) as home:
+                disturb = partial(disturbance, ending, moment, seconds, home)
+                code, faults = ended(command, home, over_former, disturb)
+            where = "over a former result" if over_former else "into a new folder"
+            said = f"{number:3} {ending:7} at {moment:5.2f} {where:20} exit {code:4}"
+            print(f"{said}: {'; '.join(faults) or 'the same bits'}", flush=True)
+            failed += bool(faults)
     print(f"{given.count} runs, {failed} of them lost or changed something")
     return int(failed > 0)
 
 
-def ended_runs(
-    folder: Path, count: int, seed: int, endings: tuple[str, ...] = ENDINGS
-) -> Iterator[Ended]:
-    """Render a scene, run once undisturbed, then end runs at random moments."""
+def undisturbed(folder: Path) -> tuple[list[str], float]:
+    """Render a scene and run twice undisturbed; give the command and the seconds that it takes."""
     load()
-    scene, random_moments = folder / "scene", random.Random(seed)
+    scene = folder / "scene"
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1 --seed 1"
     assert forked(["render", "balls", "-o", str(scene), *small.split()]) == 0
-    inputs = [str(scene / "photos"), "--sparse", str(scene / "truth" / "sparse")]
-    command = ["reconstruct", *inputs]
-    whole, former = folder / "whole", folder / "former"
-    assert forked([*command, "-o", str(former), *FORMER]) == 0
+    command = ["reconstruct", str(scene / "photos"), "--sparse", str(scene / "truth" / "sparse")]
+    assert forked([*command, "-o", str(folder / "former"), *FORMER]) == 0
     forked([*command, "-o", str(folder / "first"), *SETTINGS])  # what is loaded once
     began = time.perf_counter()
-    assert forked([*command, "-o", str(whole), *SETTINGS]) == 0
-    seconds = time.perf_counter() - began
-    for number in range(count):
-        ending, over_former = endings[number % len(endings)], random_moments.random() < 0.5
-        moment = random_moments.random()
-        with place(folder / f"run{number}", ending) as home:
-            out = home / "out"
-            if over_former:
-                copied(former, out)
-            line = [*command, "-o", str(out), *SETTINGS, *(["--overwrite"] * over_former)]
-            code = forked(line, disturbance(ending, moment, seconds, home))
-            faults = ["it hangs"] * (code == HANGS)
-            faults += half_replaced(out, (whole, former) if over_former else (whole,))
-            kept = len(list((out / ".stages").glob("*.safetensors")))
-            relieve(home)
-            again = forked([*command, "-o", str(out), *SETTINGS, "--overwrite"])
-            faults += [] if again == 0 else [f"the next run exits with {again}"]
-            faults += [f"{name} differs" for name in unlike(out, whole)]
-            hidden = sorted(path.name for path in home.iterdir() if path != out)
-            faults += [f"left beside it: {', '.join(hidden)}"] if hidden else []
-        yield Ended(ending, over_former, moment, code, kept, tuple(faults))
+    assert forked([*command, "-o", str(folder / "whole"), *SETTINGS]) == 0
+    return command, time.perf_counter() - began
+
+
+def ended(
+    command: list[str], home: Path, over_former: bool, disturb: Callable[[], "Disturbance"]
+) -> tuple[int, list[str]]:
+    """End a run, and run again: the exit code of the first, and what was wrong after either."""
+    whole, former, out = (*(home.with_name(name) for name in ("whole", "former")), home / "out")
+    if over_former:
+        copied(former, out)
+    line = [*command, "-o", str(out), *SETTINGS]
+    code = forked([*line, *(["--overwrite"] * over_former)], disturb())
+    faults = ["it hangs"] * (code == HANGS)
+    faults += half_replaced(out, (whole, former) if over_former else (whole,))
+    (home / "ballast").unlink(missing_ok=True)
+    again = forked([*line, "--overwrite"])
+    faults += [] if again == 0 else [f"the next run exits with {again}"]
+    faults += [f"{name} differs" for name in unlike(out, whole)]
+    hidden = sorted(path.name for path in home.iterdir() if path != out)
+    return code, faults + ([f"left beside it: {', '.join(hidden)}"] if hidden else [])
 
 
 def load() -> None:
@@ -158,11 +143,6 @@ def disturbance(ending: str, moment: float, seconds: float, home: Path) -> Distu
         (home / "ballast").write_bytes(bytes(max(0, shutil.disk_usage(home).free - room)))
         return (lambda: None), None
     return (lambda: limit_files(int(moment * 1e6))), None
-
-
-def relieve(home: Path) -> None:
-    """Make room again."""
-    (home / "ballast").unlink(missing_ok=True)
 
 
 def limit_memory(more: int) -> None:

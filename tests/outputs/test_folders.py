@@ -227,7 +227,8 @@ def die_before(step):
     count = 0
     def hear(event, given):
         nonlocal count
-        if event in ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "open"):
+        writes = event == "open" and given[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        if event in ("os.rename", "os.remove", "os.rmdir", "os.mkdir") or writes:
             count += 1
             if count == step:
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -48,9 +48,7 @@ FEW = "registered {} of 6 photographs; at least 3 are needed.*05.jpg"
         ),
     ],
 )
-def test_no_component_is_chosen_where_views_are_split_few_or_in_one_place(
-    parts, spread, names, sentence
-):
+def test_views_split_few_or_in_one_place_are_refused(parts, spread, names, sentence):
     with pytest.raises(ReconstructionError, match=sentence):
         choose_component(parts, spread, names, 0.6)
 

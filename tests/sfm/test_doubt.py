@@ -34,9 +34,7 @@ def of_a_room(generator, count=12):
     return noisy(cameras.replace(cam_from_world=poses), points, generator)
 
 
-def test_points_that_follow_a_camera_in_its_place_make_a_consistent_model_that_is_doubtful(
-    generator,
-):
+def test_a_consistent_model_of_a_camera_in_its_place_is_doubtful(generator):
     model = of_a_room(generator)
     assert following_fraction(model) > 0.9
     reason = doubt(model, model.num_views)
@@ -98,9 +96,7 @@ def follows(first, second, generator):
     return follows_camera_in_place(first, second, first.new_tensor([300.0, 300]), 2.0, generator)
 
 
-def test_what_a_camera_in_its_place_sees_is_found_among_matches_of_which_most_follow_none(
-    generator,
-):
+def test_what_a_camera_in_its_place_sees_is_found_among_others(generator):
     first, second = random_pixels(generator), random_pixels(generator)
     panned = torch.tensor([[1.02, -0.03, 90], [0.03, 1.02, -40], [8e-5, -5e-5, 1]]).double()
     second[:100] = 300 + mapped(panned, first[:100] - 300)

@@ -69,9 +69,7 @@ def back(model, quarters):
 
 # A quarter turn, which shapes show, decides for the half turn beside it.
 @pytest.mark.parametrize("quarters", [[1] * 6, [3] * 6, [0, 1, 3, 2, 1, 0]])
-def test_a_model_of_stored_pixels_gives_the_cameras_of_photographs_that_were_not_turned(
-    stored, sparse, quarters
-):
+def test_a_model_of_stored_pixels_gives_the_same_cameras(stored, sparse, quarters):
     plain = existing_model(stored, sparse)
     views = turned(stored, quarters)
     with pytest.warns(PimperWarning, match="before EXIF turns them"):

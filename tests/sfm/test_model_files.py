@@ -64,9 +64,7 @@ def test_files_are_read_as_colmap_reads_them(model, tmp_path, text):
     assert tracks[0] == tracks[1]
 
 
-def test_a_name_with_whatever_unicode_takes_for_spaces_and_line_ends_is_read_from_text(
-    model, tmp_path
-):
+def test_a_name_with_spaces_and_line_ends_of_unicode_is_read_from_text(model, tmp_path):
     names = ("a  b.png", "c\u2028d.png", "e\u00a0f.png", "g\x85h\x1ci.png")
     reconstruction_of(model.replace(names=names), COLORS).write_text(str(tmp_path))
     read = read_model(tmp_path)
@@ -135,9 +133,7 @@ def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
         ("cameras", "<Q", 8, [0]),  # a picture without width
     ],
 )
-def test_an_image_without_a_sound_pose_or_camera_is_refused_by_name(
-    folder, name, layout, at, values
-):
+def test_an_image_without_a_sound_pose_or_camera_is_refused(folder, name, layout, at, values):
     change(folder / f"{name}.bin", layout, 8 + at, *values)
     with pytest.raises(InputError, match=r"is broken: a b\.png has no sound pose or camera"):
         read_model(folder)

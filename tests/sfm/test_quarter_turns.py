@@ -13,9 +13,7 @@ COUNTS = dict(camera_models().values())
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 @pytest.mark.parametrize("model", sorted(COUNTS.keys() - {"EQUIRECTANGULAR"}))
-def test_a_turned_camera_images_every_point_where_the_turned_picture_has_it(
-    model, quarters, generator
-):
+def test_a_turned_camera_images_as_the_picture_is_turned(model, quarters, generator):
     count = COUNTS[model]
     one_focal = model.startswith(("SIMPLE_", "RADIAL"))
     start = (90.0, 41.0, 29.0) if one_focal else (90.0, 97.0, 41.0, 29.0)

@@ -233,9 +233,7 @@ def test_photographs_with_pixels_that_are_no_numbers_are_refused_by_name(views, 
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
-def test_structure_from_motion_runs_once_for_the_same_photographs(
-    views, model, tmp_path, monkeypatch
-):
+def test_the_same_photographs_are_reconstructed_once(views, model, tmp_path, monkeypatch):
     runs = []
 
     def found(views, config):

@@ -111,9 +111,7 @@ EVERY = range(5)
         ([EVERY, EVERY], [{"d.jpg": 0.1}], [all_pairs(5)], [5, 5]),  # every pair
     ],
 )
-def test_pairs_are_guided_and_the_mapper_starts_until_a_model_is_complete(
-    told, space, models, misplaced, guided, seeds
-):
+def test_the_mapper_starts_until_all_are_there(told, space, models, misplaced, guided, seeds):
     answers = told(models, misplaced)
     assert register(space, SETTINGS).complete
     assert answers.matched == [
@@ -175,9 +173,7 @@ def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told,
     assert found.around == ()
 
 
-def test_features_of_a_room_are_left_out_where_the_plain_model_is_doubtful(
-    told, space, monkeypatch
-):
+def test_a_room_is_left_out_where_the_plain_model_is_doubtful(told, space, monkeypatch):
     told([EVERY, EVERY], rest=ROOM)
     doubts = ["follows a camera in its place", ""]
     monkeypatch.setattr(registration, "doubt", lambda model, count: doubts.pop(0))
@@ -187,9 +183,7 @@ def test_features_of_a_room_are_left_out_where_the_plain_model_is_doubtful(
     assert found.explained == 1
 
 
-def test_of_many_photographs_likely_pairs_are_matched_and_those_of_missing_ones_with_all(
-    told, space, monkeypatch
-):
+def test_of_many_photographs_likely_pairs_are_matched_first(told, space, monkeypatch):
     answers = told([[0, 1, 2, 4], EVERY], [{"c 1.png": 0.1}, {}])
     monkeypatch.setattr(registration, "MOST_PAIRED", 4)
     monkeypatch.setattr(registration, "pairs_to_match", lambda space: NEIGHBOURS[1])

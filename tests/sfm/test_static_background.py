@@ -12,9 +12,7 @@ from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 # The violating share is smaller the nearer the camera is to the table's plane: all moves sideways,
 # as before a camera that only shifts.
 @pytest.mark.parametrize(("elevation_deg", "fraction"), [(2.0, 0.2), (25.0, 0.7)])
-def test_a_room_behind_a_turntable_is_at_rest_and_what_turns_is_not(
-    elevation_deg, fraction, generator
-):
+def test_a_room_is_at_rest_and_what_turns_is_not(elevation_deg, fraction, generator):
     scene = turntable(generator, elevation_deg=elevation_deg)
     rest = scene.rest()
     assert rest.room
@@ -55,9 +53,7 @@ def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_s
     assert not any(resting.any() for resting in rest.features)
 
 
-def test_a_flat_object_that_hardly_moves_from_one_photograph_to_the_next_keeps_its_features(
-    generator,
-):
+def test_a_flat_object_that_hardly_moves_keeps_its_features(generator):
     cameras = orbit(12, 18.0)
     points = torch.rand(500, 3, generator=generator, dtype=torch.float64) - 0.5
     points = points * points.new_tensor([4.0, 0.1, 3.0])

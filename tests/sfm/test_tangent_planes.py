@@ -54,9 +54,7 @@ def test_the_reference_is_a_view_that_sees_the_point_and_never_a_candidate(gener
     assert not planes.candidates[each, planes.reference].any()
 
 
-def test_views_behind_the_plane_or_without_the_point_in_their_image_are_no_candidates(
-    generator,
-):
+def test_views_behind_the_plane_or_without_the_point_are_no_candidates(generator):
     cameras = ball.cameras_on_an_arc()
     along, up = torch.rand(2, 40, generator=generator, dtype=torch.float64) - 0.5
     tilt = torch.tensor(torch.pi / 3).double()  # the wall's normal leans to x by that

@@ -81,9 +81,7 @@ def test_cameras_before_a_room_and_a_table_at_rest_are_those_of_the_object(solid
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jitter", [{"pan_jitter_px": 30.0}, {"crop_jitter_px": 30.0}])
-def test_before_a_room_that_shifts_cameras_are_those_of_the_object_and_masks_asked_for(
-    solid, jitter
-):
+def test_before_a_room_that_shifts_cameras_are_those_of_the_object(solid, jitter):
     larger = {"width": 480, "height": 360, "num_views": 36}
     scene = furnished(solid, fixed_table=True, **larger, **jitter)
     views = photographs(scene, list(range(6))).replace(masks=None)
