@@ -40,8 +40,14 @@ def held(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys):
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+@pytest.fixture
+def reconstruct(photos, chain, tmp_path):
+    """Run with a stand-in for the chain, into the folder `out`."""
+    return lambda *given: run("reconstruct", photos, "-o", tmp_path / "out", *given)
+
+
+def test_a_run_writes_the_result_and_says_where(reconstruct, chain, tmp_path, capsys):
+    assert reconstruct() == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
     config, views, sparse = chain.given
     assert config == CoarseToFineConfig() == load_config("default")
@@ -56,14 +62,14 @@ def test_a_run_writes_the_result_and_says_where(photos, chain, tmp_path, capsys)
 
 
 def test_a_run_closes_with_what_guards_left_out(
-    photos, chain, reconstruction, tmp_path, monkeypatch, capsys
+    reconstruct, chain, reconstruction, tmp_path, capsys
 ):
     gone = LeftOut(
         guard="sfm.missing", what="photographs", count=1, total=4, reason="none", names=("3.png",)
     )
     told = reconstruction.replace(left_out=(gone,))
-    monkeypatch.setattr(chain, "__call__", lambda *_: told)
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    chain.__call__ = lambda *_: told
+    assert reconstruct() == 0
     assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
@@ -133,8 +139,10 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--log-level"], "--log-level is nothing"),
     ],
 )
-def test_what_the_user_can_mend_is_one_message(photos, chain, tmp_path, capsys, arguments, told):
-    assert run("reconstruct", photos, "-o", tmp_path / "out", *arguments) == 2
+def test_what_the_user_can_mend_is_one_message(
+    reconstruct, chain, tmp_path, capsys, arguments, told
+):
+    assert reconstruct(*arguments) == 2
     message = capsys.readouterr().err
     assert message.startswith("error: ")
     assert told in message
@@ -143,17 +151,17 @@ def test_what_the_user_can_mend_is_one_message(photos, chain, tmp_path, capsys, 
     assert held(tmp_path) == ["photos"]
 
 
-def test_an_occupied_out_is_refused_before_photographs_are_read(photos, chain, tmp_path, capsys):
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+def test_an_occupied_out_is_refused_before_photographs_are_read(reconstruct, tmp_path, capsys):
+    assert reconstruct() == 0
     assert run("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
     assert "out: already holds albedo.png" in capsys.readouterr().err
-    assert run("reconstruct", photos, "-o", tmp_path / "out", "--overwrite") == 0
+    assert reconstruct("--overwrite") == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
 
 
-def test_a_missing_gpu_is_told_before_the_run(photos, chain, tmp_path, capsys, monkeypatch):
+def test_a_missing_gpu_is_told_before_the_run(reconstruct, chain, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert run("reconstruct", photos, "-o", tmp_path / "out", "--device", "cuda") == 2
+    assert reconstruct("--device", "cuda") == 2
     assert "finds no CUDA device" in capsys.readouterr().err
     assert chain.given is None
 
@@ -179,11 +187,11 @@ def terminate():
     ],
 )
 def test_a_run_that_ends_early_leaves_nothing(
-    photos, chain, tmp_path, capsys, monkeypatch, work, kind, code, told
+    reconstruct, chain, tmp_path, capsys, work, kind, code, told
 ):
     former = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(chain, "work", lambda self: work())
-    assert run("reconstruct", photos, "--json", "-o", tmp_path / "out") == code
+    chain.work = lambda self: work()
+    assert reconstruct("--json") == code
     said = capsys.readouterr()
     assert told in said.err
     last = json.loads(said.out.splitlines()[-1])
@@ -192,10 +200,10 @@ def test_a_run_that_ends_early_leaves_nothing(
     assert signal.getsignal(signal.SIGTERM) is former
 
 
-def test_warnings_are_sentences(photos, chain, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(chain, "work", warn)
+def test_warnings_are_sentences(reconstruct, chain, capsys):
+    chain.work = warn
     usual = warnings.showwarning
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 0
+    assert reconstruct() == 0
     assert "warning: light hardly varies.\n" in capsys.readouterr().err
     assert warnings.showwarning is usual
 
@@ -219,10 +227,10 @@ def test_a_misspelt_command_names_the_nearest(capsys):
     assert "Did you mean `reconstruct`?" in capsys.readouterr().err
 
 
-def test_what_is_unexpected_is_told_and_kept(photos, chain, tmp_path, capsys, monkeypatch):
+def test_what_is_unexpected_is_told_and_kept(reconstruct, chain, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(chain, "work", lambda self: 1 / 0)
-    assert run("reconstruct", photos, "-o", tmp_path / "out", "-q") == 1
+    chain.work = lambda self: 1 / 0
+    assert reconstruct("-q") == 1
     message = capsys.readouterr().err.splitlines()[-1]
     assert message.startswith("error: unexpected ZeroDivisionError: division by zero.")
     (kept,) = tmp_path.glob("pimper-*.txt")
@@ -244,24 +252,22 @@ def test_what_is_unexpected_is_told_and_kept(photos, chain, tmp_path, capsys, mo
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 99 bytes"), "memory ran out"),
     ],
 )
-def test_what_the_machine_refuses_is_no_fault(
-    photos, chain, tmp_path, capsys, monkeypatch, error, told
-):
+def test_what_the_machine_refuses_is_no_fault(reconstruct, chain, tmp_path, capsys, error, told):
     def refuse(_):
         raise error
 
-    monkeypatch.setattr(chain, "work", refuse)
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 2
+    chain.work = refuse
+    assert reconstruct() == 2
     message = capsys.readouterr().err.splitlines()[-1]
     assert told in message
     assert "fault" not in message
     assert held(tmp_path) == ["photos"]
 
 
-def test_a_report_that_cannot_be_written_is_told(photos, chain, tmp_path, capsys, monkeypatch):
+def test_a_report_that_cannot_be_written_is_told(reconstruct, chain, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
-    monkeypatch.setattr(chain, "work", lambda self: 1 / 0)
-    assert run("reconstruct", photos, "-o", tmp_path / "out") == 1
+    chain.work = lambda self: 1 / 0
+    assert reconstruct() == 1
     told = capsys.readouterr().err
     assert "Traceback" in told
     assert "Above is what a report needs" in told
@@ -297,9 +303,9 @@ def test_names_in_utf_8_are_written_whatever_the_locale(photos, tmp_path):
     assert "Traceback" not in ran.stderr
 
 
-def test_a_log_of_debug_tells_tracebacks(photos, chain, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(chain, "work", lambda self: fail())
-    assert run("reconstruct", photos, "-o", tmp_path / "out", "--log-level", "debug") == 2
+def test_a_log_of_debug_tells_tracebacks(reconstruct, chain, capsys):
+    chain.work = lambda self: fail()
+    assert reconstruct("--log-level", "debug") == 2
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -314,11 +320,9 @@ def warn(_):
         (["--log-level", "error"], False),
     ],
 )
-def test_a_quiet_run_tells_warnings_alone(
-    photos, chain, tmp_path, capsys, monkeypatch, given, warned
-):
-    monkeypatch.setattr(chain, "work", warn)
-    assert run("reconstruct", photos, "-o", tmp_path / "out", *given) == 0
+def test_a_quiet_run_tells_warnings_alone(reconstruct, chain, capsys, given, warned):
+    chain.work = warn
+    assert reconstruct(*given) == 0
     told = capsys.readouterr()
     assert told.out == ""
     assert all(line.startswith("warning: ") for line in told.err.splitlines())
@@ -329,9 +333,9 @@ def events(capsys):
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
-def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(chain, "work", warn)
-    assert run("reconstruct", photos, "--json", "-o", tmp_path / "out") == 0
+def test_a_machine_reads_events_one_a_line(reconstruct, chain, tmp_path, capsys):
+    chain.work = warn
+    assert reconstruct("--json") == 0
     told = events(capsys)
     assert told[0]["event"] == "start"
     assert told[0]["command"] == "reconstruct"
@@ -363,17 +367,15 @@ def test_a_machine_reads_events_one_a_line(photos, chain, tmp_path, capsys, monk
     assert (lines[0], lines[-2:]) == ("import", ["between stages", "write"])
 
 
-def test_a_run_that_tells_events_does_not_wait(
-    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
-):
+def test_a_run_that_tells_events_does_not_wait(reconstruct, chain, reconstruction, capsys):
     pytest.importorskip("viser")
 
     def show(self):
         self.watch(reconstruction.scene)
         self.preview(reconstruction.scene, reconstruction.coarse)
 
-    monkeypatch.setattr(chain, "work", show)
-    assert run("reconstruct", photos, "--view", "--json", "-o", tmp_path / "out") == 0
+    chain.work = show
+    assert reconstruct("--view", "--json") == 0
     told = events(capsys)
     (page,) = [one for one in told if one["event"] == "view"]
     assert page["address"].startswith("http://127.0.0.1:")
@@ -381,27 +383,25 @@ def test_a_run_that_tells_events_does_not_wait(
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_a_run_that_is_looked_at_stays_until_ctrl_c(
-    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
-):
+def test_a_run_that_is_looked_at_stays_until_ctrl_c(reconstruct, chain, reconstruction, capsys):
     pytest.importorskip("viser")
-    monkeypatch.setattr(chain, "work", lambda self: self.watch(reconstruction.scene))
-    assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 0
+    chain.work = lambda self: self.watch(reconstruction.scene)
+    assert reconstruct("--view") == 0
     assert capsys.readouterr().out.rstrip().endswith("until Ctrl-C.")
 
 
-def test_without_a_viewer_a_run_is_refused(photos, tmp_path, capsys, monkeypatch):
+def test_without_a_viewer_a_run_is_refused(reconstruct, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pimper_torch.result.viewer.server.find_spec", lambda _: None)
-    assert run("reconstruct", photos, "--view", "-o", tmp_path / "out") == 2
+    assert reconstruct("--view") == 2
     assert "pip install 'pimper_torch[view]'" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
 
 def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
-    photos, chain, reconstruction, tmp_path, capsys, monkeypatch
+    reconstruct, chain, reconstruction, tmp_path, capsys
 ):
     out = tmp_path / "out"
-    assert run("reconstruct", photos, "-o", out) == 0
+    assert reconstruct() == 0
     former = {path: path.stat().st_mtime_ns for path in out.iterdir()}
     capsys.readouterr()
 
@@ -415,13 +415,13 @@ def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
         assert {path: path.stat().st_mtime_ns for path in former} == former
         raise ReconstructionError("no surface.")
 
-    monkeypatch.setattr(chain, "work", show_and_fail)
-    assert run("reconstruct", photos, "--json", "--overwrite", "-o", out) == 2
+    chain.work = show_and_fail
+    assert reconstruct("--json", "--overwrite") == 2
     (told,) = [one for one in events(capsys) if one["event"] == "preview"]
     assert told["path"] == str(out / ".stages" / "preview.png")
     assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == former
-    monkeypatch.setattr(chain, "work", show)
-    assert run("reconstruct", photos, "--overwrite", "-o", out) == 0
+    chain.work = show
+    assert reconstruct("--overwrite") == 0
     assert f"{told['path']} shows the coarse surface" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {path.name for path in former}
 
@@ -443,12 +443,12 @@ def test_an_output_that_cannot_be_written_ends_in_a_message(capsys, monkeypatch)
     assert "Traceback" not in message
 
 
-def test_a_mesh_of_ones_own_reaches_the_chain(photos, chain, tmp_path):
+def test_a_mesh_of_ones_own_reaches_the_chain(reconstruct, photos, chain, tmp_path):
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     write_ply(mesh, tmp_path / "rough.ply")
     out = tmp_path / "out"
-    assert run("reconstruct", photos, "-o", out, "--mesh", tmp_path / "rough.ply") == 0
+    assert reconstruct("--mesh", tmp_path / "rough.ply") == 0
     assert torch.equal(chain.mesh.faces, mesh.faces)
     assert json.loads((out / "summary.json").read_text())["mesh"] == str(tmp_path / "rough.ply")
     assert run("reconstruct", photos, "-o", tmp_path / "b", "--mesh", tmp_path / "none.ply") != 0
