@@ -25,7 +25,7 @@ def test_a_folder_of_folders_has_an_object_each(scans):
     assert names(scans) == ["ball", "cup", "jar"]
     assert [one.photos.name for one in read_objects(str(scans))] == ["ball", "cup", "photos"]
     assert names([scans / "cup", str(scans / "jar"), Object(name="x", photos=scans)]) == [
-        *("cup", "jar", "x"),
+        *("cup", "jar", "x")
     ]
 
 

@@ -313,13 +313,7 @@ def warn(_):
     warnings.warn("light hardly varies.", PimperWarning, stacklevel=1)
 
 
-@pytest.mark.parametrize(
-    ("given", "warned"),
-    [
-        (["-q"], True),
-        (["--log-level", "error"], False),
-    ],
-)
+@pytest.mark.parametrize(("given", "warned"), [(["-q"], True), (["--log-level", "error"], False)])
 def test_a_quiet_run_tells_warnings_alone(reconstruct, chain, capsys, given, warned):
     chain.work = warn
     assert reconstruct(*given) == 0

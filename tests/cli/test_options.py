@@ -46,7 +46,7 @@ RUNS = {
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
         "--max-kept 1.5GB --max-memory 20GB --on-failure skip --view "
-        "--hold-out 0",
+        "--hold-out 0"
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -64,7 +64,7 @@ RUNS = {
     ],
     "export": [
         "{result} --out {out} --format colmap nerfstudio alicevision maps lights --axes lub "
-        "--photos {photos} --overwrite",
+        "--photos {photos} --overwrite"
     ],
     "evaluate": [
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "

@@ -6,11 +6,7 @@ import numpy as np
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 # Of some camera, from XYZ to its colours under D65.
-XYZ_TO_CAMERA = (
-    (0.6722, -0.0635, -0.0963),
-    (-0.4287, 1.2460, 0.2028),
-    (-0.0908, 0.2162, 0.5668),
-)
+XYZ_TO_CAMERA = ((0.6722, -0.0635, -0.0963), (-0.4287, 1.2460, 0.2028), (-0.0908, 0.2162, 0.5668))
 BAYER = np.array([[0, 1], [1, 2]])
 
 

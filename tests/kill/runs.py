@@ -2,8 +2,8 @@
 
     python tests/kill/runs.py --count 50 --seed 0
 
-A run is ended by SIGKILL, by a full disk, or by too little memory, as often into a folder that is
-new as into one that holds a former result. Then: the former result is whole, or the new one; the
+A run is ended by SIGKILL, by files that may grow no further, as on a full disk, or by too little
+memory, as often into a folder that is new as into one that holds a former result. Then: the former result is whole, or the new one; the
 same command, undisturbed, ends with the files of a run that never was disturbed, byte for byte;
 and no hidden folder is left beside it.
 
@@ -11,20 +11,17 @@ Runs are forked from a process that has everything loaded; they take a second or
 """
 
 import argparse
-import contextlib
 import hashlib
 import json
 import os
 import random
 import resource
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -37,7 +34,6 @@ SETTINGS = ("--preset", "fast")
 FORMER = (*SETTINGS, "--faces", "all", "--factorize.light-prior", "3")
 # Seconds after which a run hangs, and what stands for its exit code.
 LONGEST, HANGS = 300.0, 71
-DISK_MB = 24  # the kept stages of a run take 3 MB, a former result and a new one 1 MB each
 
 
 def main() -> int:
@@ -54,9 +50,10 @@ def main() -> int:
         for number in range(given.count):
             ending = given.endings[number % len(given.endings)]
             over_former, moment = random_moments.random() < 0.5, random_moments.random()
-            with place(folder / f"run{number}", ending) as home:
-                disturb = partial(disturbance, ending, moment, seconds, home)
-                code, faults = ended(command, home, over_former, disturb)
+            home = folder / f"run{number}"
+            home.mkdir()
+            disturbed = disturbance(ending, moment, seconds)
+            code, faults = ended(command, home, over_former, disturbed)
             where = "over a former result" if over_former else "into a new folder"
             said = f"{number:3} {ending:7} at {moment:5.2f} {where:20} exit {code:4}"
             print(f"{said}: {'; '.join(faults) or 'the same bits'}", flush=True)
@@ -80,17 +77,16 @@ def undisturbed(folder: Path) -> tuple[list[str], float]:
 
 
 def ended(
-    command: list[str], home: Path, over_former: bool, disturb: Callable[[], "Disturbance"]
+    command: list[str], home: Path, over_former: bool, disturbed: "Disturbance"
 ) -> tuple[int, list[str]]:
     """End a run, and run again: the exit code of the first, and what was wrong after either."""
     whole, former, out = (*(home.with_name(name) for name in ("whole", "former")), home / "out")
     if over_former:
         copied(former, out)
     line = [*command, "-o", str(out), *SETTINGS]
-    code = forked([*line, *(["--overwrite"] * over_former)], disturb())
+    code = forked([*line, *(["--overwrite"] * over_former)], disturbed)
     faults = ["it hangs"] * (code == HANGS)
     faults += half_replaced(out, (whole, former) if over_former else (whole,))
-    (home / "ballast").unlink(missing_ok=True)
     again = forked([*line, "--overwrite"])
     faults += [] if again == 0 else [f"the next run exits with {again}"]
     faults += [f"{name} differs" for name in unlike(out, whole)]
@@ -108,40 +104,15 @@ def load() -> None:
     compile_all()
 
 
-@contextlib.contextmanager
-def place(home: Path, ending: str) -> Iterator[Path]:
-    """Give a folder for a run, on a small disk of its own where one is to be full."""
-    home.mkdir()
-    mounted = ending == "disk" and mount(home)
-    try:
-        yield home
-    finally:
-        if mounted:
-            subprocess.run(["umount", "-l", str(home)], check=True)
-
-
-def mount(home: Path) -> bool:
-    """Mount a disk in memory; False where that is not allowed."""
-    size = f"size={DISK_MB}m"
-    ran = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(home)], capture_output=True
-    )
-    return ran.returncode == 0
-
-
 Disturbance = tuple[Callable[[], None], float | None]
 
 
-def disturbance(ending: str, moment: float, seconds: float, home: Path) -> Disturbance:
+def disturbance(ending: str, moment: float, seconds: float) -> Disturbance:
     """Give what a run does before it begins, and the seconds after which it is killed."""
     if ending == "killed":
         return (lambda: None), moment * seconds
     if ending == "memory":  # of what the stages take on top of what is loaded
         return (lambda: limit_memory(int(moment * 400e6))), None
-    if home.is_mount():
-        room = int(moment * 2.5 * 2**20)  # what is kept and a result take about as much
-        (home / "ballast").write_bytes(bytes(max(0, shutil.disk_usage(home).free - room)))
-        return (lambda: None), None
     return (lambda: limit_files(int(moment * 1e6))), None
 
 

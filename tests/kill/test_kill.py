@@ -11,7 +11,7 @@ RUNS = Path(__file__).with_name("runs.py")
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="needs fork, mount and /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
 def test_nothing_is_lost_whatever_ends_a_run():
     line = [sys.executable, str(RUNS), "--count", "6", "--seed", "45"]
     ran = subprocess.run(line, capture_output=True, text=True)

@@ -15,12 +15,7 @@ from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, structu
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.sfm.sparse_scene import write_model
 from pimper_torch.records import Views
-from pimper_torch.runtime.errors import (
-    ConfigError,
-    InputError,
-    PimperWarning,
-    ReconstructionError,
-)
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning, ReconstructionError
 from pimper_torch.runtime.progress import listening
 from pimper_torch.runtime.store import Store, digest
 

@@ -18,10 +18,7 @@ from pimper_torch.runtime.errors import PimperWarning
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 
 RIGID = StaticBackground(features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
-ROOM = RIGID.replace(
-    features=5 * (torch.tensor([True, False]),),
-    violating_fraction=0.5,
-)
+ROOM = RIGID.replace(features=5 * (torch.tensor([True, False]),), violating_fraction=0.5)
 
 NOTHING = torch.zeros(3, 2).double()
 MOVED = (VerifiedPair(views=(0, 1), first=NOTHING, second=NOTHING),)

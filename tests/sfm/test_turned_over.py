@@ -1,5 +1,3 @@
-import warnings
-
 import pytest
 import torch
 
@@ -26,18 +24,3 @@ def test_series_between_which_an_object_was_turned_over_are_registered_on_it_wit
     up = torch.tensor([0.0, 1.0, 0.0])
     down = -found.cameras.cam_from_world[:, 1, :3]
     assert ((down @ up > 0) == torch.tensor([True] * 12 + [False] * 12)).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("affine_shape", [False, True])
-def test_a_still_object_on_a_patterned_table_was_not_moved(affine_shape):
-    settings = {"num_views": 12, "width": 480, "height": 360}
-    scene = build_scene("potatoes", SceneConfig(**settings, table="patterned"))
-    views = photographs(scene, list(range(12))).replace(masks=None)
-    config = ReconstructConfig(affine_shape=affine_shape, track_iterations=0, threads=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", PimperWarning)
-        found = Reconstruct(config)(views)
-    assert found.views.names == scene.names
-    assert len(found.series) == 0
-    assert center_errors(found, scene).median() < 0.003

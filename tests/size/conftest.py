@@ -31,11 +31,7 @@ def ball(reconstruction):
         focals_px=torch.full((5,), torch.nan),
     )
     scene = reconstruction.scene.replace(
-        views=views,
-        cameras=cameras,
-        lenses=(lens,) * 5,
-        unregistered=("IMG_9.jpg",),
-        **no_points(),
+        views=views, cameras=cameras, lenses=(lens,) * 5, unregistered=("IMG_9.jpg",), **no_points()
     )
     return reconstruction.replace(
         mesh=Mesh(vertices_world=vertices.float(), faces=faces),

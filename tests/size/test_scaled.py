@@ -13,58 +13,41 @@ import pimper_torch as pt
 from pimper_torch.doors.size.scaled import LAST, POSES, POWERS, scaled
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.records import (
-    AlbedoPrior,
-    Cameras,
     CoarseMesh,
-    Convergence,
     Depths,
     FacetPoints,
     Heights,
-    InlierPrior,
-    Judged,
-    LightPrior,
-    Materials,
-    Mesh,
-    NormalPrior,
-    PatchPriors,
-    Photometry,
     Reconstruction,
     Record,
-    SilhouettePrior,
     Silhouettes,
-    SparseScene,
     Surface,
-    Templates,
-    Textured,
-    ViewLights,
-    Views,
 )
 from pimper_torch.runtime.errors import ConfigError
 
 # What has no unit of length, or another one: pixels, angles, radiance, fractions.
 WITHOUT = {
-    Views: {"images", "focals_px"},
-    Cameras: {"intrinsics"},
-    SparseScene: {"reprojection_errors_px", "observation_pixels", "background_from_view"},
-    Silhouettes: {"inside"},
-    Mesh: {"normals_world", "albedo", "confidence"},
-    Templates: {"barycentric", "normals_patch"},
-    Photometry: {"normals_patch", "albedo", "lights_patch", "information", "exposure"},
-    PatchPriors: {
+    "Views": {"images", "focals_px"},
+    "Cameras": {"intrinsics"},
+    "SparseScene": {"reprojection_errors_px", "observation_pixels", "background_from_view"},
+    "Silhouettes": {"inside"},
+    "Mesh": {"normals_world", "albedo", "confidence"},
+    "Templates": {"barycentric", "normals_patch"},
+    "Photometry": {"normals_patch", "albedo", "lights_patch", "information", "exposure"},
+    "PatchPriors": {
         *("normals_patch", "normal_information", "albedo", "albedo_variance"),
         *("inlier", "lights_patch", "light_variance"),
     },
-    NormalPrior: {"normals", "variance"},
-    AlbedoPrior: {"albedo", "variance"},
-    InlierPrior: {"probability"},
-    SilhouettePrior: {"inside"},
-    LightPrior: {"lights", "variance"},
-    Surface: {"barycentric", "normals_world", "albedo", "information"},
-    Convergence: {"residual"},
-    ViewLights: {"direction_world", "closeness", "ambient", "directed"},  # closeness is a ratio
-    Materials: {"metallic", "roughness", "specular"},
-    Judged: {"psnr_db"},
-    Textured: {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
+    "NormalPrior": {"normals", "variance"},
+    "AlbedoPrior": {"albedo", "variance"},
+    "InlierPrior": {"probability"},
+    "SilhouettePrior": {"inside"},
+    "LightPrior": {"lights", "variance"},
+    "Surface": {"barycentric", "normals_world", "albedo", "information"},
+    "Convergence": {"residual"},
+    "ViewLights": {"direction_world", "closeness", "ambient", "directed"},  # closeness is a ratio
+    "Materials": {"metallic", "roughness", "specular"},
+    "Judged": {"psnr_db"},
+    "Textured": {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
 }
 
 
@@ -89,7 +72,12 @@ def test_every_number_of_a_result_is_a_length_or_is_known_to_be_none():
     kinds = records_in(Reconstruction, {Surface})
     assert {Heights, Depths, CoarseMesh, FacetPoints} <= kinds
     for kind in kinds:
-        known = {*POWERS.get(kind, {}), POSES.get(kind), LAST.get(kind), *WITHOUT.get(kind, ())}
+        known = {
+            *POWERS.get(kind, {}),
+            POSES.get(kind),
+            LAST.get(kind),
+            *WITHOUT.get(kind.__name__, ()),
+        }
         hints = typing.get_type_hints(kind)
         for field in dataclasses.fields(kind):
             for part in parts_of(hints[field.name]):

@@ -33,11 +33,7 @@ def found(store):
         leave_out("silhouettes.empty", torch.tensor([True, False]), names=("a", "b"))
         return cameras()
 
-    with (
-        pytest.warns(PimperWarning, match="doubtful"),
-        collecting() as events,
-        recorded(Silent()),
-    ):
+    with pytest.warns(PimperWarning, match="doubtful"), collecting() as events, recorded(Silent()):
         record, _ = kept(store, "key", Cameras, lambda: called("stage", make))
     told = [event for event in events if not isinstance(event, StageReport)]
     reports = [event.replace(kept=False) for event in events if event not in told]

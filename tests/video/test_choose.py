@@ -1,8 +1,6 @@
-import pytest
 import torch
 
 from pimper_torch.cli.video.choose import Scan, chosen
-from pimper_torch.runtime.errors import InputError
 
 
 def scan(way, sharpness=None):
@@ -43,8 +41,3 @@ def test_frames_that_show_the_same_are_not_chosen_to_make_up_the_number():
     noise = 0.001 * torch.rand(120, generator=torch.Generator().manual_seed(1))
     numbers = chosen(scan((way + noise).cummax(dim=0).values), 12)
     assert (numbers // 30).tolist() == [0, 1, 2, 3]
-
-
-def test_a_video_in_which_nothing_moves_is_refused():
-    with pytest.raises(InputError, match="nothing moves in the 50 frames"):
-        chosen(scan(torch.linspace(0, 0.05, 50)), 10)
