@@ -3,26 +3,10 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import camera_writers as rigs
 import numpy as np
 import pytest
 import torch
-from camera_writers import (
-    HEIGHT,
-    NAMES,
-    WIDTH,
-    of_colmap,
-    of_idr,
-    of_matrices,
-    of_meshroom,
-    of_metashape,
-    of_named_poses,
-    of_projections,
-    of_sfm_json,
-    of_transforms,
-    rig_of,
-    saved,
-    views_of,
-)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -36,20 +20,20 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 @pytest.fixture
 def rig() -> Cameras:
-    return rig_of(7)
+    return rigs.rig_of(7)
 
 
 WAYS = [
-    of_colmap,
-    lambda rig, folder: of_colmap(rig, folder, text=True),
-    of_transforms,
-    of_metashape,
-    of_meshroom,
-    of_sfm_json,
-    of_idr,
-    of_matrices,
-    of_named_poses,
-    of_projections,
+    rigs.of_colmap,
+    lambda rig, folder: rigs.of_colmap(rig, folder, text=True),
+    rigs.of_transforms,
+    rigs.of_metashape,
+    rigs.of_meshroom,
+    rigs.of_sfm_json,
+    rigs.of_idr,
+    rigs.of_matrices,
+    rigs.of_named_poses,
+    rigs.of_projections,
 ]
 
 
@@ -57,67 +41,78 @@ WAYS = [
 @given(seed=st.integers(0, 2**31))
 @pytest.mark.parametrize("write", WAYS)
 def test_every_file_gives_the_cameras_that_were_written(write, seed):
-    rig = rig_of(seed)
+    rig = rigs.rig_of(seed)
     with TemporaryDirectory() as folder:
-        found = existing_model(views_of(), write(rig, Path(folder)))
-    assert found.names == NAMES
-    order = torch.tensor(np.argsort(NAMES) if write in (of_matrices, of_projections) else range(3))
+        found = existing_model(rigs.views_of(), write(rig, Path(folder)))
+    assert found.names == rigs.NAMES
+    order = torch.tensor(
+        np.argsort(rigs.NAMES) if write in (rigs.of_matrices, rigs.of_projections) else range(3)
+    )
     # Arrays without names go by the order of the names: those of the rig were written in another.
     expected = rig.take(torch.argsort(order))
     assert_close(found.cam_from_world, expected.cam_from_world, rtol=0, atol=1e-6)
     assert_close(pinholes_for(found.lenses), expected.intrinsics, rtol=0, atol=1e-6)
-    assert [(lens.width, lens.height) for lens in found.lenses] == [(WIDTH, HEIGHT)] * 3
+    assert [(lens.width, lens.height) for lens in found.lenses] == [(rigs.WIDTH, rigs.HEIGHT)] * 3
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_of_several_models_in_a_folder_the_largest_is_read(rig, text, tmp_path):
-    for number, names in (("0", ("2.png",)), ("1", NAMES), ("10", ("x.png", "10.png"))):
+    for number, names in (("0", ("2.png",)), ("1", rigs.NAMES), ("10", ("x.png", "10.png"))):
         cameras = rig.take(torch.arange(len(names)))
-        of_colmap(cameras, tmp_path, text=text, names=names).rename(tmp_path / number)
+        rigs.of_colmap(cameras, tmp_path, text=text, names=names).rename(tmp_path / number)
     told = r"3 COLMAP models, .* read is 1, the largest, not 0, 10\. Point to"
     with pytest.warns(PimperWarning, match=told):
-        found = existing_model(views_of(), tmp_path)
-    assert found.names == NAMES
+        found = existing_model(rigs.views_of(), tmp_path)
+    assert found.names == rigs.NAMES
     assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
     # One alone is read without a word: in its folder, beside others in it, and around it.
     (tmp_path / "0").rename(tmp_path / "1" / "old")
-    assert existing_model(views_of(), tmp_path / "1").names == NAMES
+    assert existing_model(rigs.views_of(), tmp_path / "1").names == rigs.NAMES
     (tmp_path / "10").rename(tmp_path / "1" / "older")
-    assert existing_model(views_of(), tmp_path).names == NAMES
+    assert existing_model(rigs.views_of(), tmp_path).names == rigs.NAMES
 
 
-@pytest.mark.parametrize("write", [of_colmap, of_metashape, of_meshroom, of_transforms])
+@pytest.mark.parametrize(
+    "write", [rigs.of_colmap, rigs.of_metashape, rigs.of_meshroom, rigs.of_transforms]
+)
 def test_cameras_follow_photographs_that_were_resized(rig, write, tmp_path):
-    found = existing_model(views_of(0.5), write(rig, tmp_path))
+    found = existing_model(rigs.views_of(0.5), write(rig, tmp_path))
     K = pinholes_for(found.lenses)
     assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    "write", [of_matrices, of_idr, lambda rig, folder: of_transforms(rig, folder, sizes=False)]
+    "write",
+    [
+        rigs.of_matrices,
+        rigs.of_idr,
+        lambda rig, folder: rigs.of_transforms(rig, folder, sizes=False),
+    ],
 )
 def test_a_file_without_sizes_is_for_the_photographs_as_their_files_are(rig, write, tmp_path):
     photographs = tmp_path / "photos"
     photographs.mkdir()
-    for name in NAMES:
-        Image.new("L", (WIDTH, HEIGHT)).save(photographs / name)
-    found = existing_model(views_of(0.5, photographs), write(rig, tmp_path))
+    for name in rigs.NAMES:
+        Image.new("L", (rigs.WIDTH, rigs.HEIGHT)).save(photographs / name)
+    found = existing_model(rigs.views_of(0.5, photographs), write(rig, tmp_path))
     K = pinholes_for(found.lenses)
     assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
 
 
 def test_a_file_without_sizes_is_not_for_the_preview_in_raw(rig, tmp_path):
-    for name in NAMES:  # Pillow reads of a NEF its first picture, of 160 x 120
-        Image.new("L", (WIDTH // 4, HEIGHT // 4)).save(tmp_path / name)
-    found = existing_model(views_of(1.0, tmp_path), of_matrices(rig, tmp_path))
+    for name in rigs.NAMES:  # Pillow reads of a NEF its first picture, of 160 x 120
+        Image.new("L", (rigs.WIDTH // 4, rigs.HEIGHT // 4)).save(tmp_path / name)
+    found = existing_model(rigs.views_of(1.0, tmp_path), rigs.of_matrices(rig, tmp_path))
     assert_close(pinholes_for(found.lenses), rig.intrinsics, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".CR2", ".dng", ".heic"])
 def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suffix, tmp_path):
-    jpegs = tuple(name.replace(".png", ".JPG") for name in NAMES)
-    views = views_of().replace(names=tuple(name.replace(".png", suffix) for name in NAMES))
-    found = existing_model(views, of_colmap(rig, tmp_path, names=jpegs))
+    jpegs = tuple(name.replace(".png", ".JPG") for name in rigs.NAMES)
+    views = rigs.views_of().replace(
+        names=tuple(name.replace(".png", suffix) for name in rigs.NAMES)
+    )
+    found = existing_model(views, rigs.of_colmap(rig, tmp_path, names=jpegs))
     assert found.names == views.names
     assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
 
@@ -125,11 +120,11 @@ def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suff
 def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
     K = rig.intrinsics.clone()
     K[:, 0, 1] = 1e-3
-    existing_model(views_of(), of_matrices(rig.replace(intrinsics=K), tmp_path))
+    existing_model(rigs.views_of(), rigs.of_matrices(rig.replace(intrinsics=K), tmp_path))
     K[1, 0, 1] = 3.0
-    skewed = of_projections(rig.replace(intrinsics=K), tmp_path)
+    skewed = rigs.of_projections(rig.replace(intrinsics=K), tmp_path)
     with pytest.raises(InputError, match=r"cameras\.npz: found a skew in 2\.png"):
-        existing_model(views_of(), skewed)
+        existing_model(rigs.views_of(), skewed)
 
 
 @pytest.mark.parametrize(
@@ -149,18 +144,18 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
 )
 def test_arrays_that_are_no_cameras_are_refused(arrays, told, tmp_path):
     with pytest.raises(InputError, match=told):
-        existing_model(views_of(), saved(tmp_path, **arrays))
+        existing_model(rigs.views_of(), rigs.saved(tmp_path, **arrays))
 
 
 @pytest.mark.parametrize("name", ["cameras.txt", "cameras.json", "cameras.xml", "cameras.npz"])
 def test_another_file_is_refused(name, tmp_path):
     (tmp_path / name).write_text("nothing of the kind")
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        existing_model(views_of(), tmp_path / name)
+        existing_model(rigs.views_of(), tmp_path / name)
 
 
 def test_two_cameras_of_one_photograph_are_refused(rig, tmp_path):
     pose = rig.cam_from_world
-    path = saved(tmp_path, K=rig.intrinsics[0], cam_from_world=pose, names=["2.png"] * 3)
+    path = rigs.saved(tmp_path, K=rig.intrinsics[0], cam_from_world=pose, names=["2.png"] * 3)
     with pytest.raises(InputError, match=r"2\.png may be any of 2\.png, 2\.png"):
-        existing_model(views_of(), path)
+        existing_model(rigs.views_of(), path)

@@ -7,23 +7,12 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import camera_writers as rigs
 import numpy as np
 import scipy.io
 import tifffile
 import torch
 import trimesh
-from camera_writers import (
-    HEIGHT,
-    NAMES,
-    WIDTH,
-    of_idr,
-    of_matrices,
-    of_meshroom,
-    of_metashape,
-    of_projections,
-    of_transforms,
-    rig_of,
-)
 from PIL import Image, ImageCms, PngImagePlugin
 from sparse_models import observed, views_of
 
@@ -269,13 +258,22 @@ def _camera_files(root: Path) -> list[Seed]:
     def seed(write: Callable[[Cameras, Path], Path]) -> Seed:
         folder = root / write.__name__
         folder.mkdir(parents=True)
-        name = write(rig_of(7), folder).name
+        name = write(rigs.rig_of(7), folder).name
         return Seed(f"cameras {write.__name__}", folder, (name,), lambda copy: read(copy / name))
 
     def read(path: Path) -> object:
-        return read_cameras(path, NAMES, lambda names: [(WIDTH, HEIGHT)] * len(names))
+        return read_cameras(
+            path, rigs.NAMES, lambda names: [(rigs.WIDTH, rigs.HEIGHT)] * len(names)
+        )
 
-    ways = of_matrices, of_projections, of_idr, of_transforms, of_meshroom, of_metashape
+    ways = (
+        rigs.of_matrices,
+        rigs.of_projections,
+        rigs.of_idr,
+        rigs.of_transforms,
+        rigs.of_meshroom,
+        rigs.of_metashape,
+    )
     return [seed(write) for write in ways]
 
 

@@ -47,13 +47,26 @@ def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
         assert_close(read.expected_error, mesh.expected_error, rtol=0, atol=1e-7)
 
 
+def parts_of(path):
+    """Read a GLB's tree and its data."""
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def write_parts(path, tree, data):
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = ((b"JSON", text), (b"BIN\0", data))
+    body = b"".join(struct.pack("<I4s", len(one), kind) + one for kind, one in chunks)
+    path.write_bytes(struct.pack("<4s2I", b"glTF", 2, 12 + len(body)) + body)
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_colours_of_any_kind_that_gltf_has_are_read_as_they_are(kind, mesh, tmp_path):
     path = tmp_path / "a.glb"
     write_glb(mesh, path)
-    data = path.read_bytes()
-    (size,) = struct.unpack_from("<I", data, 12)
-    tree = json.loads(data[20 : 20 + size])
+    tree, data = parts_of(path)
     accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
     top = np.iinfo(kind).max
     colors = np.random.default_rng(5).integers(0, top, (5, 4), endpoint=True).astype(kind)
@@ -64,14 +77,7 @@ def test_colours_of_any_kind_that_gltf_has_are_read_as_they_are(kind, mesh, tmp_
     view = {"buffer": 0, "byteOffset": buffer["byteLength"], "byteLength": colors.nbytes}
     tree["bufferViews"].append(view)
     buffer["byteLength"] += colors.nbytes
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    body = data[28 + size :] + colors.tobytes()
-    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(body))
-    chunks = (
-        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0")
-    )
-    path.write_bytes(head + chunks + body)
+    write_parts(path, tree, data + colors.tobytes())
     wanted = torch.from_numpy(colors[:, :3].astype(np.float64) / top)
     assert_close(read_mesh(path).albedo, wanted, rtol=0, atol=1e-12)
 
@@ -166,13 +172,9 @@ def test_what_is_no_mesh_is_refused_and_takes_no_memory(name, content, why, tmp_
 )
 def test_a_scene_that_is_none_is_refused(mesh, change, why, tmp_path):
     write_glb(mesh, tmp_path / "a.glb")
-    data = (tmp_path / "a.glb").read_bytes()
-    (size,) = struct.unpack_from("<I", data, 12)
-    tree = json.loads(data[20 : 20 + size])
+    tree, data = parts_of(tmp_path / "a.glb")
     change(tree)
-    text = json.dumps(tree).encode()
-    head = struct.pack("<4s3I4s", b"glTF", 2, len(data) - size + len(text), len(text), b"JSON")
-    (tmp_path / "a.glb").write_bytes(head + text + data[20 + size :])
+    write_parts(tmp_path / "a.glb", tree, data)
     with pytest.raises(InputError, match=why):
         read_mesh(tmp_path / "a.glb")
 
@@ -260,9 +262,7 @@ def test_positions_are_doubles_only_where_singles_would_move_them(tmp_path, mesh
 def test_a_glb_has_its_offset_in_its_node_and_nothing_there_without_one(tmp_path):
     for offset, placed in ((UTM, [{"mesh": 0, "translation": list(UTM)}]), ((0.0,) * 3, None)):
         write_glb(fine_mesh(), tmp_path / "a.glb", offset)
-        data = (tmp_path / "a.glb").read_bytes()
-        (size,) = struct.unpack_from("<I", data, 12)
-        tree = json.loads(data[20 : 20 + size])
+        tree, _ = parts_of(tmp_path / "a.glb")
         nodes = [{key: node[key] for key in node if key != "name"} for node in tree["nodes"]]
         assert [node for node in nodes if "translation" in node] == (placed or [])
         positions = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]

@@ -3,9 +3,9 @@
     python tests/kill/runs.py --count 50 --seed 0
 
 A run is ended by SIGKILL, by files that may grow no further, as on a full disk, or by too little
-memory, as often into a folder that is new as into one that holds a former result. Then: the former result is whole, or the new one; the
-same command, undisturbed, ends with the files of a run that never was disturbed, byte for byte;
-and no hidden folder is left beside it.
+memory, as often into a folder that is new as into one that holds a former result. Then: the former
+result is whole, or the new one; the same command, undisturbed, ends with the files of a run that
+never was disturbed, byte for byte; and no hidden folder is left beside it.
 
 Runs are forked from a process that has everything loaded; they take a second or two.
 """

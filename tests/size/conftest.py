@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import without_points
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -30,22 +31,11 @@ def ball(reconstruction):
         names=tuple(f"IMG_{number}.jpg" for number in range(5)),
         focals_px=torch.full((5,), torch.nan),
     )
-    scene = reconstruction.scene.replace(
-        views=views, cameras=cameras, lenses=(lens,) * 5, unregistered=("IMG_9.jpg",), **no_points()
+    scene = without_points(reconstruction.scene).replace(
+        views=views, cameras=cameras, lenses=(lens,) * 5, unregistered=("IMG_9.jpg",)
     )
     return reconstruction.replace(
         mesh=Mesh(vertices_world=vertices.float(), faces=faces),
         scene=scene,
         silhouettes=Silhouettes.everything(views),
     )
-
-
-def no_points():
-    none = torch.zeros(0, dtype=torch.long)
-    return {
-        "points_world": torch.zeros(0, 3),
-        "reprojection_errors_px": torch.zeros(0),
-        "observation_point": none,
-        "observation_view": none,
-        "observation_pixels": torch.zeros(0, 2),
-    }
