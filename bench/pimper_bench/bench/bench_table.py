@@ -5,9 +5,8 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -18,6 +17,30 @@ from pimper_bench.bench.measure import Machine
 from pimper_bench.metrics.figure_rows import plain
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import MissingProgramError
+
+_COST = "cost"
+_RAYS = "along the rays of the reference view"
+_COMMON = "where all methods cover the object"
+_SURFACE = "distances of surfaces"
+
+
+class Column(NamedTuple):
+    """A figure of the table.
+
+    Attributes:
+        part: Of the table, which the terminal shows by itself.
+    """
+
+    part: str
+    heading: str
+    decimals: int
+    value: Callable[["BenchRow"], float | None]
+
+
+def _shown(part: str, heading: str, decimals: int, unit: float = 1.0) -> Any:  # noqa: ANN401
+    """Return the field of a figure, unknown by default, that the table shows in a unit."""
+    about = {"part": part, "heading": heading, "decimals": decimals, "unit": unit}
+    return dataclasses.field(default=None, metadata=about)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,31 +60,31 @@ class BenchRow(Record):
 
     scene: str
     method: str
-    mesh_points: int | None = None
-    triangles: int | None = None
-    samples: int | None = None
-    missing_percent: float | None = None
-    minutes: float | None = None
-    sfm_minutes: float | None = None
-    relative_error: float | None = None
-    coverage_percent: float | None = None
-    mean_normal_deg: float | None = None
-    median_normal_deg: float | None = None
-    mean_shape_normal_deg: float | None = None
-    median_shape_normal_deg: float | None = None
-    common_percent: float | None = None
-    common_relative_error: float | None = None
-    common_mean_normal_deg: float | None = None
-    common_median_normal_deg: float | None = None
-    common_mean_shape_normal_deg: float | None = None
-    common_median_shape_normal_deg: float | None = None
-    pitted_percent: float | None = None
-    chamfer: float | None = None
-    accuracy: float | None = None
+    mesh_points: int | None = _shown(_COST, "points", 0)
+    triangles: int | None = _shown(_COST, "triangles", 0)
+    samples: int | None = _shown(_COST, "samples, M", 2, unit=1e6)
+    missing_percent: float | None = _shown(_COST, "missing, %", 1)
+    minutes: float | None = _shown(_COST, "minutes", 1)
+    sfm_minutes: float | None = _shown(_COST, "SfM, min", 1)
+    peak_memory_mb: float | None = _shown(_COST, "memory, MB", 0)
+    relative_error: float | None = _shown(_RAYS, "3D error, %", 2)
+    coverage_percent: float | None = _shown(_RAYS, "covered, %", 1)
+    mean_normal_deg: float | None = _shown(_RAYS, "normals, °", 2)
+    median_normal_deg: float | None = _shown(_RAYS, "median, °", 2)
+    mean_shape_normal_deg: float | None = _shown(_RAYS, "shape, °", 2)
+    median_shape_normal_deg: float | None = _shown(_RAYS, "shape median, °", 2)
+    pitted_percent: float | None = _shown(_RAYS, "pitted, %", 2)
+    common_percent: float | None = _shown(_COMMON, "covered by all, %", 1)
+    common_relative_error: float | None = _shown(_COMMON, "3D error there, %", 2)
+    common_mean_normal_deg: float | None = _shown(_COMMON, "normals there, °", 2)
+    common_median_normal_deg: float | None = _shown(_COMMON, "median there, °", 2)
+    common_mean_shape_normal_deg: float | None = _shown(_COMMON, "shape there, °", 2)
+    common_median_shape_normal_deg: float | None = _shown(_COMMON, "shape median there, °", 2)
+    chamfer: float | None = _shown(_SURFACE, "Chamfer, %", 3)
+    accuracy: float | None = _shown(_SURFACE, "accuracy, %", 3)
     completeness: float | None = None
-    completeness_seen: float | None = None
+    completeness_seen: float | None = _shown(_SURFACE, "complete, %", 3)
     f_scores: tuple[tuple[float, float], ...] = ()
-    peak_memory_mb: float | None = None
     note: str = ""
     published: bool = False
 
@@ -91,34 +114,26 @@ class Table(Record):
 
 
 _PRINTED = (
-    # scene, mesh points, triangles, samples, missing %, minutes, 3D error %
-    ("mug", 115, 198, 6_690_000, 24.7, 24.4, 7.1),
-    ("jar", 130, 206, 22_600_000, 57.8, 33.1, 9.34),
-    ("balls", 250, 362, 42_400_000, 69.5, 62.6, 9.69),
-    ("potatoes", 150, 276, 36_700_000, 62.7, 50.8, 11.15),
+    # scene, method, mesh points, triangles, samples, missing %, minutes, 3D error %
+    ("mug", "PiMPeR", 115, 198, 6_690_000, 24.7, 24.4, 7.1),
+    ("jar", "PiMPeR", 130, 206, 22_600_000, 57.8, 33.1, 9.34),
+    ("balls", "PiMPeR", 250, 362, 42_400_000, 69.5, 62.6, 9.69),
+    ("potatoes", "PiMPeR", 150, 276, 36_700_000, 62.7, 50.8, 11.15),
+    ("potatoes", "global-stereo", None, None, None, None, 22 * 60.0, 17.34),
 )
-PUBLISHED = (
-    *(
-        BenchRow(
-            scene=scene,
-            method="PiMPeR",
-            mesh_points=points,
-            triangles=triangles,
-            samples=samples,
-            missing_percent=missing,
-            minutes=minutes,
-            relative_error=error,
-            published=True,
-        )
-        for scene, points, triangles, samples, missing, minutes, error in _PRINTED
-    ),
+PUBLISHED = tuple(
     BenchRow(
-        scene="potatoes",
-        method="global-stereo",
-        minutes=22 * 60.0,
-        relative_error=17.34,
+        scene=scene,
+        method=method,
+        mesh_points=points,
+        triangles=triangles,
+        samples=samples,
+        missing_percent=missing,
+        minutes=minutes,
+        relative_error=error,
         published=True,
-    ),
+    )
+    for scene, method, points, triangles, samples, missing, minutes, error in _PRINTED
 )
 """The figures printed for PiMPeR: 30 frames of 1600x1200 each, of real mugs, jars, balls and
 potatoes, in Matlab, 2014. The error is not defined there."""
@@ -132,15 +147,7 @@ def with_published(rows: Sequence[BenchRow]) -> tuple[BenchRow, ...]:
 
 def write_json(table: Table, path: Path) -> None:
     """Write a table with all its digits; figures that are not finite become ``null``."""
-    report = {
-        "format": "pimper-bench",
-        "version": 1,
-        "date": table.date,
-        "scale": table.scale,
-        "machine": table.machine,
-        "settings": table.settings,
-        "rows": table.rows,
-    }
+    report = {"format": "pimper-bench", "version": 1, **dataclasses.asdict(table)}
     text = json.dumps(plain(report), indent=1, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
@@ -149,76 +156,27 @@ MISSING = "\N{EN DASH}"
 _PUBLISHED_MARK = "†"
 
 
-class Column(NamedTuple):
-    """A figure of the table."""
+def columns(rows: Sequence[BenchRow]) -> dict[str, list[Column]]:
+    """Return the columns that some row has a figure for, by the part of the table they are in."""
 
-    heading: str
-    value: Callable[[BenchRow], int | float | None]
-    decimals: int
+    def column(name: str, part: str, heading: str, decimals: int, unit: float) -> Column:
+        def value(row: BenchRow) -> float | None:
+            figure: float | None = getattr(row, name)
+            return figure if figure is None else figure / unit
 
+        return Column(part, heading, decimals, value)
 
-def _columns(*listed: tuple[str, str, int]) -> tuple[Column, ...]:
-    """Return columns from their headings, fields of rows and decimals."""
-    return tuple(Column(heading, attrgetter(field), digits) for heading, field, digits in listed)
-
-
-_COST = (
-    *_columns(("points", "mesh_points", 0), ("triangles", "triangles", 0)),
-    Column("samples, M", lambda row: row.samples and row.samples / 1e6, 2),
-    *_columns(
-        ("missing, %", "missing_percent", 1),
-        ("minutes", "minutes", 1),
-        ("SfM, min", "sfm_minutes", 1),
-        ("memory, MB", "peak_memory_mb", 0),
-    ),
-)
-_RAYS = _columns(
-    ("3D error, %", "relative_error", 2),
-    ("covered, %", "coverage_percent", 1),
-    ("normals, °", "mean_normal_deg", 2),
-    ("median, °", "median_normal_deg", 2),
-    ("shape, °", "mean_shape_normal_deg", 2),
-    ("shape median, °", "median_shape_normal_deg", 2),
-    ("pitted, %", "pitted_percent", 2),
-)
-_COMMON = _columns(
-    ("covered by all, %", "common_percent", 1),
-    ("3D error there, %", "common_relative_error", 2),
-    ("normals there, °", "common_mean_normal_deg", 2),
-    ("median there, °", "common_median_normal_deg", 2),
-    ("shape there, °", "common_mean_shape_normal_deg", 2),
-    ("shape median there, °", "common_median_shape_normal_deg", 2),
-)
-_SURFACE = _columns(
-    ("Chamfer, %", "chamfer", 3),
-    ("accuracy, %", "accuracy", 3),
-    ("complete, %", "completeness_seen", 3),
-)
-
-
-def columns(rows: Sequence[BenchRow]) -> dict[str, tuple[Column, ...]]:
-    """Return the columns that some row has a figure for, by what they are about."""
-
-    def known(columns: Sequence[Column]) -> tuple[Column, ...]:
-        return tuple(
-            column for column in columns if any(_is_known(column.value(row)) for row in rows)
+    def f_score(threshold: float) -> Column:
+        return Column(
+            _SURFACE, f"F {threshold:g} %", 1, lambda row: dict(row.f_scores).get(threshold)
         )
 
-    thresholds = sorted({threshold for row in rows for threshold, _ in row.f_scores})
-    scores = tuple(
-        Column(
-            f"F {threshold:g} %",
-            lambda row, threshold=threshold: dict(row.f_scores).get(threshold),  # type: ignore[misc]
-            1,
-        )
-        for threshold in thresholds
-    )
-    return {
-        "cost": known(_COST),
-        "along the rays of the reference view": known(_RAYS),
-        "where all methods cover the object": known(_COMMON),
-        "distances of surfaces": known((*_SURFACE, *scores)),
-    }
+    fields = dataclasses.fields(BenchRow)
+    listed = [column(field.name, **field.metadata) for field in fields if field.metadata]
+    listed += map(f_score, sorted({threshold for row in rows for threshold, _ in row.f_scores}))
+    known = [one for one in listed if any(_is_known(one.value(row)) for row in rows)]
+    parts = (_COST, _RAYS, _COMMON, _SURFACE)
+    return {part: [one for one in known if one.part == part] for part in parts}
 
 
 def cell(value: int | float | None, decimals: int) -> str:

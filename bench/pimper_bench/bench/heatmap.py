@@ -1,7 +1,8 @@
 """Errors on the surface, and the contact sheet of the bench.
 
-An error map has one number a pixel: finite where it was measured, infinite where the truth
-shows something that the surface misses, NaN where there is nothing to compare.
+An error map has one number a pixel, per cent of the diagonal of the true bounding box: finite
+where it was measured, infinite where the truth shows something that the surface misses, NaN where
+there is nothing to compare.
 """
 
 from collections.abc import Sequence
@@ -13,41 +14,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pimper_bench.bench.bench_inputs import Inputs
+from pimper_bench.metrics.in_view import Meeting
+from pimper_bench.metrics.surface_distances import bounding_diagonal
+from pimper_bench.truth import Capture
 from pimper_torch.ground.geometry.rigid import rotate
-from pimper_torch.ground.geometry.visibility import Hits
-from pimper_torch.records import Cameras, Mesh
+from pimper_torch.records import Mesh
 from pimper_torch.result.viz.maps import normal_colors, view_maps
 from pimper_torch.result.viz.render import shade
-from pimper_torch.result.viz.tiles import Picture, Tile, array, sheet
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.result.viz.tiles import Picture, Tile, array, encoded, sheet
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)
+# Errors from here on have the last colour: twice what the facets alone are off by, so that
+# methods differ.
+CLIP_PERCENT = 1.0
+LABEL = f"distance to the truth, % of the diagonal, 0 to {CLIP_PERCENT:g} (clipped there)"
 _PANEL_PX, _HEATMAP_PX = 260, 620
 _BAR_PX = (16, 400)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorScale:
-    """Scale from errors to colours.
-
-    Attributes:
-        clip: Errors from here on have the last colour.
-        unit: Of the errors, such as ``% of the diagonal``.
-    """
-
-    clip: float
-    unit: str
-    what: str = "distance to the truth"
-
-    def __post_init__(self) -> None:
-        if not (self.clip > 0 and np.isfinite(self.clip)):
-            raise InputError(f"clip is {self.clip}; needed: a finite number above 0.")
-
-    @property
-    def label(self) -> str:
-        """Title of the colour bar."""
-        return f"{self.what}, {self.unit}, 0 to {self.clip:g} (clipped at {self.clip:g})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,17 +64,67 @@ class SceneRow:
     methods: tuple[MethodPanels, ...]
 
 
+def method_panels(
+    mesh: Mesh, met: Meeting | None, inputs: Inputs, scene: str, method: str, heatmap: Path
+) -> MethodPanels:
+    """Draw the errors of a surface on it, and return its pictures for the sheet.
+
+    Args:
+        mesh: In the frame of the truth.
+        met: Of the rays of the reference view; ``None`` if none meets it.
+        heatmap: File for the errors, PNG.
+    """
+    truth = inputs.maps
+    if met is None or truth.cameras is None:
+        return MethodPanels(method=method, note="points only")
+    errors, shading = error_along_rays(met, truth), shade(mesh, truth.cameras)
+    draw_heatmap(errors, heatmap, shading=shading, title=f"{scene}, {method}")
+    crop = _crop(truth)
+    return MethodPanels(
+        method=method,
+        surface=_on_white(view_maps(mesh, truth.cameras, 0, met.hits).normals_cam)[crop],
+        error=error_picture(errors, shading)[crop],
+    )
+
+
+def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
+    """Return a scene's row: photograph, truth, and the panels of all methods."""
+    maps = inputs.maps
+    assert maps.cameras is not None
+    assert maps.truth.normals_world is not None
+    crop = _crop(maps)
+    taken = inputs.scene.views.images[inputs.coarse.reference]
+    normals_world = maps.truth.normals_world[0]
+    normals_cam = rotate(maps.cameras.cam_from_world[0].to(normals_world), normals_world)
+    return SceneRow(
+        scene=scene,
+        photograph=encoded(taken.movedim(0, -1))[crop],
+        truth=_on_white(normals_cam)[crop],
+        methods=methods,
+    )
+
+
+def _crop(maps: Capture) -> tuple[slice, slice]:
+    assert maps.truth.foreground is not None
+    return crop_to(maps.truth.foreground[0])
+
+
+def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
+    """Return the distance of a surface from the truth along the rays of a view, as an error map."""
+    assert capture.truth.mesh is not None
+    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
+    error[met.valid] = torch.inf
+    distance = (met.points - met.points_true).norm(dim=-1).double()
+    error[met.both] = 100 * distance / bounding_diagonal(capture.truth.mesh)
+    return error
+
+
 def error_picture(
-    error: Float[Tensor, "height width"],
-    scale: ErrorScale,
-    *,
-    shading: Float[Tensor, "height width 3"] | None = None,
+    error: Float[Tensor, "height width"], shading: Float[Tensor, "height width 3"] | None = None
 ) -> Picture:
     """Colour an error map.
 
     Args:
-        error: See the head of this file.
-        scale: From the first colour at 0 to the last at its clip.
         shading: The surface, shaded; tints the colours a little so that height field is seen.
 
     Returns:
@@ -99,41 +133,14 @@ def error_picture(
     from matplotlib import colormaps
 
     values = error.detach().cpu().double()
-    colors = colormaps[_COLORS]((values / scale.clip).clamp(0, 1).nan_to_num(0).numpy())[..., :3]
+    fractions = (values / CLIP_PERCENT).clamp(0, 1).nan_to_num(0)
+    colors = colormaps[_COLORS](fractions.numpy())[..., :3]
     if shading is not None:
         tone = shading.detach().cpu().double().mean(dim=-1, keepdim=True).numpy()
         colors = colors * (0.65 + 0.35 * tone)  # darker would hide the colour
     colors[values.isnan().numpy()] = 1
     colors[values.isinf().numpy()] = MISSED
     return np.asarray(colors, dtype=np.float32)
-
-
-def shading_in_view(
-    mesh: Mesh, cameras: Cameras, view: int
-) -> Float[Tensor, "height width 3"] | None:
-    """Shade a mesh as one camera sees it; ``None`` for points without faces."""
-    return shade(mesh, cameras.take([view])) if len(mesh.faces) else None
-
-
-def normals_picture(
-    normals_world: Float[Tensor, "height width 3"], cameras: Cameras, view: int
-) -> Picture:
-    """Colour normals in the frame of a camera; white where there are none."""
-    normals_cam = rotate(cameras.cam_from_world[view].to(normals_world), normals_world)
-    return _on_white(normals_cam)
-
-
-def surface_picture(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> Picture:
-    """Colour the normals that a mesh carries, or those of its shape if it carries none.
-
-    Args:
-        mesh: Any; points without faces give a white picture.
-        hits: Of the view's rays on the mesh, if they are known already.
-    """
-    if not len(mesh.faces):
-        width, height = (int(side) for side in cameras.sizes_px[view])
-        return np.ones((height, width, 3), dtype=np.float32)
-    return _on_white(view_maps(mesh, cameras, view, hits).normals_cam)
 
 
 def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
@@ -154,7 +161,6 @@ def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
 
 def draw_heatmap(
     error: Float[Tensor, "height width"],
-    scale: ErrorScale,
     path: Path | str,
     *,
     shading: Float[Tensor, "height width 3"] | None = None,
@@ -163,16 +169,15 @@ def draw_heatmap(
     """Draw one error map on the shaded surface, with its colour bar, as PNG.
 
     Args:
-        error: Of every pixel of a view, see the head of this file.
-        shading: The surface in that view, see :func:`shading_in_view`.
+        shading: The surface in that view, shaded.
     """
     rows, columns = crop_to(~error.isnan())
-    picture = error_picture(error, scale, shading=shading)[rows, columns]
-    shown = [[Tile(title=title, picture=picture)], [_bar(scale, missed=bool(error.isinf().any()))]]
+    picture = error_picture(error, shading)[rows, columns]
+    shown = [[Tile(title=title, picture=picture)], [_bar(missed=bool(error.isinf().any()))]]
     sheet(shown, _HEATMAP_PX).save(path)
 
 
-def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) -> None:
+def draw_sheet(rows: Sequence[SceneRow], path: Path | str) -> None:
     """Draw scenes by methods as PNG.
 
     Every scene has two rows of pictures: the photograph and each method's surface above, the
@@ -181,8 +186,6 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
     Args:
         rows: At least one; a method that is missing in one leaves its place empty there.
     """
-    if not rows:
-        raise InputError("there is no scene to draw; needed: one or more.")
     names = tuple(dict.fromkeys(panels.method for row in rows for panels in row.methods))
     shown: list[list[Tile]] = []
     for row in rows:
@@ -195,7 +198,7 @@ def draw_sheet(rows: Sequence[SceneRow], scale: ErrorScale, path: Path | str) ->
             note = "" if one.surface is None else one.note  # once is enough
             below.append(Tile(picture=one.error, note=note))
         shown += [above, below]
-    sheet([*shown, [_bar(scale, missed=True)]], _PANEL_PX).save(path)
+    sheet([*shown, [_bar(missed=True)]], _PANEL_PX).save(path)
 
 
 def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
@@ -203,11 +206,11 @@ def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
     return array(torch.where(there, normal_colors(normals_cam), 1.0))
 
 
-def _bar(scale: ErrorScale, *, missed: bool) -> Tile:
-    """Draw the colours of a scale in a row, and what red means."""
+def _bar(*, missed: bool) -> Tile:
+    """Draw the colours of errors in a row, and what red means."""
     height, width = _BAR_PX
-    values = torch.linspace(0, scale.clip, width).expand(height, width).clone()
+    values = torch.linspace(0, CLIP_PERCENT, width).expand(height, width).clone()
     if missed:
         values[:, -width // 10 :] = torch.inf
-    title = f"{scale.label}{'; red: missed' if missed else ''}"
-    return Tile(title=title, picture=error_picture(values, scale), wide=True)
+    title = f"{LABEL}{'; red: missed' if missed else ''}"
+    return Tile(title=title, picture=error_picture(values), wide=True)

@@ -5,12 +5,12 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 
 from pimper_torch.cli.doctor.machine import total_gb
+from pimper_torch.doors.io.version import installed_version
 from pimper_torch.records import Record
 from pimper_torch.runtime.cores import usable_cores
 
@@ -55,7 +55,7 @@ def this_machine() -> Machine:
         gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
         system=f"{platform.system()} {platform.machine()}",
         python=platform.python_version(),
-        versions=tuple(f"{name} {_version(name)}" for name in _PACKAGES),
+        versions=tuple(f"{name} {installed_version(name)}" for name in _PACKAGES),
     )
 
 
@@ -66,13 +66,6 @@ def _cpu() -> str:
         text = ""
     named = re.search(r"^model name\s*:\s*(.+)$", text, flags=re.MULTILINE)
     return named[1].strip() if named else platform.processor() or platform.machine()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 _SELF = Path("/proc/self")

@@ -3,16 +3,13 @@
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from pimper_bench.bench.bench_inputs import (
     BenchConfig,
@@ -32,165 +29,44 @@ from pimper_bench.bench.bench_table import (
     write_json,
 )
 from pimper_bench.bench.heatmap import (
-    ErrorScale,
     MethodPanels,
     SceneRow,
-    crop_to,
-    draw_heatmap,
     draw_sheet,
-    error_picture,
-    normals_picture,
-    shading_in_view,
-    surface_picture,
+    method_panels,
+    scene_row,
 )
 from pimper_bench.bench.measure import peak_memory, this_machine
 from pimper_bench.metrics.evaluation import Evaluation, evaluate
 from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
 from pimper_bench.metrics.similarity import transfer
-from pimper_bench.metrics.surface_distances import bounding_diagonal
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.meshes import read_mesh, write_ply
+from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.outputs.folders import written_whole
-from pimper_torch.records import Mesh, StageReport
-from pimper_torch.result.viz.tiles import encoded
+from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperError, PimperWarning
-from pimper_torch.runtime.progress import listening
-from pimper_torch.runtime.reporting import Observer, Silent, peak_memory_mb
-
-Covered = Bool[Tensor, "height width"]
-
-
-def with_common(
-    rows: Sequence[BenchRow],
-    covered: Sequence[Covered | None],
-    meshes: Sequence[Path | str],
-    maps: Capture,
-) -> list[BenchRow]:
-    """Add figures over the pixels that all methods cover to the rows of a scene.
-
-    A method that leaves out difficult parts has small errors on the rest.
-
-    Args:
-        covered: True where rays of the view meet truth and method; ``None`` for methods
-            without a surface, which limit no other.
-        meshes: The surfaces as files, in the frame of the truth.
-        maps: The truth in that view alone.
-    """
-    known = [one for one in covered if one is not None]
-    if not known:
-        return list(rows)
-    common = reduce(torch.logical_and, known)
-    return [
-        row if own is None else _with_common(row, path, common, maps)
-        for row, own, path in zip(rows, covered, meshes, strict=True)
-    ]
-
-
-def _with_common(row: BenchRow, path: Path | str, common: Covered, maps: Capture) -> BenchRow:
-    mesh = read_mesh(path)
-    met = meet_truth(mesh, maps, 0)
-    assert met is not None  # as when it was measured
-    met = met.only(common)
-    fraction = 100 * met.coverage
-    if not met.both.any():
-        return row.replace(common_percent=fraction)
-    figures = figures_of(met, mesh, maps, 0)
-    others = {f"common_{name}": value for name, value in _along_rays(figures).items()}
-    return row.replace(common_percent=fraction, **others)
-
-
-def _along_rays(view: ViewFigures | None) -> dict[str, Any]:
-    """Return the figures that a row has over its own pixels and over common ones."""
-    if view is None:
-        return {}
-    normals, shape = view.transferred_normals, view.shape_normals
-    return {
-        "relative_error": view.relative_error,
-        "mean_normal_deg": normals.mean_deg if normals else None,
-        "median_normal_deg": normals.median_deg if normals else None,
-        "mean_shape_normal_deg": shape.mean_deg if shape else None,
-        "median_shape_normal_deg": shape.median_deg if shape else None,
-    }
-
-
-# Per cent of the diagonal: twice what the facets alone are off by, so that methods differ.
-ERROR_SCALE = ErrorScale(clip=1.0, unit="% of the diagonal")
-
-
-def method_panels(
-    mesh: Mesh,
-    met: Meeting | None,
-    inputs: Inputs,
-    scene: str,
-    method: str,
-    heatmap: Path | str | str,
-) -> MethodPanels:
-    """Draw the errors of a surface on it, and return its pictures for the sheet.
-
-    Args:
-        mesh: In the frame of the truth.
-        met: Of the rays of the reference view; ``None`` if none meets it.
-    """
-    truth = inputs.maps
-    if met is None or truth.cameras is None:
-        return MethodPanels(method=method, note="points only")
-    errors = error_along_rays(met, truth)
-    shading = shading_in_view(mesh, truth.cameras, 0)
-    draw_heatmap(errors, ERROR_SCALE, heatmap, shading=shading, title=f"{scene}, {method}")
-    crop = _crop(truth)
-    return MethodPanels(
-        method=method,
-        surface=surface_picture(mesh, truth.cameras, 0, met.hits)[crop],
-        error=error_picture(errors, ERROR_SCALE, shading=shading)[crop],
-    )
-
-
-def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
-    """Return a scene's row: photograph, truth, and the panels of all methods."""
-    maps = inputs.maps
-    assert maps.cameras is not None
-    assert maps.truth.normals_world is not None
-    crop = _crop(maps)
-    taken = inputs.scene.views.images[inputs.coarse.reference]
-    return SceneRow(
-        scene=scene,
-        photograph=encoded(taken.movedim(0, -1))[crop],
-        truth=normals_picture(maps.truth.normals_world[0], maps.cameras, 0)[crop],
-        methods=methods,
-    )
-
-
-def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
-    """Return the distance of a surface from the truth along the rays of a view.
-
-    Per cent of the diagonal of the true bounding box; infinite on the object where the surface is
-    missed, NaN off the object.
-    """
-    assert capture.truth.mesh is not None
-    error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
-    error[met.valid] = torch.inf
-    distance = (met.points - met.points_true).norm(dim=-1).double()
-    error[met.both] = 100 * distance / bounding_diagonal(capture.truth.mesh)
-    return error
-
-
-def _crop(maps: Capture) -> tuple[slice, slice]:
-    assert maps.truth.foreground is not None
-    return crop_to(maps.truth.foreground[0])
-
+from pimper_torch.runtime.reporting import stage
 
 BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
 
 
-_Cell = tuple[BenchRow, MethodPanels, Covered | None]
-"""Row, pictures, and pixels of the reference view whose rays meet truth and surface."""
+class _Cell(NamedTuple):
+    """What a method gave on a scene.
+
+    Attributes:
+        mesh: Its surface in the frame of the truth; ``None`` if it failed.
+        met: Intersections of the rays of the reference view; ``None`` without faces.
+    """
+
+    row: BenchRow
+    panels: MethodPanels
+    mesh: Mesh | None = None
+    met: Meeting | None = None
 
 
 def run_bench(
     config: BenchConfig,
     folder: Path | str,
     *,
-    observer: Observer | None = None,
     overwrite: bool = False,
     cache: Path | str | None = None,
 ) -> Table:
@@ -212,7 +88,6 @@ def run_bench(
     Args:
         cache: Folder where the models of structure from motion are kept from run to run.
     """
-    observer = observer or Silent()
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
     rows: list[BenchRow] = []
@@ -225,9 +100,7 @@ def run_bench(
             (staging / part).mkdir()
         for scene in config.scenes:
             try:
-                measured, pictures = _scene(
-                    scene, methods, config, Path(workspace), staging, observer, cache
-                )
+                measured, pictures = _scene(scene, methods, config, Path(workspace), staging, cache)
             except KeyboardInterrupt:
                 if not rows:
                     raise
@@ -249,7 +122,7 @@ def run_bench(
         write_json(table, staging / "table.json")
         (staging / "table.md").write_text(markdown(table) + "\n", encoding="utf-8")
         if sheet:
-            draw_sheet(sheet, ERROR_SCALE, staging / "sheet.png")
+            draw_sheet(sheet, staging / "sheet.png")
     return table
 
 
@@ -259,29 +132,59 @@ def _scene(
     config: BenchConfig,
     workspace: Path,
     staging: Path,
-    observer: Observer,
     cache: Path | str | None,
 ) -> tuple[list[BenchRow], list[SceneRow]]:
     """Run all methods on a scene; a scene without cameras has rows that say why."""
     name = Path(scene).stem
-    with _shown(observer, f"{name} render"):
+    with stage(f"{name} render"):
         rendered = scene_folder(scene, config, workspace)
     try:
-        with _shown(observer, f"{name} sfm"):
+        with stage(f"{name} sfm"):
             inputs = prepare(rendered, config, cache)
     except PimperError as error:
         return [row_of_failure(name, method, error) for method in methods], []
     cells = []
     for method, run in methods.items():
-        with _shown(observer, f"{name} {method}"):
+        with stage(f"{name} {method}"):
             cells.append(_cell(name, method, run, inputs, config, staging))
-    rows, panels, covered = zip(*cells, strict=True)
-    meshes = [_mesh_file(staging, name, method) for method in methods]
-    return with_common(rows, covered, meshes, inputs.maps), [scene_row(name, inputs, panels)]
+    panels = tuple(cell.panels for cell in cells)
+    return _with_common(cells, inputs.maps), [scene_row(name, inputs, panels)]
 
 
-def _mesh_file(folder: Path, scene: str, method: str) -> Path:
-    return folder / "meshes" / f"{scene}_{method}.ply"
+def _with_common(cells: Sequence[_Cell], maps: Capture) -> list[BenchRow]:
+    """Return the rows of a scene with figures over the pixels that all methods cover.
+
+    A method that leaves out difficult parts has small errors on the rest. Methods without a
+    surface limit no other.
+
+    Args:
+        maps: The truth in the reference view alone.
+    """
+    known = [cell.met.both for cell in cells if cell.met is not None]
+    common = reduce(torch.logical_and, known) if known else None
+    rows = []
+    for row, _, mesh, met in cells:
+        if common is not None and mesh is not None and met is not None:
+            shared = met.only(common)
+            view = figures_of(shared, mesh, maps, 0) if bool(common.any()) else None
+            figures = {f"common_{name}": value for name, value in _along_rays(view).items()}
+            row = row.replace(common_percent=100 * shared.coverage, **figures)
+        rows.append(row)
+    return rows
+
+
+def _along_rays(view: ViewFigures | None) -> dict[str, Any]:
+    """Return the figures that a row has over its own pixels and over common ones."""
+    if view is None:
+        return {}
+    normals, shape = view.transferred_normals, view.shape_normals
+    return {
+        "relative_error": view.relative_error,
+        "mean_normal_deg": normals.mean_deg if normals else None,
+        "median_normal_deg": normals.median_deg if normals else None,
+        "mean_shape_normal_deg": shape.mean_deg if shape else None,
+        "median_shape_normal_deg": shape.median_deg if shape else None,
+    }
 
 
 def _cell(
@@ -303,27 +206,24 @@ def _cell(
     except (PimperError, MemoryError) as error:
         minutes = (time.perf_counter() - began) / 60
         row = row_of_failure(scene, method, error, minutes=minutes, sfm_minutes=sfm_minutes)
-        return row, MethodPanels(method=method, note=row.note), None
+        return _Cell(row, MethodPanels(method=method, note=row.note))
     mesh = transfer(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
-    write_ply(mesh, _mesh_file(staging, scene, method))
-    heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
+    write_ply(mesh, staging / "meshes" / f"{scene}_{method}.ply")
     # Evaluated in a view, it has been met.
     met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
-    row = row_of(scene, method, outcome, evaluation, memory=memory, sfm_minutes=sfm_minutes)
-    panels = method_panels(mesh, met, inputs, scene, method, heatmap)
-    return row, panels, met.both if met else None
+    heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
+    row = _row_of(scene, method, outcome, evaluation, memory, sfm_minutes)
+    return _Cell(row, method_panels(mesh, met, inputs, scene, method, heatmap), mesh, met)
 
 
-def row_of(
+def _row_of(
     scene: str,
     method: str,
     outcome: MethodRun,
     evaluation: Evaluation,
-    *,
-    memory: float | None = None,
-    sfm_minutes: float | None = None,
+    memory: float | None,
+    sfm_minutes: float | None,
 ) -> BenchRow:
-    """Take a row's figures from an outcome and its evaluation."""
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
     seen, missing = surface.seen if surface else None, outcome.missing_fraction
@@ -348,21 +248,4 @@ def row_of(
         else (),
         peak_memory_mb=memory,
         **_along_rays(view),
-    )
-
-
-@contextmanager
-def _shown(observer: Observer, name: str) -> Iterator[None]:
-    began = time.perf_counter()
-    observer.started(name)
-    progressed: Callable[[int, int], None] = observer.progressed
-    with listening(progressed):
-        yield
-    observer.finished(
-        StageReport(
-            name=name,
-            seconds=time.perf_counter() - began,
-            peak_memory_mb=peak_memory_mb(),
-            figures={},
-        )
     )

@@ -21,10 +21,8 @@ _OUT, _QUICK = Path("pimper_bench"), BenchConfig()
 
 def run(job: "_Job", output: Output) -> None:
     """Carry out ``bench``."""
-    with output.observer() as observer:
-        table = run_bench(
-            job.config, job.out, observer=observer, overwrite=job.overwrite, cache=job.cache
-        )
+    with output.observer():
+        table = run_bench(job.config, job.out, overwrite=job.overwrite, cache=job.cache)
     if not output.as_json:
         Console().print(terminal(table))
     output.remark(f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.")

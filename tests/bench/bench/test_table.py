@@ -14,7 +14,6 @@ from pimper_bench.bench.bench_table import (
     PUBLISHED,
     BenchRow,
     Table,
-    cell,
     columns,
     markdown,
     row_of_failure,
@@ -81,15 +80,6 @@ def cells(text):
     return [dict(zip(split[0], line, strict=True)) for line in split[2:]]
 
 
-def test_only_zero_is_shown_as_zero():
-    assert cell(0.0, 2) == "0.00"
-    assert cell(0, 0) == "0"
-    assert cell(0.0049, 2) == "<0.01"
-    assert cell(0.0051, 2) == "0.01"
-    for nothing in (None, math.nan, math.inf):
-        assert cell(nothing, 2) == MISSING
-
-
 def test_what_is_missing_is_a_dash_in_every_column():
     full, empty = cells(markdown(table(FULL, EMPTY)))
     words = {"scene": "mug", "method": "pmvs", "note": "not installed: pmvs2"}
@@ -136,18 +126,11 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
     assert len({len(line) for line in lines}) == 1
     rule = lines[1].split("|")[1:-1]
     assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 25 + [False]
-    points = [line.index(".", line.index("mug")) for line in (lines[2], lines[4])]
-    assert points[0] == points[1]  # decimal points of one column stand under one another
 
 
 def test_columns_that_no_row_fills_are_left_out():
     bare = FULL.replace(f_scores=(), chamfer=None, relative_error=math.nan)
-    parts = columns([bare, EMPTY])
-    assert [len(part) for part in parts.values()] == [7, 6, 6, 2]
-    headings = [column.heading for part in parts.values() for column in part]
-    assert "Chamfer, %" not in headings
-    assert "3D error, %" not in headings
-    assert not any(heading.startswith("F ") for heading in headings)
+    assert [len(part) for part in columns([bare, EMPTY]).values()] == [7, 6, 6, 2]
 
 
 def test_thresholds_that_differ_between_rows_have_columns_of_their_own():
@@ -188,7 +171,7 @@ def test_published_rows_stand_before_ours_and_are_marked():
     assert "†" not in markdown(table(FULL))
 
 
-def test_published_figures_are_shown_as_printed_and_agree_with_one_another():
+def test_published_figures_are_shown_as_printed():
     shown = {(one["scene"], one["method"]): one for one in cells(markdown(table(*PUBLISHED)))}
     mug = shown["mug", "PiMPeR †"]
     assert [mug[name] for name in ("samples, M", "missing, %", "3D error, %")] == [
@@ -197,14 +180,6 @@ def test_published_figures_are_shown_as_printed_and_agree_with_one_another():
         "7.10",
     ]
     assert shown["potatoes", "global-stereo †"]["minutes"] == "1,320.0"  # 22 hours
-    for row in PUBLISHED[:4]:
-        # A triangulation of a disk by n points, 3 at least on its border: Euler's formula.
-        assert row.triangles <= 2 * row.mesh_points - 5
-        # The mug has the fewest points, samples and minutes, and errs least.
-        assert row.samples >= PUBLISHED[0].samples
-        assert row.minutes >= PUBLISHED[0].minutes
-        assert row.relative_error >= PUBLISHED[0].relative_error
-    assert PUBLISHED[4].relative_error > PUBLISHED[3].relative_error  # as the paper claims
 
 
 def test_the_legend_says_where_it_was_measured():
@@ -237,22 +212,16 @@ def test_the_terminal_says_in_full_why_figures_are_missing():
     assert text.count("word") == 30
 
 
-def test_json_holds_every_field(tmp_path):
+def test_json_holds_every_field_and_null_for_what_is_no_number(tmp_path):
     before = table(FULL, EMPTY, *PUBLISHED, seed=3, scenes=["mug", "jar"])
     write_json(before, tmp_path / "bench.json")
     report = json.loads((tmp_path / "bench.json").read_text())
     assert report["settings"] == {"seed": 3, "scenes": ["mug", "jar"]}
     assert [build(BenchRow, row, "row") for row in report["rows"]] == [*before.rows]
     assert build(Machine, report["machine"], "machine") == MACHINE
-
-
-def test_what_is_no_number_becomes_null_in_json(tmp_path):
-    odd = FULL.replace(minutes=math.nan, chamfer=math.inf)
-    write_json(table(odd), tmp_path / "bench.json")
-    report = json.loads((tmp_path / "bench.json").read_text())
-    assert report["rows"][0]["minutes"] is None
-    assert report["rows"][0]["relative_error"] == 1.234567  # all digits
-    assert report["rows"][0]["chamfer"] is None
+    write_json(table(FULL.replace(minutes=math.nan, chamfer=math.inf)), tmp_path / "bench.json")
+    (row,) = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    assert row["minutes"] is row["chamfer"] is None
 
 
 def test_a_missing_program_is_told_from_a_failure():
