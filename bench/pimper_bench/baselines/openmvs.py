@@ -22,11 +22,11 @@ from pimper_torch.runtime.errors import InputError, MissingProgramError, Reconst
 from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.stage import Stage
 
-# Environment variable that may name a program, or the folder it lies in, and folders of installers.
-_VARIABLE, _FOLDERS = "PIMPER_OPENMVS", ("/usr/local/bin/OpenMVS", "/usr/bin/OpenMVS")
+# Where OpenMVS's own installer puts its programs.
+_FOLDERS = ("/usr/local/bin/OpenMVS", "/usr/bin/OpenMVS")
 _ADVICE = (
-    f"Get it from https://github.com/cdcseacave/openMVS, or point {_VARIABLE} to it, or leave this "
-    "method out."
+    "Get it from https://github.com/cdcseacave/openMVS and put its folder on the PATH, or leave "
+    "this method out."
 )
 PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")
 
@@ -40,7 +40,8 @@ _MAX_MINUTES = 120.0
 class OpenMvs(Stage):
     """Depth maps by patch match, a mesh that explains their visibility, refined.
 
-    All under the programs' own defaults. Masks are not handed over: not every version takes them.
+    Of version 2.3 or later, which wants the dense points named. All under the programs' own
+    defaults. Masks are not handed over: not every version takes them.
     """
 
     @torch.no_grad()
@@ -71,23 +72,11 @@ class OpenMvs(Stage):
 
 
 def find_program(name: str) -> Path:
-    """Find an executable: by the variable, on the PATH, in the usual folders."""
-    if _VARIABLE in os.environ:
-        named = Path(os.environ[_VARIABLE])
-        path = named / name if named.is_dir() else named
-        if not (path.is_file() and os.access(path, os.X_OK)):
-            raise MissingProgramError(
-                f"{name} is not installed at {named}, where {_VARIABLE} says; needed: the "
-                f"executable, or the folder it lies in. {_ADVICE}"
-            )
-        return path.absolute()  # it will run in another folder
+    """Find an executable: on the PATH, then in the usual folders."""
     found = shutil.which(name) or shutil.which(name, path=os.pathsep.join(_FOLDERS))
     if found is None:
-        raise MissingProgramError(
-            f"{name} is not installed: it is neither on the PATH nor named by {_VARIABLE}. "
-            f"{_ADVICE}"
-        )
-    return Path(found).absolute()
+        raise MissingProgramError(f"{name} is not installed: it is not on the PATH. {_ADVICE}")
+    return Path(found).absolute()  # it will run in another folder
 
 
 def _write_scene(scene: SparseScene, folder: Path) -> None:
@@ -127,13 +116,7 @@ def _run_all(found: dict[str, Path], folder: Path) -> Mesh:
 
     call("InterfaceCOLMAP", "-i", str(folder), leaves=(_SCENE,))
     call("DensifyPointCloud", "-i", _SCENE, leaves=(_DENSE,))
-    try:
-        help_text = run_program([found["ReconstructMesh"], "--help"], folder, deadline, 1)
-    except ReconstructionError as error:  # some versions fail after showing their help
-        help_text = str(error)
-    # Since version 2.3 the dense points are not in the scene's file, and must be named.
-    points = ("-p", "scene_dense.ply") if "--pointcloud-file" in help_text else ()
-    call("ReconstructMesh", "-i", _DENSE, *points, leaves=(_MESH,))
+    call("ReconstructMesh", "-i", _DENSE, "-p", "scene_dense.ply", leaves=(_MESH,))
     path, printed = call("RefineMesh", "-i", _DENSE, "--mesh-file", _MESH, leaves=_REFINED)
     try:
         # Its colours are radiance under this light, no albedo.

@@ -15,7 +15,6 @@ from pimper_bench.truth import Capture, DtuProtocol, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.rigid import rigid
 
 _POINTS = "the DTU point feature set"
 _MVS = "the DTU multi-view stereo set of 2014"
@@ -81,10 +80,8 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
         Calibration/cal18/pos_001.txt ...                                 3x4 projections
         Points/stl/stl001_total.ply                                       scan, in mm
 
-    Instead of ``Calibration`` there may be ``Cameras/00000000_cam.txt`` and so on, as MVSNet
-    distributes them for the full photographs: ``extrinsic`` 4x4, ``intrinsic`` 3x3, counted
-    from 0. The world is the same, in millimetres. Photographs are rectified: free of lens
-    distortion. Pixels of both camera files count from the centre of the first one. Nothing
+    The world is in millimetres. Photographs are rectified: free of lens distortion. Pixels of the
+    camera files count from the centre of the first one. MVSNet's camera files are not read. Nothing
     is published on the photographs' transfer curve; as those of the set's sister from the
     same camera they are taken for linear. Directions of the lights are not published.
 
@@ -95,7 +92,7 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
             ``max``.
 
     Source: Jensen et al., Large Scale Multi-view Stereopsis Evaluation, CVPR 2014,
-    roboimagedata.compute.dtu.dk; names as in the set's SampleSet and in MVSNet's loader.
+    roboimagedata.compute.dtu.dk; names as in the set's SampleSet.
     """
     root = DataSetPath(Path(folder), _MVS)
     inner = f"Rectified/scan{scan}"
@@ -183,40 +180,15 @@ def _halves(root: DataSetPath, scan: int) -> Float[Tensor, "point 3"] | None:
 def _mvs_cameras(
     root: DataSetPath, positions: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
-    """Read the cameras of positions, from the set's own files or else from MVSNet's."""
-    official, other = root.inner("Calibration/cal18"), root.inner("Cameras")
-    if official.path.is_dir():
-        projections = []
-        for position in positions:
-            file = official.inner(f"pos_{position:03d}.txt")
-            matrix = file.numbers(file.read_text(), 12, "a 3x4 matrix").reshape(3, 4)
-            rank = int(torch.linalg.matrix_rank(matrix[:, :3]))
-            file.expect(rank == 3, "the projection of a camera", f"a matrix of rank {rank}")
-            projections.append(matrix)
-        return decompose_projections(torch.stack(projections))
-    root.expect(
-        other.path.is_dir(),
-        "Calibration/cal18/pos_001.txt and so on, or Cameras/00000000_cam.txt and so on",
-    )
-    parsed = [_mvsnet_camera(other.inner(f"{position - 1:08d}_cam.txt")) for position in positions]
-    intrinsics, poses = zip(*parsed, strict=True)
-    return torch.stack(intrinsics), torch.stack(poses)
-
-
-def _mvsnet_camera(file: DataSetPath) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"]]:
-    words = file.read_text().split()
-    file.expect(
-        len(words) >= 27 and words[0] == "extrinsic" and words[17] == "intrinsic",
-        "the word extrinsic, 16 numbers, the word intrinsic, 9 numbers",
-        f"{len(words)} words, the first {words[:1]}",
-    )
-    extrinsic = file.numbers(words[1:17], 16, "extrinsic").reshape(4, 4)
-    K = file.numbers(words[18:27], 9, "intrinsic").reshape(3, 3)
-    # MVSNet's training copies are 160 x 128: their principal point lies near (80, 64).
-    file.expect(
-        float(K[0, 2]) > _SIZE_PX[0] / 4,
-        "intrinsics of the photographs of 1600 x 1200",
-        f"a principal point at ({float(K[0, 2]):.0f}, {float(K[1, 2]):.0f})",
-    )
-    U, _, Vh = torch.linalg.svd(extrinsic[:3, :3])
-    return K, rigid(U @ Vh, extrinsic[:3, 3])
+    """Read the cameras of positions from the set's own files."""
+    folder = root.inner("Calibration/cal18")
+    needed = "Calibration/cal18/pos_001.txt and so on, as the set's SampleSet has them"
+    root.expect(folder.path.is_dir(), needed)
+    projections = []
+    for position in positions:
+        file = folder.inner(f"pos_{position:03d}.txt")
+        matrix = file.numbers(file.read_text(), 12, "a 3x4 matrix").reshape(3, 4)
+        rank = int(torch.linalg.matrix_rank(matrix[:, :3]))
+        file.expect(rank == 3, "the projection of a camera", f"a matrix of rank {rank}")
+        projections.append(matrix)
+    return decompose_projections(torch.stack(projections))

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from pimper_bench.metrics.surface_distances import joined
+from pimper_bench.metrics.surface_distances import with_surroundings
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.pixels import pixel_centers
@@ -317,7 +317,7 @@ def true_maps(capture: Capture, view: int) -> TrueMaps | None:
         return TrueMaps(depth=truth.depth[view], normals_world=normals, where=where)
     if truth.mesh is None or len(truth.mesh.faces) == 0 or cameras is None:
         return None
-    whole = joined(truth.mesh, truth.surroundings)
+    whole = with_surroundings(truth.mesh, truth)
     hits = cast_view(whole, cameras, view)
     return TrueMaps(
         depth=hits.distance,

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_bench.metrics.surface_distances import joined, sample_surface, true_surface
+from pimper_bench.metrics.surface_distances import sample_surface, true_surface, with_surroundings
 from pimper_bench.truth import Capture
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.rigid import rigid, transform
@@ -210,7 +210,7 @@ def align_estimate(
     known: dict[str, float | None] = {}
     description = f"similarity on {used} cameras" if used else "identity"
     if method == "icp":
-        target = joined(true_surface(capture), capture.truth.surroundings)
+        target = with_surroundings(true_surface(capture), capture.truth)
         kind = "plane" if len(target.faces) else "point"
         description = (
             f"similarity ICP, point to {kind}, {100 * trimmed_fraction:g} % of the estimate "

@@ -10,7 +10,8 @@ from scipy.stats import spearmanr
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_bench.truth import Capture
+from pimper_bench.scenes.procedural_meshes import join
+from pimper_bench.truth import Capture, Truth
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
@@ -104,24 +105,13 @@ def count_seeing(
     mesh, cameras = capture.truth.mesh, capture.cameras
     if cameras is None or mesh is None or not len(mesh.faces):
         return None
-    whole = joined(mesh, capture.truth.surroundings)
+    whole = with_surroundings(mesh, capture.truth)
     caster = RayCaster(whole.vertices_world, whole.faces)
     count = torch.zeros(len(samples.points), dtype=torch.long)
     for position in torch.unique(capture.position):
         view = int((capture.position == position).nonzero()[0])
         count += _seen(samples, cameras, view, caster, diagonal)
     return count
-
-
-def joined(mesh: Mesh, other: Mesh | None) -> Mesh:
-    """Put two surfaces in one, geometry only; the faces of ``mesh`` come first."""
-    vertices = mesh.vertices_world
-    if other is None:
-        return Mesh(vertices_world=vertices, faces=mesh.faces)
-    return Mesh(
-        vertices_world=torch.cat([vertices, other.vertices_world.to(vertices)]),
-        faces=torch.cat([mesh.faces, other.faces + len(vertices)]),
-    )
 
 
 def _seen(
@@ -346,6 +336,11 @@ class TrueSurface:
             seen_fraction=None if seen is None else float(seen.double().mean()),
             calibration=calibration,
         )
+
+
+def with_surroundings(surface: Mesh, truth: Truth) -> Mesh:
+    """Put the true surroundings, if they are known, behind the faces of a surface."""
+    return join(surface, *([] if truth.surroundings is None else [truth.surroundings]))
 
 
 def true_surface(capture: Capture) -> Mesh:

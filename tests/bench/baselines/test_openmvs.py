@@ -14,19 +14,16 @@ from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError, MissingProgramError, ReconstructionError
 
 # Every program refuses options it does not know, checks its input, and leaves what OpenMVS
-# leaves. `points` says whether this is a version that wants the dense points named.
+# leaves.
 FAKE = """#!{python}
 import pathlib, shutil, sys
-name, points = pathlib.Path(sys.argv[0]).name, {points}
+name = pathlib.Path(sys.argv[0]).name
 known = {{"-i", "-w", "--max-threads"}} | {{
     "InterfaceCOLMAP": set(),
     "DensifyPointCloud": set(),
-    "ReconstructMesh": {{"-p"}} if points else set(),
+    "ReconstructMesh": {{"-p"}},
     "RefineMesh": {{"--mesh-file"}},
 }}[name]
-if "--help" in sys.argv:
-    print("--input-file arg", "--pointcloud-file arg" if points else "")
-    sys.exit(1)
 options = dict(zip(sys.argv[1::2], sys.argv[2::2]))
 assert set(options) <= known, sorted(set(options) - known)
 here = pathlib.Path(options["-w"])
@@ -39,7 +36,7 @@ if name == "DensifyPointCloud":
     (here / "scene_dense.mvs").touch()
     (here / "scene_dense.ply").touch()
 if name == "ReconstructMesh":
-    assert ("-p" in options) == points
+    assert (here / options["-p"]).exists()
     if {finds}:
         shutil.copy({mesh!r}, here / "scene_dense_mesh.ply")
 if name == "RefineMesh":
@@ -53,7 +50,6 @@ PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMe
 def _no_openmvs(monkeypatch, tmp_path):
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-    monkeypatch.delenv("PIMPER_OPENMVS", raising=False)
 
 
 @pytest.fixture
@@ -62,7 +58,7 @@ def triangle():
     return Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2]]))
 
 
-def install(tmp_path, triangle, *, points=False, finds=True, names=PROGRAMS):
+def install(tmp_path, triangle, *, finds=True, names=PROGRAMS):
     write_ply(triangle, tmp_path / "mesh.ply")
     write_ply(
         triangle.replace(vertices_world=triangle.vertices_world + 1), tmp_path / "refined.ply"
@@ -75,7 +71,6 @@ def install(tmp_path, triangle, *, points=False, finds=True, names=PROGRAMS):
                 copy=str(tmp_path / "seen"),
                 mesh=str(tmp_path / "mesh.ply"),
                 refined=str(tmp_path / "refined.ply"),
-                points=points,
                 finds=finds,
             )
         )
@@ -83,9 +78,8 @@ def install(tmp_path, triangle, *, points=False, finds=True, names=PROGRAMS):
     return tmp_path / "seen"
 
 
-@pytest.mark.parametrize("points", [False, True], ids=["old version", "new version"])
-def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_path, points):
-    install(tmp_path, triangle, points=points)
+def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_path):
+    install(tmp_path, triangle)
     estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
     assert_close(estimate.mesh.vertices_world, triangle.vertices_world + 1)
     assert torch.equal(estimate.mesh.faces, triangle.faces)
@@ -139,13 +133,6 @@ def test_every_missing_program_is_named_before_anything_runs(reconstruction, tri
     with pytest.raises(MissingProgramError, match="ReconstructMesh is not installed"):
         OpenMvs()(reconstruction.scene, reconstruction.coarse)
     assert not copy.exists()
-
-
-def test_the_variable_may_name_the_programs_folder(reconstruction, triangle, tmp_path, monkeypatch):
-    install(tmp_path, triangle)
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.setenv("PIMPER_OPENMVS", str(tmp_path / "bin"))
-    assert len(OpenMvs()(reconstruction.scene, reconstruction.coarse).mesh.faces) == 1
 
 
 def test_a_step_that_leaves_nothing_is_named(reconstruction, triangle, tmp_path):

@@ -1,10 +1,7 @@
 import pytest
-import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_colmap
-from pimper_torch.doors.exchange.colmap_workspace import write_colmap
-from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.runtime.errors import InputError
 
 # `hand_camera` as a quaternion: a third of a turn about (-1, -1, -1), w = 0.5.
@@ -51,20 +48,6 @@ def test_photographs_may_lie_elsewhere(folder, sees):
     with pytest.raises(InputError, match="a folder `images`"):
         read_colmap(folder)
     assert sees(read_colmap(folder, images=folder / "pictures")) == pytest.approx([9, 11])
-
-
-def test_a_lens_is_undistorted(folder):
-    write_text(folder / "sparse" / "0", camera="1 SIMPLE_RADIAL 16 12 20 7 5 -0.2")
-    capture = read_colmap(folder)
-    assert capture.cameras.intrinsics[0].tolist() == [[20, 0, 7], [0, 20, 5], [0, 0, 1]]
-    assert (capture.views.images[0, :, 11, 15] > 0).all()
-
-
-def test_a_cloud_is_written_with_the_model(capture, tmp_path):
-    points = torch.tensor([[6.0, 3, 5], [1, 2, 4]])
-    write_colmap(capture.views, capture.cameras, tmp_path, points_world=points)
-    found = read_model(tmp_path / "sparse" / "0").points_world
-    assert_close(found, points.double())
 
 
 @pytest.mark.parametrize(

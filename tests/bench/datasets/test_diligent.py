@@ -102,20 +102,16 @@ def test_one_light_a_view_shrunk(turntable):
     assert_close(2 * capture.cameras.intrinsics[:, :2], full[:, :2])
 
 
+def _saying(name, text):
+    return lambda folder: (folder / name).write_text(text)
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
         (lambda folder: (folder / "view_02" / "mask.png").unlink(), r"mask\.png: there is no"),
-        (
-            lambda folder: (folder / "view_02" / "light_directions.txt").write_text("1 0 0\n"),
-            r"view_02: .*Found: 1, 1 and 3",
-        ),
-        (
-            lambda folder: (folder / "view_01" / "filenames.txt").write_text(
-                "../a 002.png 003.png"
-            ),
-            r"'\.\./a', which leads out of it",
-        ),
+        (_saying("view_02/light_directions.txt", "1 0 0\n"), r"view_02: .*Found: 1, 1 and 3"),
+        (_saying("view_01/filenames.txt", "../a 002.png 003.png"), r"'\.\./a', which leads out"),
         (lambda folder: (folder / "Calib_Results.mat").unlink(), r"Calib_Results\.mat"),
         (
             lambda folder: [path.rename(folder / path.name[5:]) for path in folder.glob("view_*")],

@@ -47,19 +47,6 @@ def folder(tmp_path, rig, paint):
     return tmp_path
 
 
-def save_mvsnet(folder, rig, factor=1.0):
-    (folder / "Cameras").mkdir()
-    for place in (1, 2, 3):
-        K = rig.intrinsics[place - 1].clone()
-        K[:2, 2] -= 0.5
-        K[:2] *= factor
-        rows = ["extrinsic"]
-        rows += [" ".join(str(float(x)) for x in row) for row in rig.cam_from_world[place - 1]]
-        rows += ["", "intrinsic"] + [" ".join(str(float(x)) for x in row) for row in K]
-        rows += ["", "425.0 2.5"]
-        (folder / "Cameras" / f"{place - 1:08d}_cam.txt").write_text("\n".join(rows) + "\n")
-
-
 def check_cameras(capture, rig):
     index = capture.position - 1
     assert_close(capture.cameras.cam_from_world, rig.cam_from_world[index].float())
@@ -76,23 +63,9 @@ def test_photographs_come_with_the_cameras_of_their_positions_and_the_scan(folde
     assert_close(capture.truth.points_world, torch.tensor([[1.0, 2, 3], [4, 5, 600]]))
 
 
-def test_mvsnets_cameras_serve_as_well(folder, rig):
-    for path in (folder / "Calibration" / "cal18").iterdir():
-        path.unlink()
-    (folder / "Calibration" / "cal18").rmdir()
-    save_mvsnet(folder, rig)
-    check_cameras(read_dtu_mvs(folder, 9), rig)
-
-
 def test_the_brightest_of_all_lights_is_read_when_asked_for(folder):
     capture = read_dtu_mvs(folder, 9, lights=[ALL_LIGHTS])
     assert capture.views.names == tuple(f"rect_{place:03d}_max.png" for place in (1, 2, 3))
-
-
-def test_one_light_a_position(folder):
-    capture = read_dtu_mvs(folder, 9, light_seed=0, positions=(1, 3))
-    assert capture.position.tolist() == [1, 3]
-    assert capture.light[0] != capture.light[1]
 
 
 def test_the_protocol_has_the_grid_of_the_files(folder):
@@ -103,40 +76,40 @@ def test_the_protocol_has_the_grid_of_the_files(folder):
     assert protocol.plane.tolist() == [0, 1, -2, 3]
 
 
-def test_cameras_for_mvsnets_small_training_copies_are_refused(folder, rig):
-    (folder / "Calibration" / "cal18").rename(folder / "Calibration" / "cal19")
-    save_mvsnet(folder, rig, factor=0.1)
-    with pytest.raises(InputError, match=r"1600 x 1200.*principal point at \(80, 60\)"):
-        read_dtu_mvs(folder, 9)
+def _matrices(folder):
+    arrays = {"ObsMask": np.eye(3), "BB": np.eye(3)[:2], "Res": 10.0}
+    scipy.io.savemat(folder / "ObsMask" / "ObsMask9_10.mat", arrays)
 
 
-def test_a_folder_without_cameras_is_told_both_kinds(folder):
-    (folder / "Calibration" / "cal18").rename(folder / "Calibration" / "cal19")
-    with pytest.raises(InputError, match=r"cal18/pos_001\.txt and so on, or Cameras/00000000_cam"):
-        read_dtu_mvs(folder, 9)
-
-
-@pytest.mark.parametrize("text", ["1 2 3", "0 " * 12, "a " * 12])
-def test_a_camera_file_with_something_else_is_refused(folder, text):
-    (folder / "Calibration" / "cal18" / "pos_002.txt").write_text(text)
-    with pytest.raises(InputError, match=r"pos_002\.txt"):
-        read_dtu_mvs(folder, 9)
+def _camera_of(text):
+    return lambda folder: (folder / "Calibration" / "cal18" / "pos_002.txt").write_text(text)
 
 
 @pytest.mark.parametrize(
-    ("read", "needed"),
+    ("spoil", "read", "scan", "needed"),
     [
-        (read_dtu_mvs, r"Rectified/scan2.*Found: Calibration"),
-        (read_dtu_protocol, r"ObsMask2_10\.mat.*Found: ObsMask9_10\.mat, Plane9\.mat"),
+        (_camera_of("1 2 3"), read_dtu_mvs, 9, r"pos_002\.txt.*12"),
+        (_camera_of("0 " * 12), read_dtu_mvs, 9, r"pos_002\.txt.*a matrix of rank 0"),
+        (_camera_of("a " * 12), read_dtu_mvs, 9, r"pos_002\.txt"),
+        (
+            lambda folder: (folder / "Calibration" / "cal18").rename(folder / "Cameras"),
+            read_dtu_mvs,
+            9,
+            r"cal18/pos_001\.txt and so on",
+        ),
+        (lambda folder: None, read_dtu_mvs, 2, r"Rectified/scan2.*Found: Calibration"),
+        (
+            lambda folder: None,
+            read_dtu_protocol,
+            2,
+            r"ObsMask2_10\.mat.*Found: ObsMask9_10\.mat, Plane9\.mat",
+        ),
+        (_matrices, read_dtu_protocol, 9, r"a grid as ObsMask.*3 x 3"),
     ],
 )
-def test_readers_refuse_a_scan_that_is_not_there(folder, read, needed):
+def test_another_layout_is_refused_by_what_was_expected_and_found(
+    folder, spoil, read, scan, needed
+):
+    spoil(folder)
     with pytest.raises(InputError, match=needed):
-        read(folder, 2)
-
-
-def test_read_dtu_protocol_refuses_a_matrix(folder):
-    matrices = {"ObsMask": np.eye(3), "BB": np.eye(3)[:2], "Res": 10.0}
-    scipy.io.savemat(folder / "ObsMask" / "ObsMask9_10.mat", matrices)
-    with pytest.raises(InputError, match=r"a grid as ObsMask.*3 x 3"):
-        read_dtu_protocol(folder, 9)
+        read(folder, scan)

@@ -67,18 +67,6 @@ def test_a_matrix_of_no_camera_is_refused(folder, matrix, needed):
         read_idr(folder)
 
 
-def test_a_skew_survives(capture, tmp_path, sees):
-    sheared = capture.cameras.intrinsics.clone()
-    sheared[:, 0, 1] = 5
-    write_idr(capture.views, capture.cameras.replace(intrinsics=sheared), tmp_path)
-    assert sees(read_idr(tmp_path)) == pytest.approx([10, 11])
-
-
-def test_views_without_masks_get_white_ones(capture, tmp_path):
-    write_idr(capture.views.replace(masks=None), capture.cameras, tmp_path)
-    assert torch.equal(read_idr(tmp_path).views.masks, capture.views.inside)
-
-
 def test_the_unit_sphere_holds_the_points(capture, tmp_path, generator):
     points = torch.tensor([3.0, -2, 7]) + torch.rand(50, 3, generator=generator)
     write_idr(capture.views, capture.cameras, tmp_path, points_world=points)

@@ -61,20 +61,6 @@ def test_subsets_are_kept_in_order_of_position_and_light():
     assert choose_photographs(position, light, folder, lights=[1]) == [1, 2]
 
 
-def test_lights_that_were_left_out_are_not_sampled_either():
-    position, light = grid(10, 7)
-    chosen = choose_photographs(
-        position.tolist(),
-        light.tolist(),
-        DataSetPath(Path("set"), "a set"),
-        positions=range(3, 9),
-        lights=(2, 5),
-        light_seed=3,
-    )
-    assert position[chosen].tolist() == list(range(3, 9))
-    assert set(light[chosen].tolist()) == {2, 5}
-
-
 @pytest.mark.parametrize(
     "asked", [{"positions": [4], "lights": None}, {"positions": None, "lights": [9]}]
 )

@@ -3,13 +3,11 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
 from pimper_torch.doors.exchange.nerfstudio import write_transforms
-from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.runtime.errors import InputError
 
 # `hand_camera`: columns are the camera's right, up (its down is the world's z), back, place.
@@ -127,11 +125,6 @@ def test_a_frame_of_anything_else_is_refused(save, more, needed):
         read_transforms(save(files=("images/a.png",), **more))
 
 
-def test_a_folder_without_the_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"transforms\.json or transforms_train\.json"):
-        read_transforms(tmp_path)
-
-
 def test_intrinsics_shared_by_all_views_stand_once(capture, tmp_path):
     write_transforms(capture.views.take([0]), capture.cameras.take([0]), tmp_path / "one")
     said = json.loads((tmp_path / "one" / "transforms.json").read_text())
@@ -141,11 +134,3 @@ def test_intrinsics_shared_by_all_views_stand_once(capture, tmp_path):
     said = json.loads((tmp_path / "two" / "transforms.json").read_text())
     assert "fl_x" not in said
     assert [frame["w"] for frame in said["frames"]] == [16, 13]
-
-
-def test_a_cloud_is_written_beside(capture, tmp_path):
-    points = torch.tensor([[1.0, 2, 3], [4, 5, 7]])
-    write_transforms(capture.views, capture.cameras, tmp_path, points_world=points)
-    assert json.loads((tmp_path / "transforms.json").read_text())["ply_file_path"]
-    read = read_mesh(tmp_path / "sparse_pc.ply")
-    assert_close(read.vertices_world, points.double())

@@ -5,7 +5,7 @@ from pimper_bench.metrics import (
     compare_albedo,
     compare_along_rays,
 )
-from pimper_bench.metrics.surface_distances import joined
+from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.truth import Truth
 from pimper_torch.ground.geometry.visibility import cast_view
 from pimper_torch.runtime.errors import InputError
@@ -83,8 +83,8 @@ def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
     half = half_of(ball)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
     alone = compare_along_rays(half, capture, 0)
-    found = compare_along_rays(joined(half, table), capture, 0)
-    unknown = compare_along_rays(joined(half, table), make.capture_of(ball, cameras=cameras), 0)
+    found = compare_along_rays(join(half, table), capture, 0)
+    unknown = compare_along_rays(join(half, table), make.capture_of(ball, cameras=cameras), 0)
     assert 0.4 < alone.coverage < 0.8
     assert found.coverage == alone.coverage
     assert found.relative_error == pytest.approx(alone.relative_error, abs=1e-6)
@@ -96,11 +96,11 @@ def test_a_surface_behind_the_true_one_is_no_table(make):
     ball, table, cameras = on_a_table(make)
     small = ball.replace(vertices_world=0.9 * ball.vertices_world)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
-    found = compare_along_rays(joined(small, table), capture, 0)
+    found = compare_along_rays(join(small, table), capture, 0)
     alone = compare_along_rays(small, capture, 0)
     assert found.coverage == alone.coverage
     raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
-    before = compare_along_rays(joined(ball, raised), capture, 0)
+    before = compare_along_rays(join(ball, raised), capture, 0)
     assert before.coverage == 1.0  # in front of the object it is an error, not a miss
 
 
