@@ -1,7 +1,11 @@
 """Parts of scenes that tests in several rooms change."""
 
+from pathlib import Path
+
 import torch
 
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.topology import half_edges
@@ -28,6 +32,19 @@ def from_above(focal_px, width, height):
     """A camera that looks at the origin from 5 along z, y up."""
     pose = look_at(torch.tensor([[0.0, 0, 5]]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
     return pinholes(pose, focal_px, width, height)
+
+
+def ball(radius=1.0, level=3, center=(0.0, 0.0, 0.0)):
+    """A ball of ``20 * 4**level`` faces; a radius along each axis makes it an ellipsoid."""
+    vertices, faces = icosphere(level)
+    placed = vertices * vertices.new_tensor(radius) + vertices.new_tensor(center)
+    return Mesh(vertices_world=placed, faces=faces)
+
+
+def write_ball(path: Path, *shape, **options) -> Path:
+    """Write a ball as PLY."""
+    write_ply(ball(*shape, **options), path)
+    return path
 
 
 def observing(scene, kept):

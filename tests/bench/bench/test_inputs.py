@@ -3,24 +3,21 @@
 import time
 
 import pytest
+from scenes import write_ball
 
 from pimper_bench.bench.bench_inputs import BenchConfig, prepare
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.method.sfm import reconstruct
 from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.records import Mesh
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered")
-    vertices, faces = icosphere(2)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
     settings = SceneConfig(num_views=6, width=64, height=48, supersample=1)
-    return render_scene(str(folder / "ball.ply"), folder / "scene", settings, processes=1)
+    path = write_ball(folder / "ball.ply", level=2)
+    return render_scene(path, folder / "scene", settings, processes=1)
 
 
 def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run(

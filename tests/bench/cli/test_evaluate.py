@@ -3,9 +3,9 @@ import json
 import pytest
 import torch
 from PIL import Image
+from scenes import write_ball
 
 from pimper_bench.cli.evaluate import named_as
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture, Truth
@@ -20,26 +20,20 @@ def run(*arguments):
     return main(["evaluate", *map(str, arguments)])
 
 
-def sphere(path, radius, level=3):
-    vertices, faces = icosphere(level)
-    write_ply(Mesh(vertices_world=radius * vertices, faces=faces), path)
-    return path
-
-
 @pytest.fixture
 def ball(tmp_path):
-    return sphere(tmp_path / "ball.ply", 1.0)
+    return write_ball(tmp_path / "ball.ply", 1.0)
 
 
 @pytest.fixture(scope="module")
 def rendering(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered")
     config = SceneConfig(num_views=3, width=50, height=36, supersample=1)
-    return render_scene(sphere(folder / "ball.ply", 1.0), folder / "out", config, processes=1)
+    return render_scene(write_ball(folder / "ball.ply", 1.0), folder / "out", config, processes=1)
 
 
 def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
-    larger = sphere(tmp_path / "larger.ply", 1.1)
+    larger = write_ball(tmp_path / "larger.ply", 1.1)
     assert run(larger, ball, "--samples", 3000) == 0
     told = capsys.readouterr().out
     assert "none: the frames are taken for the same" in told
@@ -64,7 +58,7 @@ def test_how_near_a_result_comes_to_photographs_is_told(ball, reconstruction, tm
 
 
 def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsys):
-    larger = sphere(tmp_path / "larger.ply", 1.1)
+    larger = write_ball(tmp_path / "larger.ply", 1.1)
     out = tmp_path / "report.json"
     options = ["--alignment", "icp", "--trimmed-fraction", 0.1]
     assert run(larger, ball, "--samples", 3000, *options, "-o", out) == 0
@@ -90,7 +84,7 @@ def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
 
 
 def test_expected_error_is_compared_with_the_true_one(ball, tmp_path):
-    larger = sphere(tmp_path / "larger.ply", 1.1)
+    larger = write_ball(tmp_path / "larger.ply", 1.1)
     out = tmp_path / "report.json"
     mesh = read_mesh(larger)
     told = mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2]))
@@ -105,7 +99,7 @@ def test_only_what_evaluate_wrote_is_replaced_and_only_on_demand(ball, tmp_path,
     mesh = read_mesh(ball)
     write_ply(mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2])), ball)
     out = tmp_path / "report.json"
-    larger = sphere(tmp_path / "larger.ply", 1.1)
+    larger = write_ball(tmp_path / "larger.ply", 1.1)
     both = ["-o", out, "--samples"]
     assert run(ball, larger, *both, 3000) == 0
     first = out.read_bytes()
@@ -179,7 +173,7 @@ def test_what_each_figure_says_stands_beside_it_where_there_is_room(ball, monkey
 
 
 def test_a_result_is_judged_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
-    result, out = sphere(tmp_path / "result.ply", 10.5, level=4), tmp_path / "report.json"
+    result, out = write_ball(tmp_path / "result.ply", 10.5, level=4), tmp_path / "report.json"
     options = ["--truth-layout", "dtu-mvs", "--scan", 9, "--samples", 3000, "-o", out]
     assert run(result, dtu, *options) == 0
     report = json.loads(out.read_text())["dtu"]

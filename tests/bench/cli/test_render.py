@@ -2,20 +2,16 @@ import json
 
 import pytest
 import torch
+from scenes import write_ball
 from torch.testing import assert_close
 
 from pimper_bench.datasets.rendered import read_rendered
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.records import Mesh
 
 
 @pytest.fixture
 def ball(tmp_path):
-    vertices, faces = icosphere(2)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
-    return tmp_path / "ball.ply"
+    return write_ball(tmp_path / "ball.ply", level=2)
 
 
 def render(scene, out, *options):
@@ -37,26 +33,9 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
     assert "photographs 2" in told.err
 
 
-def test_a_room_and_a_point_light_stand_still_on_demand_and_only_where_the_object_turns(
-    ball, tmp_path, capsys
-):
-    options = ("--fixed-point-light", "--fixed-room", "--fixed-table")
-    assert render(ball, tmp_path / "out", *options) == 2
+def test_settings_that_exclude_one_another_are_told_in_a_sentence(ball, tmp_path, capsys):
+    assert render(ball, tmp_path / "out", "--fixed-point-light") == 2
     assert "fixed_point_light is True; needed: path turntable" in capsys.readouterr().err
-    assert render(ball, tmp_path / "out", "--path", "turntable", *options) == 0
-    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
-    assert all(settings[name] for name in ("fixed_point_light", "fixed_room", "fixed_table"))
-
-
-def test_an_object_is_turned_over_on_demand_and_not_before_a_room(ball, tmp_path, capsys):
-    turned = ("--turned-over", "--path", "turntable", "--num-views", "2")
-    assert render(ball, tmp_path / "out", "--fixed-room", *turned) == 2
-    assert "turned_over is True; needed: 2 views or more" in capsys.readouterr().err
-    assert render(ball, tmp_path / "out", *turned) == 0
-    capture = read_rendered(tmp_path / "out")
-    assert capture.truth.surroundings is None  # elsewhere in the second half
-    below = capture.cameras.centers_world[:, 2] < capture.truth.mesh.vertices_world[:, 2].mean()
-    assert below.tolist() == [False, True]
 
 
 def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_path):

@@ -2,16 +2,14 @@ import json
 import shutil
 
 import pytest
+from scenes import write_ball
 from torch.testing import assert_close
 
 from pimper_bench.datasets.rendered import read_rendered
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 
 CONFIG = SceneConfig(num_views=3, width=50, height=36, supersample=1, specular=0.05)
@@ -19,10 +17,7 @@ CONFIG = SceneConfig(num_views=3, width=50, height=36, supersample=1, specular=0
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    path = tmp_path_factory.mktemp("meshes") / "ball.ply"
-    vertices, faces = icosphere(3)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), path)
-    return path
+    return write_ball(tmp_path_factory.mktemp("meshes") / "ball.ply")
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
-import pytest
 import torch
+from scenes import ball
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere, join, potato, table
+from pimper_bench.scenes.procedural_meshes import potato, table
 from pimper_bench.scenes.render_in_memory import (
     Sphere,
     render_objects,
@@ -16,8 +16,6 @@ from pimper_bench.scenes.textures import random_speckle
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.topology import half_edges
-from pimper_torch.records import Mesh
-from pimper_torch.runtime.errors import ConfigError
 
 QUIET = SensorConfig(supersample=1, read_noise=0.0, shot_noise=0.0)
 
@@ -38,11 +36,6 @@ def point_light(position, **changes):
 
 def above(width=31, height=31):
     return arc_cameras(1, width=width, height=height, focal_px=60.0, distance=5.0, span_deg=0.0)
-
-
-def ball(center, radius, subdivisions=4):
-    vertices, faces = icosphere(subdivisions)
-    return Mesh(vertices_world=vertices * radius + vertices.new_tensor(center), faces=faces)
 
 
 def test_closed_forms_obey_first_order_lighting_exactly(cameras, generator):
@@ -89,7 +82,7 @@ def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_
 def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
     objects = [
         SceneObject(mesh=table(3.0), texture=white),
-        SceneObject(mesh=ball((1.0, 0.0, 1.0), 0.3), texture=white, surroundings=True),
+        SceneObject(mesh=ball(0.3, 4, (1.0, 0.0, 1.0)), texture=white, surroundings=True),
     ]
     # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
     lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
@@ -155,7 +148,7 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
     )
     texture = random_speckle(generator, cells=(0.5,))
     traced = render_objects(
-        [SceneObject(mesh=ball((0.0, 0.0, 0.0), 1.0, subdivisions=6), texture=texture)],
+        [SceneObject(mesh=ball(level=6), texture=texture)],
         cameras,
         far,
         generator,
@@ -225,16 +218,3 @@ def test_a_potato_is_closed_rests_on_the_table_and_depends_on_its_seed_only():
     assert_close(first.vertices_world, again.vertices_world)
     other = potato(torch.Generator().manual_seed(71), subdivisions=3)
     assert (first.vertices_world - other.vertices_world).norm(dim=1).mean() > 0.01
-
-
-def test_joined_meshes_keep_their_triangles():
-    one, two = table(1.0), ball((0.0, 0.0, 2.0), 0.5, subdivisions=1)
-    both = join(one, two)
-    corners = both.vertices_world[both.faces]
-    assert_close(corners[:2], one.vertices_world[one.faces])
-    assert_close(corners[2:], two.vertices_world[two.faces])
-
-
-def test_a_sensor_without_rays_is_refused():
-    with pytest.raises(ConfigError, match="supersample is 0"):
-        SensorConfig(supersample=0)

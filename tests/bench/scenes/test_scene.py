@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import ball, write_ball
 from scipy.spatial import KDTree
 from torch.testing import assert_close
 
@@ -28,10 +29,7 @@ SMALL = SceneConfig(num_views=5, width=80, height=60)
 @pytest.fixture
 def egg(tmp_path):
     """A closed mesh, far from the origin, twice as long along y as across."""
-    vertices, faces = icosphere(2)
-    vertices = vertices * vertices.new_tensor([1.0, 2.0, 1.0]) + vertices.new_tensor([9.0, 5, 7])
-    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "egg.ply")
-    return tmp_path / "egg.ply"
+    return write_ball(tmp_path / "egg.ply", (1.0, 2.0, 1.0), level=2, center=(9.0, 5.0, 7.0))
 
 
 def test_the_object_fills_every_picture_and_leaves_none(egg):
@@ -111,13 +109,13 @@ def test_a_uniform_albedo_replaces_the_texture_of_the_object_alone(egg):
     assert_close(plain.lights.positions_world, textured.lights.positions_world)
 
 
-def test_a_patterned_table_has_more_contrast_than_a_cloth(egg):
+def test_a_patterned_table_has_more_contrast_than_a_cloth_and_a_plain_one_has_none(egg):
     def contrast(table):
         scene = build_scene(egg, SceneConfig(num_views=2, width=40, height=30, table=table))
         albedo = scene.surroundings_mesh.albedo
         return float((albedo.std(dim=0) / albedo.mean(dim=0)).min())
 
-    assert contrast("patterned") > 2 * contrast("cloth")
+    assert contrast("patterned") > 2 * contrast("cloth") > contrast("plain") == 0
 
 
 def test_an_object_turns_counter_clockwise_with_its_texture(egg):
@@ -175,17 +173,19 @@ def test_a_seed_decides_everything(egg):
     assert len(draws) == 5
 
 
-def test_a_name_that_is_no_scene_is_refused_with_those_there_are():
-    with pytest.raises(InputError, match=r"no scene 'jug'.*mug, jar, balls, potatoes"):
-        build_scene("jug", SMALL)
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("jug", r"no scene 'jug'.*mug, jar, balls, potatoes"), ("cloud.ply", "without faces")],
+)
+def test_what_is_no_object_is_refused(tmp_path, monkeypatch, name, words):
+    monkeypatch.chdir(tmp_path)
+    points = ball(level=1)
+    write_ply(points.replace(faces=points.faces[:0]), tmp_path / "cloud.ply")
+    with pytest.raises(InputError, match=words):
+        build_scene(name, SMALL)
 
 
-def test_a_cloud_without_faces_is_refused(tmp_path):
-    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
-    points = "property float z\nend_header\n0 0 0\n1 0 0\n0 1 1\n"
-    (tmp_path / "cloud.ply").write_text(header + points)
-    with pytest.raises(InputError, match="without faces"):
-        build_scene(tmp_path / "cloud.ply", SMALL)
+BEFORE = ("fixed_point_light", "fixed_room", "fixed_table")
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,21 @@ def test_a_cloud_without_faces_is_refused(tmp_path):
         ({"irradiance": 0.0, "ambient": 0.0}, "some light"),
         ({"point_light_distance": 0.5}, "point_light_distance is 0.5"),
         ({"exposure": 0.0}, "exposure is 0.0"),
+        ({"supersample": 0}, "supersample is 0"),
         ({"albedo": (0.5, 0.5, 1.5)}, "albedo is"),
+        *(({name: True}, f"{name} is True.*turntable instead of arc") for name in BEFORE),
+        (
+            {"path": "turntable", "constant_light": True, "fixed_point_light": True},
+            r"constant_light is True.*no fixed_point_light",
+        ),
+        (
+            {"path": "turntable", "turned_over": True, "fixed_room": True},
+            "turned_over is True; needed: 2 views or more",
+        ),
+        (
+            {"width": 80, "height": 60, "pan_jitter_px": 9.0, "crop_jitter_px": 10.0},
+            r"pan_jitter_px is 9.*at most 18",
+        ),
     ],
 )
 def test_settings_that_give_no_photographs_are_refused(setting, words):
@@ -279,15 +293,11 @@ _MUG_MESH = scene_objects.mug_mesh
 
 def test_no_ball_cuts_another():
     made = scene_objects.balls(torch.Generator().manual_seed(1))
-    centres = [item.mesh.vertices_world.mean(dim=0) for item in made]
-    radii = [
-        float((item.mesh.vertices_world[0] - centre).norm())
-        for item, centre in zip(made, centres, strict=True)
-    ]
-    for first in range(len(made)):
-        for second in range(first):
-            distance = float((centres[first] - centres[second]).norm())
-            assert distance > radii[first] + radii[second] - 1e-3
+    corners = [item.mesh.vertices_world for item in made]
+    centres = torch.stack([vertices.mean(dim=0) for vertices in corners])
+    radii = (torch.stack([vertices[0] for vertices in corners]) - centres).norm(dim=1)
+    gaps = torch.cdist(centres, centres) - radii - radii[:, None]
+    assert gaps[~torch.eye(len(made), dtype=torch.bool)].min() > -1e-3
 
 
 def test_no_potato_cuts_another():

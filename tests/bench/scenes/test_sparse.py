@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_bench.scenes.render_in_memory import EndlessPlane, Sphere, render_shape
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
@@ -61,14 +61,6 @@ def test_rays_through_noiseless_pixels_meet_in_their_points(generator):
     pixels = pixels.movedim(0, 1).clone()
     pixels[:10, 0] = -1e4  # unseen, so it must not count
     assert_close(triangulate_rays(cameras, pixels, seen), points)
-
-
-def test_a_plane_fills_all_views_with_points(generator):
-    cameras = arc_cameras(4, width=40, height=30, focal_px=50.0, distance=4.0, span_deg=20.0)
-    lights = torch.ones(4, 4, dtype=torch.float64)
-    scene = render_shape(EndlessPlane(), cameras, lights, random_speckle(generator))
-    sparse = exact_cloud(scene, 100, generator)
-    assert_close(sparse.points_world[:, 2], torch.zeros(100, dtype=torch.float64))
 
 
 def test_a_cloud_is_single_precision_as_structure_from_motion_gives_it(scene, generator):

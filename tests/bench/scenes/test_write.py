@@ -4,20 +4,15 @@ import json
 import numpy as np
 import pytest
 import torch
+from scenes import write_ball
 from torch.testing import assert_close
 
 from pimper_bench.datasets.rendered import read_rendered
-from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.rendered_folder import render_scene, unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.radiometry import LINEAR
 from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError, OutputError, PimperWarning
 
 SMALL = SceneConfig(num_views=3, width=48, height=36, supersample=1)
@@ -25,10 +20,7 @@ SMALL = SceneConfig(num_views=3, width=48, height=36, supersample=1)
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    path = tmp_path_factory.mktemp("meshes") / "ball.ply"
-    vertices, faces = icosphere(3)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), path)
-    return path
+    return write_ball(tmp_path_factory.mktemp("meshes") / "ball.ply")
 
 
 @pytest.fixture(scope="module")
@@ -50,32 +42,6 @@ def test_a_rendering_holds_what_it_says(rendering):
         assert held == [f"view_{view:03d}.{suffix}" for view in range(3)]
     report = json.loads((rendering / "truth" / "scene.json").read_text())
     assert report["settings"]["width"] == 48
-
-
-def test_photographs_and_masks_are_those_of_the_frames(rendering, ball):
-    scene = build_scene(ball, SMALL)
-    views = load_views(rendering / "photos", masks=rendering / "masks")
-    stage = TracedObjects(scene.objects)
-    for view in range(3):
-        frame = render_frame(
-            stage, scene.cameras, scene.lights, view, scene.noise(view), SMALL.sensor
-        )
-        # Half a byte, where sRGB is steepest: 2.4 / 1.055 of it.
-        assert_close(views.images[view], frame.image, atol=0.5 / 255 * 2.4, rtol=0)
-        assert_close(views.masks[view], frame.foreground)
-
-
-def test_deep_linear_photographs_are_read_back_to_the_last_bit(ball, tmp_path):
-    config = SceneConfig(
-        num_views=3, width=32, height=24, bits=16, encoding="linear", supersample=1
-    )
-    render_scene(ball, tmp_path / "deep", config, processes=1)
-    views = load_views(tmp_path / "deep" / "photos", encoding=LINEAR)
-    scene = build_scene(ball, config)
-    frame = render_frame(
-        TracedObjects(scene.objects), scene.cameras, scene.lights, 1, scene.noise(1), config.sensor
-    )
-    assert_close(views.images[1], frame.image, atol=0.51 / 65535, rtol=0)
 
 
 def test_true_points_lie_on_the_surface_that_the_maps_show(rendering):
