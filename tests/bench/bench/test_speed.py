@@ -33,14 +33,6 @@ def told(stage, **figures):
     return StageReport(name=stage, seconds=0.0, peak_memory_mb=0.0, figures=figures)
 
 
-def test_exponents_are_those_of_the_power_law(speed):
-    sizes = [10.0, 20.0, 40.0]
-    assert_close(speed.exponent(sizes, [3 * size**1.5 for size in sizes]), 1.5)
-    assert_close(speed.exponent(sizes, [7.0, 7.0, 7.0]), 0.0)
-    assert math.isnan(speed.exponent(sizes, [1.0, 0.0, 1.0]))
-    assert math.isnan(speed.exponent([5.0, 5.0, 5.0], [1.0, 2.0, 3.0]))
-
-
 def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
     first, other, again = (
         speed.Cost(stage=stage, seconds=2, cpu_seconds=3, page_faults=5, peak_mb=peak)
@@ -78,16 +70,6 @@ def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
     assert outer.peak_mb - inner.peak_mb > 250
     assert outer.page_faults > inner.page_faults
     assert outer.seconds > inner.seconds > 0
-
-
-def test_each_round_has_the_floor_of_its_own_samples(speed):
-    names = ("reconstruct", "warp", "factorize", "sweep", "warp", "extract")
-    costs = [speed.Cost(stage=name, seconds=1, cpu_seconds=1, page_faults=0) for name in names]
-    floors = {"copy_gb_per_s": 13.0, "batched_product_gflop_per_s": 64.0, "colmap_seconds": 7.0}
-    found = speed.with_floors(costs, floors, [1e9, 4e9])
-    floor = [cost.floor_seconds for cost in found]
-    assert floor[:5] == [7.0, 1.0, 1.0, 1.0, 4.0]
-    assert math.isnan(floor[5])
 
 
 @pytest.mark.usefixtures("small_pictures")

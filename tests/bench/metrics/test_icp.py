@@ -6,7 +6,6 @@ from torch.testing import assert_close
 
 from pimper_bench.metrics import align_estimate, trimmed_icp
 from pimper_bench.metrics.similarity import rotation_angles_deg, split_similarity
-from pimper_bench.truth import Truth
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.records import Estimate, Mesh
 from pimper_torch.runtime.errors import InputError
@@ -62,21 +61,6 @@ def test_a_known_similarity_is_found_among_a_third_of_outliers(generator, make):
     assert scale < 1e-6
     assert angle < 6e-5
     assert shift < 1e-6
-
-
-def test_a_truth_that_lacks_half_needs_that_half_trimmed(generator, make):
-    whole = make.potato(level=3)
-    centre = whole.vertices_world[whole.faces].mean(dim=1)
-    half = whole.replace(faces=whole.faces[centre[:, 2] > 0])
-    known = known_similarity(make, generator, angle_deg=4.0, scale=1.03)
-    estimate = make.moved(whole, torch.linalg.inv(known))
-    settings = dict(trimmed_fraction=0.6, **FEW)
-    found = fitted(estimate, half, torch.eye(4).double(), generator=generator, **settings)
-    scale, angle, shift = error_of(found.truth_from_world, known)
-    assert found.converged
-    assert found.residual < 1e-5
-    assert max(scale, shift) < 1e-4
-    assert angle < 1e-2
 
 
 def test_a_blown_up_sphere_is_brought_to_size_and_not_turned(generator, make):
@@ -141,12 +125,6 @@ def test_without_cameras_nothing_is_aligned_and_that_is_told(generator, make):
     assert torch.equal(found.truth_from_world, torch.eye(4).double())
     with pytest.raises(InputError, match="0 views have a camera in both"):
         aligned(make, generator, "cameras", cameras_there=False)
-
-
-def test_icp_without_a_true_surface_is_refused(generator, make):
-    estimate = Estimate(mesh=make.square())
-    with pytest.raises(InputError, match="neither a mesh nor points"):
-        align_estimate(estimate, make.capture(Truth()), "icp", generator=generator)
 
 
 @pytest.mark.parametrize("angle_deg", [1e-7, 30.0, 179.9999])

@@ -8,7 +8,6 @@ from pimper_bench.metrics import (
 from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.truth import Truth
 from pimper_torch.ground.geometry.visibility import cast_view
-from pimper_torch.runtime.errors import InputError
 
 
 def with_maps(make, truth, cameras):
@@ -102,13 +101,6 @@ def test_a_surface_behind_the_true_one_is_no_table(make):
     raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
     before = compare_along_rays(join(ball, raised), capture, 0)
     assert before.coverage == 1.0  # in front of the object it is an error, not a miss
-
-
-def test_a_mesh_of_the_table_alone_is_refused(make):
-    ball, table, cameras = on_a_table(make)
-    capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
-    with pytest.raises(InputError, match="lies on the surroundings"):
-        compare_along_rays(table, capture, 0)
 
 
 def test_nothing_is_compared_where_nothing_is_known(make):

@@ -8,30 +8,12 @@ from pimper_bench.metrics import (
     similarity_between_points,
 )
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.records import Cameras
 from pimper_torch.runtime.errors import InputError
 
 
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(81)
-
-
-def random_rotation(generator):
-    Q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
-    return Q * torch.linalg.det(Q)
-
-
-def transferred(cameras: Cameras, target_from_source, scale, rotation) -> Cameras:
-    centers = transform(target_from_source, cameras.centers_world)
-    rotated = cameras.cam_from_world[:, :3, :3] @ rotation.mT
-    return cameras.replace(cam_from_world=rigid(rotated, -(rotated @ centers[..., None])[..., 0]))
-
-
-def test_points_transferred_by_a_similarity_are_transferred_back(generator):
-    rotation = random_rotation(generator)
+def test_points_transferred_by_a_similarity_are_transferred_back(make, generator):
+    rotation = make.rotation(generator)
     known = rigid(2.5 * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
     points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     assert_close(similarity_between_points(points, transform(known, points)), known)
@@ -60,47 +42,43 @@ def test_mirrored_points_still_get_a_rotation(generator):
 
 
 @pytest.mark.parametrize("num_views", [2, 3, 12])
-def test_cameras_on_an_arc_are_transferred_back_however_few_they_are(generator, num_views):
+def test_cameras_on_an_arc_are_transferred_back_however_few_they_are(make, generator, num_views):
     truth = arc_cameras(num_views, width=64, height=48, focal_px=70.0, distance=4.0, sway_deg=0.0)
-    rotation = random_rotation(generator)
-    known = rigid(0.2 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
-    ours = transferred(truth, known, 0.2, rotation)
+    rotation, shift = make.rotation(generator), torch.tensor([0.4, 5.0, -1.0]).double()
+    known = rigid(0.2 * rotation, shift)
+    ours = make.transferred(truth, 0.2, rotation, shift)
     found = similarity_between_cameras(ours, truth)
     assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
 
 
-def test_cameras_in_a_row_leave_no_rotation_open(generator):
-    eyes = torch.stack([torch.tensor([x, 0.0, 5.0]).double() for x in (-1.0, 0.0, 1.0)])
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    truth = pinholes(look_at(eyes, torch.zeros(3, dtype=torch.float64), up), 70.0, 64, 48)
-    rotation = random_rotation(generator)
-    known = rigid(3.0 * rotation, torch.tensor([0.4, 5.0, -1.0], dtype=torch.float64))
-    found = similarity_between_cameras(transferred(truth, known, 3.0, rotation), truth)
-    assert_close(found @ known, torch.eye(4, dtype=torch.float64), atol=1e-10, rtol=0)
+def _arc(count):
+    return arc_cameras(count, width=64, height=48, focal_px=70.0, distance=4.0)
 
 
-def test_cameras_in_one_position_do_not_tell_the_scale():
-    arc = arc_cameras(2, width=64, height=48, focal_px=70.0, distance=4.0)
-    same = arc.replace(cam_from_world=arc.cam_from_world[[0, 0]])
-    with pytest.raises(InputError, match="scale"):
-        similarity_between_cameras(same, arc)
+def _facing(centers, facing):
+    return rigid(facing, -(facing @ centers[..., None])[..., 0])
 
 
-def test_cameras_that_no_similarity_brings_nearer_are_refused():
-    truth = arc_cameras(5, width=64, height=48, focal_px=70.0, distance=4.0)
-    facing = truth.cam_from_world[:1, :3, :3].expand(5, 3, 3)
-    ours, turned = (
-        truth.replace(cam_from_world=rigid(facing, -(facing @ centers[..., None])[..., 0]))
-        for centers in (-truth.centers_world, truth.centers_world)
+def _mirrored(cameras):
+    """Cameras that all look one way, and the same at the opposite places."""
+    facing = cameras.cam_from_world[:1, :3, :3].expand(5, 3, 3)
+    centers = cameras.centers_world
+    return (
+        cameras.replace(cam_from_world=_facing(places, facing)) for places in (-centers, centers)
     )
-    with pytest.raises(InputError, match="nothing in common"):
-        similarity_between_cameras(ours, turned)
 
 
-def test_unequal_numbers_of_cameras_are_refused():
-    two, three = (arc_cameras(n, width=64, height=48, focal_px=70.0, distance=4.0) for n in (2, 3))
-    with pytest.raises(InputError, match="2 cameras and 3 true ones"):
-        similarity_between_cameras(two, three)
+@pytest.mark.parametrize(
+    ("cameras", "told"),
+    [
+        (lambda: (_arc(2).take([0, 0]), _arc(2)), "nothing tells the scale"),
+        (lambda: _mirrored(_arc(5)), "nothing in common"),
+        (lambda: (_arc(2), _arc(3)), "2 cameras and 3 true ones"),
+    ],
+)
+def test_cameras_that_determine_no_similarity_are_refused(cameras, told):
+    with pytest.raises(InputError, match=told):
+        similarity_between_cameras(*cameras())
 
 
 def test_views_are_paired_by_name():
