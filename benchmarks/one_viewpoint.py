@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_bench.datasets.diligent import FLIP, decoded_normals, directed_lights
+from pimper_bench.datasets.diligent import FLIP, directed_lights, facing_us
 from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath, contents
+from pimper_torch.doors.io.decode import decode
 from pimper_torch.doors.io.photographs import read_mask
 from pimper_torch.ground.radiometry import LINEAR
 from pimper_torch.records import Record, Views
@@ -165,7 +166,9 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     for name in ("normal_map.png", "mask.png"):
         root.expect((root.path / name).is_file(), name)
     mask = read_mask(root.path / "mask.png")
-    normals = decoded_normals(root.inner("normal_map.png"))
+    coloured = decode(root.path / "normal_map.png").samples  # (n + 1) / 2, y up
+    root.expect(coloured.shape[0] == 3, "normals as red, green and blue", "one channel")
+    normals = facing_us(coloured.movedim(0, -1) * 2 - 1)
     _same_shape(normals.shape[:2], mask.shape, root, "normal_map.png")
     K_file, depth_file = root.inner("K.txt"), root.inner("depth_gt.npz")
     K = None

@@ -4,7 +4,7 @@ Where a folder is laid out otherwise, or a file is missing or damaged, a reader 
 :class:`~pimper_torch.runtime.errors.InputError`, which says what was expected and what was found.
 """
 
-from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
+from pimper_bench.datasets.diligent import read_diligent_mv
 from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_points, read_dtu_protocol
 from pimper_bench.datasets.formats import (
     read_camera_file,
@@ -23,7 +23,6 @@ __all__ = [
     "one_light_per_position",
     "read_camera_file",
     "read_colmap",
-    "read_diligent",
     "read_diligent_mv",
     "read_dtu_mvs",
     "read_dtu_points",

@@ -1,55 +1,26 @@
-"""DiLiGenT and DiLiGenT-MV: objects under 96 lights, from one viewpoint or twenty."""
+"""DiLiGenT-MV: objects from twenty viewpoints, under 96 lights each."""
 
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.datasets.raster import nearest
-from pimper_bench.datasets.sampling import CamerasOf, LightOptions, Shot, read_shots
+from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
-from pimper_torch.doors.io.decode import decode
 from pimper_torch.doors.io.meshes import read_mesh
 
-_ONE_VIEW, _MANY_VIEWS = "DiLiGenT", "DiLiGenT-MV"
 # Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 _VIEW = re.compile(r"view_(\d{2})")
-
-
-def read_diligent(folder: Path | str, **options: Unpack[LightOptions]) -> Capture:
-    """Read an object of DiLiGenT: one viewpoint, 96 lights, true normals.
-
-    ``folder`` is the object's, such as ``pmsData/bearPNG``::
-
-        001.png ... 096.png              16 bits, linear
-        filenames.txt                    their order; 001.png and so on where it is absent
-        light_directions.txt, light_intensities.txt, mask.png
-        Normal_gt.mat                    or Normal_gt.png, 8 or 16 bits
-
-    The camera was far away and is taken for orthographic, so there are no cameras, and the
-    world is the camera's frame: x right, y down, z forward. The files' light directions and
-    normals have y up and z towards the viewer and are turned. The first 20 photographs of
-    ``bearPNG`` are known to be faulty; leave them out by ``lights=range(21, 97)``.
-
-    Args:
-        options: See :func:`~pimper_bench.datasets.sampling.read_shots`; lights count
-            from 1.
-
-    Source: Shi, Mo, Wu, Duan, Yeung & Tan, A Benchmark Dataset and Evaluation for Non-Lambertian
-    and Uncalibrated Photometric Stereo, PAMI 41(2), 2019.
-    """
-    root = DataSetPath(Path(folder), _ONE_VIEW)
-    return _capture(root, {1: root}, None, options)
 
 
 def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Capture:
@@ -78,7 +49,7 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
     Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
     layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
     """
-    root = DataSetPath(Path(folder), _MANY_VIEWS)
+    root = DataSetPath(Path(folder), "DiLiGenT-MV")
     root.expect(root.path.is_dir(), "an object's folder such as mvpmsData/bearPNG")
     folders = {
         int(match[1]): root.inner(path)
@@ -87,44 +58,15 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
     }
     root.expect(bool(folders), "folders view_01, view_02 and so on")
     calibration, mesh = root.inner("Calib_Results.mat"), root.path / "mesh_Gt.ply"
-    capture = _capture(
+    shots = [shot for view, inner in folders.items() for shot in _shots(view, inner, root)]
+    found = read_shots(
+        shots,
         root,
-        folders,
         lambda views: decompose_projections(read_toolbox_projections(calibration, views)),
-        options,
+        **options,
     )
-    read = read_mesh(mesh) if mesh.is_file() else None
-    return capture.replace(truth=capture.truth.replace(mesh=read))
-
-
-def decoded_normals(file: DataSetPath) -> Float[Tensor, "height width 3"]:
-    """Read normals kept as colours ``(n + 1) / 2``, y up, into our camera frame."""
-    samples = decode(file.path).samples
-    file.expect(samples.shape[0] == 3, "normals as red, green and blue", "one channel")
-    return _faced(samples.movedim(0, -1) * 2 - 1)
-
-
-def directed_lights(
-    directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
-) -> Float[Tensor, "view 4"]:
-    """Return the first-order light of distant point lights without any ambient light."""
-    directed = strength[:, None] * directions_world
-    return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
-
-
-def _capture(
-    root: DataSetPath,
-    folders: Mapping[int, DataSetPath],
-    cameras: CamerasOf | None,
-    options: LightOptions,
-) -> Capture:
-    """Read photographs of some viewpoints, with lights and normals in the world."""
-    shots = [shot for view, folder in folders.items() for shot in _shots(view, folder, root)]
-    found = read_shots(shots, root, cameras, **options)
     views, position = found.capture.views, found.capture.position
-    eye = torch.eye(4, dtype=torch.float64).expand(len(position), 4, 4)
-    poses = eye if found.cam_from_world is None else found.cam_from_world
-    world_from_cam = poses[:, :3, :3].mT
+    world_from_cam = found.cam_from_world[:, :3, :3].mT
     directions = [shot.direction for shot in found.chosen if shot.direction is not None]
     strength = torch.tensor([shot.strength for shot in found.chosen], dtype=torch.float64)
     directions_world = world_from_cam @ torch.stack(directions)[..., None]
@@ -139,20 +81,20 @@ def _capture(
     ]
     return found.capture.replace(
         truth=Truth(
-            normals_world=_of_shots(normals, index) if len(normals) == len(maps) else None,
+            mesh=read_mesh(mesh) if mesh.is_file() else None,
+            normals_world=torch.stack(normals)[index] if len(normals) == len(maps) else None,
             foreground=views.masks,
             lights_world=directed_lights(directions_world[..., 0], strength),
         )
     )
 
 
-def _of_shots(
-    normals: Sequence[Float[Tensor, "height width 3"]], index: Int[Tensor, " shot"]
-) -> Float[Tensor, "shot height width 3"]:
-    """Put the map of each viewpoint beside all of its photographs, one without a copy."""
-    if len(normals) == 1:
-        return normals[0].expand(len(index), *normals[0].shape)
-    return torch.stack(list(normals))[index]
+def directed_lights(
+    directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
+) -> Float[Tensor, "view 4"]:
+    """Return the first-order light of distant point lights without any ambient light."""
+    directed = strength[:, None] * directions_world
+    return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
 
 
 def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
@@ -188,23 +130,23 @@ def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
 
 
 def _normals(folder: DataSetPath) -> Float[Tensor, "height width 3"] | None:
-    """Read ``Normal_gt`` in our camera frame (facing the viewer is ``n_z < 0``).
-
-    Zero where the file knows none; ``None`` without such a file.
-    """
-    matlab, picture = folder.inner("Normal_gt.mat"), folder.inner("Normal_gt.png")
-    if not matlab.path.is_file():
-        return decoded_normals(picture) if picture.path.is_file() else None
-    array = read_matlab(matlab, ("Normal_gt",))["Normal_gt"]
+    """Read ``Normal_gt.mat`` in our camera frame; ``None`` without such a file."""
+    file = folder.inner("Normal_gt.mat")
+    if not file.path.is_file():
+        return None
+    array = read_matlab(file, ("Normal_gt",))["Normal_gt"]
     shape = " x ".join(map(str, array.shape))
     ok = array.ndim == 3 and array.shape[2] == 3
-    matlab.expect(ok, "Normal_gt of height x width x 3", f"shape {shape}")
-    return _faced(torch.from_numpy(array.astype(np.float32)))
+    file.expect(ok, "Normal_gt of height x width x 3", f"shape {shape}")
+    return facing_us(torch.from_numpy(array.astype(np.float32)))
 
 
-def _faced(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+def facing_us(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+    """Turn normals with y up and z to the viewer into our camera frame, ``n_z < 0``.
+
+    Zero where they are not known: not finite, or shorter than half, as on a background.
+    """
     rotated = normals.nan_to_num(0) * FLIP.float()
-    # Shorter ones are background.
     known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5
     return torch.where(known, normalize(rotated, dim=-1), 0)
 

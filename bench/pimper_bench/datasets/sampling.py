@@ -56,18 +56,18 @@ class Shots(NamedTuple):
     """The photographs that were chosen, and a capture of them without truth.
 
     Attributes:
-        cam_from_world: In float64; ``None`` without cameras.
+        cam_from_world: In float64.
     """
 
     capture: Capture
     chosen: list[Shot]
-    cam_from_world: Float[Tensor, "view 4 4"] | None
+    cam_from_world: Float[Tensor, "view 4 4"]
 
 
 def read_shots(
     shots: Sequence[Shot],
     folder: DataSetPath,
-    cameras: CamerasOf | None,
+    cameras: CamerasOf,
     *,
     size_px: tuple[int, int] | None = None,
     positions: Positions | None = None,
@@ -95,22 +95,19 @@ def read_shots(
     masks = [shot.mask for shot in chosen]
     names = [shot.name for shot in chosen]
     views = read_photographs(paths, names, encoding=encoding, max_size_px=max_size_px, masks=masks)
-    placed, poses = None, None
-    if cameras is not None:
-        order = sorted({shot.position for shot in chosen})
-        index = torch.tensor([order.index(shot.position) for shot in chosen])
-        K, cam_from_world = cameras(order)
-        header = read_header(paths[0])
-        full_px = torch.tensor(size_px or (header.width, header.height))
-        across, down = (views.sizes_px[0].double() / full_px).tolist()
-        K = scale_intrinsics(intrinsics_from_indices(K), across, down)
-        poses = cam_from_world[index]
-        placed = Cameras(
-            intrinsics=K[index].float(), cam_from_world=poses.float(), sizes_px=views.sizes_px
-        )
+    order = sorted({shot.position for shot in chosen})
+    index = torch.tensor([order.index(shot.position) for shot in chosen])
+    K, cam_from_world = cameras(order)
+    header = read_header(paths[0])
+    full_px = torch.tensor(size_px or (header.width, header.height))
+    across, down = (views.sizes_px[0].double() / full_px).tolist()
+    K = scale_intrinsics(intrinsics_from_indices(K), across, down)
+    poses = cam_from_world[index]
     capture = Capture(
         views=views,
-        cameras=placed,
+        cameras=Cameras(
+            intrinsics=K[index].float(), cam_from_world=poses.float(), sizes_px=views.sizes_px
+        ),
         truth=Truth(),
         position=torch.tensor([shot.position for shot in chosen]),
         light=torch.tensor([shot.light for shot in chosen]),

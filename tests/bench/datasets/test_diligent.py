@@ -7,7 +7,7 @@ from PIL import Image
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_bench.datasets.diligent import read_diligent, read_diligent_mv
+from pimper_bench.datasets.diligent import read_diligent_mv
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.runtime.errors import InputError
 
@@ -123,30 +123,6 @@ def test_another_layout_is_refused_by_what_was_expected_and_found(turntable, bre
     break_it(turntable)
     with pytest.raises(InputError, match=message):
         read_diligent_mv(turntable)
-
-
-def test_a_single_viewpoint_is_read_in_its_cameras_frame(tmp_path, viewpoint):
-    viewpoint(tmp_path / "ballPNG")
-    capture = read_diligent(tmp_path / "ballPNG")
-    assert capture.cameras is None
-    assert capture.light.tolist() == [1, 2, 3]
-    assert capture.position.tolist() == [1, 1, 1]
-    # From the right, from above, from the viewer: x right, y down, z forward.
-    directions = normalize(capture.truth.lights_world[:, 1:], dim=1)
-    assert_close(directions, torch.tensor([[0.6, 0, -0.8], [0, -0.6, -0.8], [0, 0, -1]]))
-    assert_close(capture.truth.normals_world[2, 8, 8], torch.tensor([0, -0.6, -0.8]))
-    assert read_diligent(tmp_path / "ballPNG", lights=[2, 3]).light.tolist() == [2, 3]
-
-
-def test_normals_kept_as_colours_serve_when_there_is_no_matlab_file(
-    tmp_path, viewpoint, paint_deep
-):
-    viewpoint(tmp_path)
-    (tmp_path / "Normal_gt.mat").unlink()
-    levels = [round((component + 1) / 2 * 65535) for component in (0.0, 0.6, 0.8)]
-    paint_deep(tmp_path / "Normal_gt.png", levels, WIDTH, HEIGHT)
-    normals = read_diligent(tmp_path).truth.normals_world
-    assert_close(normals[0, 8, 8], torch.tensor([0, -0.6, -0.8]), atol=1e-4, rtol=0)
 
 
 def test_a_normal_map_comes_with_its_depth_and_pinhole(tmp_path, paint_deep):
