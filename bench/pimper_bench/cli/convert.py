@@ -1,11 +1,11 @@
 """A data set of one layout to another."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 import tyro
@@ -13,14 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_bench import datasets
-from pimper_bench.datasets.posed import assemble
-from pimper_bench.datasets.sampling import LightOptions, read_shots
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.doors.exchange.nerfstudio import thinned
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart, written_whole
-from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.ground.radiometry import FROM_FILES, LINEAR, Encoding
 from pimper_torch.ground.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.reporting import stage
@@ -134,54 +132,60 @@ def parse(arguments: Sequence[str]) -> ConvertJob:
     return read_arguments(ConvertJob, "convert", arguments, levels=True)
 
 
-def readers() -> Mapping[Source, Callable[..., Capture]]:
-    """List the reader of each layout."""
+class _Layout(NamedTuple):
+    """How a layout is read.
+
+    Attributes:
+        encoding: What its files hold, unless an option says otherwise.
+        options: Names of those that the reader knows beside the photographs' encoding.
+    """
+
+    read: Callable[..., Capture]
+    encoding: Encoding | None
+    options: tuple[str, ...] = ()
+
+
+def layouts() -> Mapping[Source, _Layout]:
+    """List all layouts."""
+    posed = ("mesh", "max_size_px")
+    beside = ("images", "masks", *posed)
+    lit = ("light_seed", "max_size_px")
     return {
-        "colmap": datasets.read_colmap,
-        "llff": datasets.read_llff,
-        "idr": datasets.read_idr,
-        "transforms": datasets.read_transforms,
-        "camera-file": datasets.read_camera_file,
-        "dtu-points": datasets.read_dtu_points,
-        "dtu-mvs": datasets.read_dtu_mvs,
-        "diligent-mv": datasets.read_diligent_mv,
-        # Without its maps, which no layout has a place for.
-        "rendered": lambda folder: datasets.read_rendered(folder, maps=False),
+        "colmap": _Layout(datasets.read_colmap, FROM_FILES, beside),
+        "llff": _Layout(datasets.read_llff, FROM_FILES, beside),
+        "idr": _Layout(datasets.read_idr, FROM_FILES, posed),
+        "transforms": _Layout(datasets.read_transforms, FROM_FILES, posed),
+        "camera-file": _Layout(datasets.read_camera_file, FROM_FILES, beside),
+        "dtu-points": _Layout(datasets.read_dtu_points, LINEAR, ("scan", *lit)),
+        "dtu-mvs": _Layout(datasets.read_dtu_mvs, LINEAR, ("scan", *lit)),
+        "diligent-mv": _Layout(datasets.read_diligent_mv, LINEAR, lit),
+        # Without its maps, which no layout has a place for; scene.json says what its files hold.
+        "rendered": _Layout(partial(datasets.read_rendered, maps=False), None),
     }
 
 
 def read(job: ConvertJob) -> Capture:
     """Read the data set with the options that were given."""
-    reader = readers()[job.source]
-    known = dict(inspect.signature(reader).parameters)
-    if "options" in known:
-        (shared,) = get_args(known["options"].annotation)
-        whole = read_shots if shared is LightOptions else assemble
-        known |= inspect.signature(whole).parameters
-    plain = ReadOptions()
+    layout, plain = layouts()[job.source], ReadOptions()
     given = {
         name: getattr(job.options, name)
         for name in _OPTIONS
         if getattr(job.options, name) != getattr(plain, name)
     }
-    photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
-    if photographs and "encoding" in known:
-        usual = known["encoding"].default
-        assert isinstance(usual, Encoding), "readers say what their layout's files hold"
-        given["encoding"] = dataclasses.replace(usual, **photographs)
-    elif photographs:
-        given |= photographs
+    known = (*layout.options, *(_PHOTOGRAPHS if layout.encoding else ()))
     strange = [_option(name) for name in given if name not in known]
     if strange:
-        accepted = {*known, *(_PHOTOGRAPHS if "encoding" in known else ())}
-        goes = [_option(name) for name in _OPTIONS if name in accepted]
+        goes = [_option(name) for name in _OPTIONS if name in known]
         raise InputError(
             f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
             f"{', '.join(goes)}, or another --source."
         )
-    if "scan" in known and "scan" not in given:
+    if "scan" in layout.options and "scan" not in given:
         raise InputError(f"--source {job.source} holds many scans; needed: --scan with a number.")
-    return reader(job.data, **given)
+    photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
+    if layout.encoding is not None and photographs:
+        given["encoding"] = dataclasses.replace(layout.encoding, **photographs)
+    return layout.read(job.data, **given)
 
 
 def write(capture: Capture, target: Target, folder: Path) -> None:

@@ -128,6 +128,7 @@ class Meeting(Record):
         valid: True where a ray meets the truth.
         both: True where it meets the mesh too.
         points: Of the mesh, from the camera's centre.
+        normals_true: Zero where unknown; ``None`` where none is known.
     """
 
     valid: Bool[Tensor, "height width"]
@@ -137,6 +138,7 @@ class Meeting(Record):
     center_world: Float[Tensor, " 3"]
     hits: Hits
     faces: Int[Tensor, "face 3"]
+    normals_true: Float[Tensor, "ray 3"] | None = None
 
     @property
     def coverage(self) -> float:
@@ -146,8 +148,12 @@ class Meeting(Record):
     def only(self, where: Bool[Tensor, "height width"]) -> "Meeting":
         """Count all other rays as misses of the mesh."""
         kept = where[self.both]
+        normals = self.normals_true
         return self.replace(
-            both=self.both & where, points=self.points[kept], points_true=self.points_true[kept]
+            both=self.both & where,
+            points=self.points[kept],
+            points_true=self.points_true[kept],
+            normals_true=None if normals is None else normals[kept],
         )
 
     def interpolate(
@@ -250,15 +256,6 @@ class ViewFigures(Record):
     albedo: AlbedoFigures | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class TrueMaps(Record):
-    """Depth (infinite where unknown), normals (zero where unknown) and object of a view."""
-
-    depth: Float[Tensor, "height width"]
-    normals_world: Float[Tensor, "height width 3"] | None
-    where: Bool[Tensor, "height width"] | None
-
-
 def compare_along_rays(mesh: Mesh, capture: Capture, view: int) -> ViewFigures | None:
     """Compare a mesh in the frame of the truth with it, over the rays of :func:`meet_truth`."""
     met = meet_truth(mesh, capture, view)
@@ -275,10 +272,12 @@ def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
     Returns:
         ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
     """
-    cameras, maps = capture.cameras, true_maps(capture, view)
+    cameras, maps = capture.cameras, _true_maps(capture, view)
     if cameras is None or maps is None or len(mesh.faces) == 0:
         return None
-    met = meet_in_view(mesh, cameras, view, maps.depth, maps.where)
+    depth, normals, where = maps
+    met = meet_in_view(mesh, cameras, view, depth, where)
+    met = met.replace(normals_true=None if normals is None else normals[met.both])
     met = without_surroundings(met, capture.truth)
     if not met.both.any():
         raise InputError(
@@ -290,8 +289,6 @@ def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
 
 def figures_of(met: Meeting, mesh: Mesh, capture: Capture, view: int) -> ViewFigures:
     """Compare a mesh with the truth over rays that meet both, all or some; at least one."""
-    maps = true_maps(capture, view)
-    assert maps is not None  # it was met
     albedo = None
     if mesh.albedo is not None and capture.truth.albedo is not None:
         albedo = compare_albedo(met.interpolate(mesh.albedo), capture.truth.albedo[view][met.both])
@@ -301,40 +298,39 @@ def figures_of(met: Meeting, mesh: Mesh, capture: Capture, view: int) -> ViewFig
         relative_error=float(relative_error(met.points.double(), met.points_true.double())),
         coverage=met.coverage,
         pixels=int(met.valid.sum()),
-        transferred_normals=_angles(met, mesh.normals_world, maps),
-        shape_normals=_angles(met, shape, maps),
+        transferred_normals=_angles(met, mesh.normals_world),
+        shape_normals=_angles(met, shape),
         albedo=albedo,
     )
 
 
-def true_maps(capture: Capture, view: int) -> TrueMaps | None:
-    """Return depth and normals of a view, from the truth's maps or by casting its mesh."""
+_Maps = tuple[
+    Float[Tensor, "height width"],
+    Float[Tensor, "height width 3"] | None,
+    Bool[Tensor, "height width"] | None,
+]
+"""Depth (infinite where unknown), normals (zero where unknown) and object of a view."""
+
+
+def _true_maps(capture: Capture, view: int) -> _Maps | None:
+    """Return the truth's maps, or cast the rays of a view on its mesh."""
     truth, cameras = capture.truth, capture.cameras
-    masks = capture.views.masks if truth.foreground is None else truth.foreground
-    where = None if masks is None else masks[view]
     if truth.depth is not None:
+        masks = capture.views.masks if truth.foreground is None else truth.foreground
         normals = None if truth.normals_world is None else truth.normals_world[view]
-        return TrueMaps(depth=truth.depth[view], normals_world=normals, where=where)
+        return truth.depth[view], normals, None if masks is None else masks[view]
     if truth.mesh is None or len(truth.mesh.faces) == 0 or cameras is None:
         return None
     whole = with_surroundings(truth.mesh, truth)
     hits = cast_view(whole, cameras, view)
-    return TrueMaps(
-        depth=hits.distance,
-        normals_world=hits.interpolate(
-            vertex_normals(whole.vertices_world, whole.faces), whole.faces
-        ),
-        where=(hits.face >= 0) & (hits.face < len(truth.mesh.faces)),
-    )
+    normals = hits.interpolate(vertex_normals(whole.vertices_world, whole.faces), whole.faces)
+    return hits.distance, normals, (hits.face >= 0) & (hits.face < len(truth.mesh.faces))
 
 
-def _angles(
-    met: Meeting, normals: Float[Tensor, "vertex 3"] | None, maps: TrueMaps
-) -> AngleFigures | None:
-    if normals is None or maps.normals_world is None:
+def _angles(met: Meeting, normals: Float[Tensor, "vertex 3"] | None) -> AngleFigures | None:
+    if normals is None or met.normals_true is None:
         return None
-    ours = met.interpolate(normals).double()
-    truth = maps.normals_world[met.both].double()
+    ours, truth = met.interpolate(normals).double(), met.normals_true.double()
     known = (truth.norm(dim=1) > 0) & (ours.norm(dim=1) > 0)
     if not bool(known.any()):
         return None

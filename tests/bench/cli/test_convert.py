@@ -8,7 +8,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.cli import convert
-from pimper_bench.cli.convert import Source, cloud, readers
+from pimper_bench.cli.convert import Source, cloud, layouts
 from pimper_bench.datasets import read_colmap, read_idr, read_transforms
 from pimper_bench.truth import Truth
 from pimper_torch.cli.main import main
@@ -129,7 +129,7 @@ def test_a_large_cloud_is_thinned_from_end_to_end():
 
 
 def test_every_layout_that_is_offered_has_a_reader():
-    assert set(readers()) == set(get_args(Source))
+    assert set(layouts()) == set(get_args(Source))
 
 
 def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
@@ -154,7 +154,7 @@ def test_a_rendered_scene_is_read_without_maps(data, monkeypatch):
     monkeypatch.setattr(
         convert.datasets, "read_rendered", lambda folder, **options: asked.update(options)
     )
-    readers()["rendered"](data)
+    layouts()["rendered"].read(data)
     assert asked == {"maps": False}
 
 
