@@ -66,13 +66,18 @@ def test_depth_times_ray_is_the_surface_in_closed_forms(cameras):
         assert_close(along, depth[hit])
 
 
-def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
-    lights = point_light([0.0, 0.0, 2.0])
+def photographed(*objects, lights, sensor=QUIET):
+    """Look down on white matte objects, or whatever objects are given."""
+    items = [
+        one if isinstance(one, SceneObject) else SceneObject(mesh=one, texture=white)
+        for one in objects
+    ]
     generator = torch.Generator().manual_seed(62)
-    scene = render_objects(
-        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
-    )
-    image = scene.views.images[0, 0]
+    return render_objects(items, above(), lights, generator, sensor)
+
+
+def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
+    image = photographed(table(2.0), lights=point_light([0.0, 0.0, 2.0])).views.images[0, 0]
     assert_close(image[15, 15], torch.tensor(1.0), atol=1e-4, rtol=0)
     # A pixel is 5/60 wide on the table; 12 pixels aside, x = 1: cos / d^2 = (2 / d) (2 / d)^2.
     distance = (1 + 4) ** 0.5
@@ -80,17 +85,12 @@ def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_
 
 
 def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
-    objects = [
-        SceneObject(mesh=table(3.0), texture=white),
-        SceneObject(mesh=ball(0.3, 4, (1.0, 0.0, 1.0)), texture=white, surroundings=True),
-    ]
+    above_table = SceneObject(mesh=ball(0.3, 4, (1.0, 0.0, 1.0)), texture=white, surroundings=True)
     # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
-    lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1], dtype=torch.float64))
-    generator = torch.Generator().manual_seed(63)
-    scene = render_objects(objects, above(), lights, generator, QUIET)
-    image = scene.views.images[0, 0]
+    lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1]).double())
+    scene = photographed(table(3.0), above_table, lights=lights)
     assert not scene.lit[0, 15, 15]
-    assert_close(image[15, 15], torch.tensor(0.1), atol=1e-6, rtol=0)
+    assert_close(scene.views.images[0, 0, 15, 15], torch.tensor(0.1), atol=1e-6, rtol=0)
     # The cone's half angle is asin(0.3 / sqrt 2), so the shadow ends at x = -1.108; columns 3
     # and 1 see x = -1 and x = -1.167.
     assert not scene.lit[0, 15, 3]
@@ -101,35 +101,25 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
 
 
 def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
-    window = torch.tensor([0.3, 0.0, 0.4], dtype=torch.float64)
-    colour = torch.tensor([[1.2, 1.0, 0.8]], dtype=torch.float64)
     lights = point_light(
         [0.0, 0.0, 2.0],
-        irradiance=torch.tensor([0.2], dtype=torch.float64),
-        window=window,
-        colour=colour,
+        irradiance=torch.tensor([0.2]).double(),
+        window=torch.tensor([0.3, 0.0, 0.4]).double(),
+        colour=torch.tensor([[1.2, 1.0, 0.8]]).double(),
     )
-    generator = torch.Generator().manual_seed(66)
-    scene = render_objects(
-        [SceneObject(mesh=table(2.0), texture=white)], above(), lights, generator, QUIET
-    )
+    scene = photographed(table(2.0), lights=lights)
     soft = 0.5 * ((1 + 0.8) / 2) ** 2
     expected = torch.tensor([0.24, 0.2, 0.16]) + soft
     assert_close(scene.views.images[0, :, 15, 15], expected, atol=1e-4, rtol=0)
 
 
 def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
-    matte = SceneObject(mesh=table(3.0), texture=white)
     glossy = SceneObject(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)
-    dim = {"irradiance": torch.tensor([0.1], dtype=torch.float64)}
-    difference = []
-    for item in (matte, glossy):
-        generator = torch.Generator().manual_seed(66)
-        scene = render_objects(
-            [item], above(), point_light([2.0, 0.0, 5.0], **dim), generator, QUIET
-        )
-        difference.append(scene.views.images[0, 0])
-    extra = difference[1] - difference[0]
+    lights = point_light([2.0, 0.0, 5.0], irradiance=torch.tensor([0.1]).double())
+    matte, shiny = (
+        photographed(item, lights=lights).views.images[0, 0] for item in (table(3.0), glossy)
+    )
+    extra = shiny - matte
     assert (extra >= -0.012).all()  # what is mirrored is taken from the matte part
     # Camera and point light stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
     row, column = divmod(int(extra.argmax()), 31)
@@ -147,13 +137,8 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
         target_world=torch.zeros(3, dtype=torch.float64),
     )
     texture = random_speckle(generator, cells=(0.5,))
-    traced = render_objects(
-        [SceneObject(mesh=ball(level=6), texture=texture)],
-        cameras,
-        far,
-        generator,
-        QUIET,
-    )
+    item = SceneObject(mesh=ball(level=6), texture=texture)
+    traced = render_objects([item], cameras, far, generator, QUIET)
     closed = render_shape(Sphere(), cameras, traced.lights_world, texture)
     both = traced.foreground & closed.lit & traced.lit
     assert both.float().mean() > 0.1
@@ -167,27 +152,27 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
 
 
 def test_noise_and_saturation_are_those_of_the_sensor():
-    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.5], dtype=torch.float64))
     noisy = SensorConfig(supersample=1, read_noise=0.01, shot_noise=0.0)
-    item = SceneObject(mesh=table(3.0), texture=white)
-    generator = torch.Generator().manual_seed(68)
-    image = render_objects([item], above(), lights, generator, noisy).views.images
-    assert abs(image.std() - 0.01) < 0.001
-    again = torch.Generator().manual_seed(68)
-    assert_close(render_objects([item], above(), lights, again, noisy).views.images, image)
-    bright = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([5.0], dtype=torch.float64))
-    assert (render_objects([item], above(), bright, generator, noisy).views.images == 1).all()
+    dim, bright = (
+        point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([strength]).double())
+        for strength in (0.5, 5.0)
+    )
+    images, again = (
+        photographed(table(3.0), lights=dim, sensor=noisy).views.images for _ in range(2)
+    )
+    assert abs(images.std() - 0.01) < 0.001
+    assert torch.equal(again, images)
+    assert (photographed(table(3.0), lights=bright, sensor=noisy).views.images == 1).all()
 
 
 def test_a_pixel_gathers_the_light_of_its_whole_area():
     def halves(points):  # black and white meet at x = 0, the centre of the centre pixel
         return (points[..., :1] > 0).to(points).expand_as(points)
 
-    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8], dtype=torch.float64))
+    lights = point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([0.8]).double())
     sensor = SensorConfig(supersample=4, read_noise=0.0, shot_noise=0.0)
-    generator = torch.Generator().manual_seed(69)
     item = SceneObject(mesh=table(3.0), texture=halves)
-    image = render_objects([item], above(), lights, generator, sensor).views.images[0, 0, 15]
+    image = photographed(item, lights=lights, sensor=sensor).views.images[0, 0, 15]
     assert_close(image[15], torch.tensor(0.4), atol=2e-3, rtol=0)
     assert image[14] == 0
     assert_close(image[16], torch.tensor(0.8), atol=2e-3, rtol=0)
