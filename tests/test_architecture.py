@@ -52,7 +52,7 @@ SOLE_IMPORTERS = {
     "numba": {"ground/kernels/compile.py"},
     "yaml": {"runtime/config.py"},
     "tyro": {"cli/", "cli/batches/", "pimper_bench/cli/", "single_view/cli/"},
-    "matplotlib": {"result/viz/", "pimper_bench/bench/heatmap.py"},
+    "matplotlib": {"result/viz/", "pimper_bench/bench/contact_sheet.py"},
     "viser": {"result/viewer/"},
     "distributed": {"cli/batches/engines.py"},
     "submitit": {"cli/batches/engines.py"},

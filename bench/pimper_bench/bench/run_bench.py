@@ -28,7 +28,7 @@ from pimper_bench.bench.bench_table import (
     with_published,
     write_json,
 )
-from pimper_bench.bench.heatmap import (
+from pimper_bench.bench.contact_sheet import (
     MethodPanels,
     SceneRow,
     draw_sheet,
@@ -46,7 +46,7 @@ from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperError, PimperWarning
 from pimper_torch.runtime.reporting import stage
 
-BENCH_NAMES = ("table.md", "table.json", "sheet.png", "heatmaps", "meshes")
+BENCH_NAMES = ("table.md", "table.json", "sheet.png", "meshes")
 
 
 class _Cell(NamedTuple):
@@ -78,7 +78,6 @@ def run_bench(
     `table.md`          the table, beside the published figures
     `table.json`        the same with all digits, and why figures are missing
     `sheet.png`         photograph, true normals, each method's normals and errors
-    `heatmaps/`         errors on the surface, one picture a scene and method
     `meshes/`           every surface, in the frame of the truth, as PLY
     ==================  ===========================================================
 
@@ -96,8 +95,7 @@ def run_bench(
         written_whole(folder, "table", overwrite=overwrite) as staging,
         tempfile.TemporaryDirectory(prefix="pimper_bench_") as workspace,
     ):
-        for part in ("heatmaps", "meshes"):
-            (staging / part).mkdir()
+        (staging / "meshes").mkdir()
         for scene in config.scenes:
             try:
                 measured, pictures = _scene(scene, methods, config, Path(workspace), staging, cache)
@@ -211,9 +209,8 @@ def _cell(
     write_ply(mesh, staging / "meshes" / f"{scene}_{method}.ply")
     # Evaluated in a view, it has been met.
     met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
-    heatmap = staging / "heatmaps" / f"{scene}_{method}.png"
     row = _row_of(scene, method, outcome, evaluation, memory, sfm_minutes)
-    return _Cell(row, method_panels(mesh, met, inputs, scene, method, heatmap), mesh, met)
+    return _Cell(row, method_panels(mesh, met, inputs, method), mesh, met)
 
 
 def _row_of(

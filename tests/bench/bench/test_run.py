@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_bench.bench import run_bench as runner
 from pimper_bench.bench.bench_inputs import BenchConfig, Inputs, MethodRun, method_named
-from pimper_bench.bench.heatmap import error_along_rays
+from pimper_bench.bench.contact_sheet import error_along_rays
 from pimper_bench.bench.run_bench import BENCH_NAMES, run_bench
 from pimper_bench.metrics import TrueSurface
 from pimper_bench.metrics.in_view import meet_truth
@@ -159,7 +159,7 @@ def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(s
     assert alone.common_relative_error == alone.relative_error
 
 
-def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
+def test_the_folder_holds_table_sheet_and_surfaces(staged, tmp_path):
     table = run_bench(config_of("larger", "lost"), tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
         [*BENCH_NAMES, MARKER]
@@ -167,7 +167,6 @@ def test_the_folder_holds_table_sheet_heat_maps_and_surfaces(staged, tmp_path):
     rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
     assert [row["method"] for row in rows] == [row.method for row in table.rows]
     assert "larger" in (tmp_path / "out" / "table.md").read_text()
-    assert [path.name for path in (tmp_path / "out" / "heatmaps").iterdir()] == ["ball_larger.png"]
     mesh = read_mesh(tmp_path / "out" / "meshes" / "ball_larger.ply")
     radii = mesh.vertices_world.norm(dim=1)
     assert_close(radii, torch.full_like(radii, 1.02), rtol=0, atol=1e-4)

@@ -30,7 +30,7 @@ MISSED = (0.88, 0.20, 0.16)
 # methods differ.
 CLIP_PERCENT = 1.0
 LABEL = f"distance to the truth, % of the diagonal, 0 to {CLIP_PERCENT:g} (clipped there)"
-_PANEL_PX, _HEATMAP_PX = 260, 620
+_PANEL_PX = 400
 _BAR_PX = (16, 400)
 
 
@@ -64,26 +64,22 @@ class SceneRow:
     methods: tuple[MethodPanels, ...]
 
 
-def method_panels(
-    mesh: Mesh, met: Meeting | None, inputs: Inputs, scene: str, method: str, heatmap: Path
-) -> MethodPanels:
-    """Draw the errors of a surface on it, and return its pictures for the sheet.
+def method_panels(mesh: Mesh, met: Meeting | None, inputs: Inputs, method: str) -> MethodPanels:
+    """Draw a surface and its errors for the sheet.
 
     Args:
         mesh: In the frame of the truth.
         met: Of the rays of the reference view; ``None`` if none meets it.
-        heatmap: File for the errors, PNG.
     """
     truth = inputs.maps
     if met is None or truth.cameras is None:
         return MethodPanels(method=method, note="points only")
-    errors, shading = error_along_rays(met, truth), shade(mesh, truth.cameras)
-    draw_heatmap(errors, heatmap, shading=shading, title=f"{scene}, {method}")
     crop = _crop(truth)
+    error = error_picture(error_along_rays(met, truth), shade(mesh, truth.cameras))
     return MethodPanels(
         method=method,
         surface=_on_white(view_maps(mesh, truth.cameras, 0, met.hits).normals_cam)[crop],
-        error=error_picture(errors, shading)[crop],
+        error=error[crop],
     )
 
 
@@ -159,24 +155,6 @@ def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def draw_heatmap(
-    error: Float[Tensor, "height width"],
-    path: Path | str,
-    *,
-    shading: Float[Tensor, "height width 3"] | None = None,
-    title: str = "",
-) -> None:
-    """Draw one error map on the shaded surface, with its colour bar, as PNG.
-
-    Args:
-        shading: The surface in that view, shaded.
-    """
-    rows, columns = crop_to(~error.isnan())
-    picture = error_picture(error, shading)[rows, columns]
-    shown = [[Tile(title=title, picture=picture)], [_bar(missed=bool(error.isinf().any()))]]
-    sheet(shown, _HEATMAP_PX).save(path)
-
-
 def draw_sheet(rows: Sequence[SceneRow], path: Path | str) -> None:
     """Draw scenes by methods as PNG.
 
@@ -198,7 +176,7 @@ def draw_sheet(rows: Sequence[SceneRow], path: Path | str) -> None:
             note = "" if one.surface is None else one.note  # once is enough
             below.append(Tile(picture=one.error, note=note))
         shown += [above, below]
-    sheet([*shown, [_bar(missed=True)]], _PANEL_PX).save(path)
+    sheet([*shown, [_bar()]], _PANEL_PX).save(path)
 
 
 def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
@@ -206,11 +184,9 @@ def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
     return array(torch.where(there, normal_colors(normals_cam), 1.0))
 
 
-def _bar(*, missed: bool) -> Tile:
-    """Draw the colours of errors in a row, and what red means."""
+def _bar() -> Tile:
+    """Draw the colours of errors in a row, the last of them that of what is missed."""
     height, width = _BAR_PX
     values = torch.linspace(0, CLIP_PERCENT, width).expand(height, width).clone()
-    if missed:
-        values[:, -width // 10 :] = torch.inf
-    title = f"{LABEL}{'; red: missed' if missed else ''}"
-    return Tile(title=title, picture=error_picture(values), wide=True)
+    values[:, -width // 10 :] = torch.inf
+    return Tile(title=f"{LABEL}; red: missed", picture=error_picture(values), wide=True)

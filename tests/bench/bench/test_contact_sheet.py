@@ -1,32 +1,18 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 from matplotlib import colormaps
 from PIL import Image
-from scenes import from_above, tilted_square
 
-from pimper_bench.bench.heatmap import (
+from pimper_bench.bench.contact_sheet import (
     MISSED,
     MethodPanels,
     SceneRow,
     crop_to,
-    draw_heatmap,
     draw_sheet,
     error_picture,
 )
-from pimper_torch.result.viz.render import shade
-
-
-@pytest.fixture
-def plane():
-    return tilted_square()
-
-
-@pytest.fixture
-def front():
-    return from_above(60.0, 48, 36)
 
 
 def has_color(path, color):
@@ -66,16 +52,6 @@ def test_the_crop_holds_every_true_pixel_and_stays_inside():
     assert (rows.start, columns.start) == (0, 8)
     assert (rows.stop, columns.stop) == (23, 33)
     assert crop_to(torch.zeros(4, 5, dtype=torch.bool)) == (slice(None), slice(None))
-
-
-def test_a_heat_map_is_drawn_with_what_is_missed(plane, front, tmp_path):
-    error = torch.zeros(36, 48)
-    shading = shade(plane, front)
-    draw_heatmap(error, tmp_path / "whole.png", shading=shading, title="mug, default")
-    assert not has_color(tmp_path / "whole.png", MISSED)
-    error[10:20, 20:30] = torch.inf
-    draw_heatmap(error, tmp_path / "missed.png", shading=shading)
-    assert has_color(tmp_path / "missed.png", MISSED)
 
 
 def picture_of(color):
