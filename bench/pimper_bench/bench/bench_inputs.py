@@ -1,8 +1,9 @@
 """Settings, scenes and methods of the bench."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,7 +20,7 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture
 from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.method.chains.chain_config import Config, load_config
 from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, placed_scene
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
@@ -153,16 +154,14 @@ class MethodRun(Record):
 
     Attributes:
         seconds: Wall clock without structure from motion.
-        samples: Samples of all templates times views, missing ones included.
+        figures: Of its stages, such as ``samples``: of all templates times views, missing ones
+            included.
         external: Whether another program did the work, in memory that is not this process's.
     """
 
     estimate: Estimate
     seconds: float
-    mesh_points: int | None = None
-    triangles: int | None = None
-    samples: int | None = None
-    missing_fraction: float | None = None
+    figures: Mapping[str, int | float] = field(default_factory=dict)
     external: bool = False
 
 
@@ -174,44 +173,29 @@ _BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs
 def method_named(name: str) -> Method:
     """Find a baseline by name, or a preset, or a YAML file of settings."""
     if name in _BASELINES:
-        return _baseline(_BASELINES[name]())
+        return partial(_run_baseline, _BASELINES[name]())
     try:
-        return _preset(name)
+        return partial(_run_preset, load_config(name))
     except ConfigError as error:
         raise ConfigError(
             f"method {name!r}: {error} Baselines are {', '.join(_BASELINES)}."
         ) from error
 
 
-def _preset(name: str) -> Method:
-    config = load_config(name)
-
-    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
-        chain = make_chain(config)
-        began = time.perf_counter()
-        result = chain(scene)
-        seconds = time.perf_counter() - began
-        found = {key: value for report in result.report for key, value in report.figures.items()}
-        return MethodRun(
-            estimate=estimate_of(result),
-            seconds=seconds,
-            mesh_points=int(found["mesh_points"]),
-            triangles=int(found["triangles"]),
-            samples=int(found["samples"]),
-            missing_fraction=found["missing_samples"] / found["samples"],
-        )
-
-    return run
+def _run_preset(config: Config, scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
+    chain = make_chain(config)
+    began = time.perf_counter()
+    result = chain(scene)
+    seconds = time.perf_counter() - began
+    figures = {key: value for report in result.report for key, value in report.figures.items()}
+    return MethodRun(estimate=estimate_of(result), seconds=seconds, figures=figures)
 
 
-def _baseline(module: nn.Module) -> Method:
-    def run(scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
-        began = time.perf_counter()
-        estimate = module(scene, coarse)
-        return MethodRun(
-            estimate=estimate,
-            seconds=time.perf_counter() - began,
-            external=isinstance(module, OpenMvs),
-        )
-
-    return run
+def _run_baseline(module: nn.Module, scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
+    began = time.perf_counter()
+    estimate = module(scene, coarse)
+    return MethodRun(
+        estimate=estimate,
+        seconds=time.perf_counter() - began,
+        external=isinstance(module, OpenMvs),
+    )

@@ -3,7 +3,7 @@
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import reduce
 from pathlib import Path
@@ -213,6 +213,15 @@ def _cell(
     return _Cell(row, method_panels(mesh, met, inputs, method), mesh, met)
 
 
+def _counted(figures: Mapping[str, int | float]) -> dict[str, Any]:
+    """Return what a preset's stages counted; baselines count nothing."""
+    names = ("mesh_points", "triangles", "samples")
+    found: dict[str, Any] = {name: int(figures[name]) for name in names if name in figures}
+    if found:
+        found["missing_percent"] = 100 * (figures["missing_samples"] / figures["samples"])
+    return found
+
+
 def _row_of(
     scene: str,
     method: str,
@@ -223,15 +232,11 @@ def _row_of(
 ) -> BenchRow:
     view = evaluation.views[0] if evaluation.views else None
     surface = evaluation.surface
-    seen, missing = surface.seen if surface else None, outcome.missing_fraction
+    seen = surface.seen if surface else None
     shape = view.shape_normals if view else None
     return BenchRow(
         scene=scene,
         method=method,
-        mesh_points=outcome.mesh_points,
-        triangles=outcome.triangles,
-        samples=outcome.samples,
-        missing_percent=None if missing is None else 100 * missing,
         minutes=outcome.seconds / 60,
         sfm_minutes=sfm_minutes,
         coverage_percent=100 * view.coverage if view else None,
@@ -244,5 +249,6 @@ def _row_of(
         if seen
         else (),
         peak_memory_mb=memory,
+        **_counted(outcome.figures),
         **_along_rays(view),
     )

@@ -27,6 +27,7 @@ from pimper_torch.runtime.errors import (
     ReconstructionError,
 )
 
+COUNTS = {"samples": 1000, "missing_samples": 250}
 RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
 
 
@@ -84,7 +85,7 @@ def of_radius(radius):
             cameras=scene.cameras,
             reference=scene.views.names[coarse.reference],
         )
-        return MethodRun(estimate=estimate, seconds=6.0, samples=1000, missing_fraction=0.25)
+        return MethodRun(estimate=estimate, seconds=6.0, figures=COUNTS)
 
     return method
 

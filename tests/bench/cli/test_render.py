@@ -1,11 +1,8 @@
 import json
 
 import pytest
-import torch
 from scenes import write_ball
-from torch.testing import assert_close
 
-from pimper_bench.datasets.rendered import read_rendered
 from pimper_torch.cli.main import main
 
 
@@ -36,17 +33,3 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
 def test_settings_that_exclude_one_another_are_told_in_a_sentence(ball, tmp_path, capsys):
     assert render(ball, tmp_path / "out", "--fixed-point-light") == 2
     assert "fixed_point_light is True; needed: path turntable" in capsys.readouterr().err
-
-
-def test_one_albedo_a_patterned_table_and_a_constant_light_on_demand(ball, tmp_path):
-    options = ("--albedo", "0.6", "0.5", "0.4", "--table", "patterned", "--rotation-deg", "30")
-    assert render(ball, tmp_path / "out", "--constant-light", *options) == 0
-    settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
-    assert settings["albedo"] == [0.6, 0.5, 0.4]
-    assert settings["table"] == "patterned"
-    lights = json.loads((tmp_path / "out" / "truth" / "lights.json").read_text())
-    assert len({tuple(position) for position in lights["positions_world"]}) == 1
-    assert settings["rotation_deg"] == 30
-    capture = read_rendered(tmp_path / "out")
-    seen = capture.truth.albedo[capture.truth.foreground]
-    assert_close(seen, torch.tensor([0.6, 0.5, 0.4]).expand_as(seen), atol=3e-4, rtol=0)  # float16
