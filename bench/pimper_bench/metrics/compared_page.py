@@ -24,6 +24,12 @@ from pimper_torch.result.report.predictions import predictions
 from pimper_torch.result.report.vertex_layers import length_layer, surface_layers
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
+# Titles and units by the names of the asset's attributes.
+_LAYERS = {
+    _DISTANCE: ("distance to the truth", "units of the truth"),
+    _ANGLE: ("error of normals", "degrees"),
+}
+_ABOUT = "At every vertex, to the nearest point of the truth"
 
 
 def write_compared_page(
@@ -44,14 +50,9 @@ def write_compared_page(
     asset = Texture()(found.mesh, few, relighting)
     errors = errors_of(asset.mesh.replace(normals_world=asset.normals), truth, truth_from_world)
     layers = [
-        length_layer(
-            name.lower(),
-            "distance to the truth" if name == _DISTANCE else "error of normals",
-            "At every vertex, to the nearest point of the truth",
-            values,
-            unit="units of the truth" if name == _DISTANCE else "degrees",
-        )
-        for name, values in errors.items()
+        length_layer(name.lower(), title, _ABOUT, errors[name], unit)
+        for name, (title, unit) in _LAYERS.items()
+        if name in errors
     ]
     with TemporaryDirectory(prefix="pimper_page_") as scratch:
         glb = Path(scratch) / "asset.glb"
