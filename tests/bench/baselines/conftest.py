@@ -21,6 +21,13 @@ BUMPS = WavyPlane(
 )
 
 
+@pytest.fixture(autouse=True)
+def _bare(monkeypatch, tmp_path):
+    """Without the machine's programs."""
+    (tmp_path / "bin").mkdir()
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+
+
 @pytest.fixture
 def sphere():
     return SPHERE

@@ -9,13 +9,6 @@ from pimper_bench.baselines.openmvs import find_program, run_program
 from pimper_torch.runtime.errors import MissingProgramError, ReconstructionError
 
 
-@pytest.fixture(autouse=True)
-def _bare(monkeypatch, tmp_path):
-    """Without the machine's programs."""
-    (tmp_path / "bin").mkdir()
-    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-
-
 def soon(minutes):
     return time.monotonic() + 60 * minutes
 

@@ -46,12 +46,6 @@ if name == "RefineMesh":
 PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")
 
 
-@pytest.fixture(autouse=True)
-def _no_openmvs(monkeypatch, tmp_path):
-    (tmp_path / "bin").mkdir()
-    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
-
-
 @pytest.fixture
 def triangle():
     corners = torch.tensor([[0.5, 0, 1], [0, 0.25, 1], [0, 0, 1.5]])

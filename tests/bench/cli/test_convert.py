@@ -42,12 +42,23 @@ def data(tmp_path):
     return folder
 
 
+@pytest.fixture
+def converted(data, tmp_path):
+    """Convert to ``out``; the status of the program."""
+
+    def convert(source, target, *options, folder=data):
+        arguments = [str(folder), "-o", str(tmp_path / "out"), "--source", source]
+        return main(["convert", *arguments, "--target", target, *map(str, options)])
+
+    return convert
+
+
 @pytest.mark.parametrize("target", READERS)
-def test_a_set_goes_to_every_layout_and_comes_back_the_same(data, tmp_path, capsys, target):
-    out = tmp_path / "out"
-    arguments = ["convert", str(data), "-o", str(out), "--source", "transforms"]
-    assert main([*arguments, "--target", target]) == 0
-    before, after = read_transforms(data), READERS[target](out)
+def test_a_set_goes_to_every_layout_and_comes_back_the_same(
+    data, converted, tmp_path, capsys, target
+):
+    assert converted("transforms", target) == 0
+    before, after = read_transforms(data), READERS[target](tmp_path / "out")
     assert_close(after.views.images, before.views.images)
     assert_close(after.cameras.intrinsics, before.cameras.intrinsics)
     assert_close(after.cameras.cam_from_world, before.cameras.cam_from_world)
@@ -56,38 +67,49 @@ def test_a_set_goes_to_every_layout_and_comes_back_the_same(data, tmp_path, caps
     assert f"as {target}" in printed
 
 
-def test_options_reach_the_reader_and_the_writer(data, tmp_path):
+def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
     (tmp_path / "true.obj").write_text("v 1 2 0\nv 2 2 0\nv 1 3 0\nf 1 2 3\n")
-    out = tmp_path / "out"
-    arguments = ["convert", str(data), "--out", str(out), "--source", "transforms"]
-    options = ["--target", "idr", "--max-size-px", "6", "--mesh", str(tmp_path / "true.obj")]
-    assert main([*arguments, *options]) == 0
-    assert read_idr(out).views.sizes_px.tolist() == [[6, 4]] * 3
-    unit_from_world = torch.linalg.inv(
-        torch.from_numpy(np.load(out / "cameras.npz")["scale_mat_0"])
-    )
+    options = ("--max-size-px", 6, "--mesh", tmp_path / "true.obj")
+    assert converted("transforms", "idr", *options) == 0
+    assert read_idr(tmp_path / "out").views.sizes_px.tolist() == [[6, 4]] * 3
+    scale_mat = np.load(tmp_path / "out" / "cameras.npz")["scale_mat_0"]
+    unit_from_world = torch.linalg.inv(torch.from_numpy(scale_mat))
     corner = transform(unit_from_world, torch.tensor([[2.0, 2, 0]]).double())
     assert_close(float(corner.norm()), 0.9)
 
 
-def test_an_option_that_the_reader_does_not_know_is_refused(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "transforms"]
-    assert main([*arguments, "--target", "idr", "--light-seed", "0"]) == 2
-    assert "--light-seed: the reader of transforms does not know it" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("source", "options", "told"),
+    [
+        ("transforms", ["--light-seed", 0], "--light-seed: the reader of transforms does not know"),
+        ("rendered", ["--photographs.black", 2], "--photographs.black: the reader of rendered"),
+        ("dtu-mvs", [], "--scan with a number"),
+        ("llff", [], r"not the layout of an LLFF set"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_and_nothing_is_written(
+    converted, tmp_path, capsys, source, options, told
+):
+    assert converted(source, "idr", *options) == 2
+    assert told in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_the_encoding_of_the_files_reaches_the_reader(data, tmp_path, monkeypatch):
-    arguments = ["convert", "--photographs.saturation", "250", str(data)]
-    arguments += ["-o", str(tmp_path / "out"), "--source", "transforms", "--target", "idr"]
-    assert main([*arguments, "--photographs.response", "linear", "--photographs.black", "2"]) == 0
-    told = Encoding(response="linear", saturation=250.0, black=2.0)
-    assert_close(
-        read_idr(tmp_path / "out").views.images,
-        read_transforms(data, encoding=told).views.images,
-        rtol=0,
-        atol=0.01,  # of 8 bits in sRGB
-    )
+def test_a_set_without_cameras_is_not_exported(data, converted, tmp_path, monkeypatch, capsys):
+    bare = read_transforms(data).replace(cameras=None)
+    monkeypatch.setattr(convert.datasets, "read_llff", lambda folder: bare)
+    assert converted("llff", "idr") == 2
+    assert "says nothing about its cameras" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_encoding_of_the_files_reaches_the_reader(data, converted, tmp_path):
+    told = {"response": "linear", "saturation": 250.0, "black": 2.0}
+    options = [word for name in told for word in (f"--photographs.{name}", told[name])]
+    assert converted("transforms", "idr", *options) == 0
+    found = read_idr(tmp_path / "out").views.images
+    expected = read_transforms(data, encoding=Encoding(**told)).views.images
+    assert_close(found, expected, rtol=0, atol=0.01)  # of 8 bits in sRGB
 
 
 def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
@@ -101,21 +123,6 @@ def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
     arguments = ["data", "-o", "out", "--source", "dtu-mvs", "--target", "idr", "--scan", "3"]
     convert.read(convert.parse([*arguments, "--photographs.response", "2.2"]))
     assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
-
-
-def test_a_set_of_scans_needs_the_scans_number(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
-    assert main([*arguments, "--target", "idr"]) == 2
-    assert "--scan with a number" in capsys.readouterr().err
-
-
-def test_another_layout_is_refused_and_nothing_is_written(data, tmp_path, capsys):
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
-    assert main([*arguments, "--target", "idr"]) == 2
-    message = capsys.readouterr().err
-    assert "not the layout of an LLFF set" in message
-    assert "poses_bounds.npy" in message
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_large_cloud_is_thinned_from_end_to_end():
@@ -132,7 +139,7 @@ def test_every_layout_that_is_offered_has_a_reader():
     assert set(layouts()) == set(get_args(Source))
 
 
-def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
+def test_one_light_a_position_is_kept_of_a_set_of_many_lights(converted, tmp_path, capsys):
     photographs = tmp_path / "Rectified" / "scan9"
     calibration = tmp_path / "Calibration" / "cal18"
     photographs.mkdir(parents=True)
@@ -143,8 +150,8 @@ def test_one_light_a_position_is_kept_of_a_set_of_many_lights(tmp_path, capsys):
             level.save(photographs / f"rect_{place:03d}_{point_light}_r5000.png")
         matrix = np.array([[2000.0, 0, 800, place], [0, 2000, 600, 2], [0, 0, 1, 700]])
         np.savetxt(calibration / f"pos_{place:03d}.txt", matrix)
-    arguments = ["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--source", "dtu-mvs"]
-    assert main([*arguments, "--scan", "9", "--light-seed", "0", "--target", "colmap"]) == 0
+    options = ("--scan", 9, "--light-seed", 0)
+    assert converted("dtu-mvs", "colmap", *options, folder=tmp_path) == 0
     assert "3 photographs of 16 x 12 from 3 positions, under 2 lights" in capsys.readouterr().out
     assert read_colmap(tmp_path / "out").views.num_views == 3
 
@@ -156,12 +163,3 @@ def test_a_rendered_scene_is_read_without_maps(data, monkeypatch):
     )
     layouts()["rendered"].read(data)
     assert asked == {"maps": False}
-
-
-def test_a_set_without_cameras_is_not_exported(data, tmp_path, monkeypatch, capsys):
-    bare = read_transforms(data).replace(cameras=None)
-    monkeypatch.setattr(convert.datasets, "read_llff", lambda folder: bare)
-    arguments = ["convert", str(data), "-o", str(tmp_path / "out"), "--source", "llff"]
-    assert main([*arguments, "--target", "idr"]) == 2
-    assert "says nothing about its cameras" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
