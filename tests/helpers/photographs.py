@@ -1,11 +1,15 @@
-"""Photographs and masks of a rendered scene as files."""
+"""Photographs of rendered scenes as files, and photographs of nothing by cameras anywhere."""
 
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
 from pimper_torch.doors.exchange.picture_files import write_picture
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.records import Cameras, Views
 
 
 def save_photographs(views, folder):
@@ -19,3 +23,29 @@ def save_masks(masks, names, folder):
     Path(folder).mkdir()
     for mask, name in zip(masks, names, strict=True):
         Image.fromarray(255 * mask.numpy().astype(np.uint8)).save(Path(folder) / name)
+
+
+def photographed(seed, skewed=False, masked=False):
+    """One to three photographs of unlike sizes, levels of 8 bits, their pinholes, and points."""
+    generator = torch.Generator().manual_seed(seed)
+    count = 1 + seed % 3
+    sizes = torch.randint(6, 17, (count, 2), generator=generator)
+    width, height = sizes.amax(dim=0).tolist()
+    levels = torch.randint(256, (count, 3, height, width), generator=generator)
+    views = Views(
+        images=linear_from_srgb(levels / 255),
+        sizes_px=sizes,
+        names=tuple(f"{index}.jpg" for index in range(count)),
+        masks=torch.rand(count, height, width, generator=generator) > 0.4 if masked else None,
+        focals_px=torch.full((count,), torch.nan),
+    )
+    views = views.replace(images=views.images * views.inside[:, None])
+    rotation, _ = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator).double())
+    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
+    K = torch.eye(3).double().repeat(count, 1, 1)
+    K[:, [0, 1], [0, 1]] = 10 + 20 * torch.rand(count, 2, generator=generator).double()
+    K[:, :2, 2] = sizes * (0.3 + 0.4 * torch.rand(count, 2, generator=generator).double())
+    K[:, 0, 1] = 5.0 * skewed
+    shift = 5 * torch.randn(count, 3, generator=generator).double()
+    cameras = Cameras(intrinsics=K, cam_from_world=rigid(rotation, shift), sizes_px=sizes)
+    return views, cameras, torch.rand(20, 3, generator=generator) * 9

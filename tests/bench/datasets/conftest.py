@@ -8,14 +8,10 @@ from PIL import Image
 
 from pimper_bench.datasets import posed
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.method.sfm.undistort import undistort
-from pimper_torch.records import Cameras, Views
 
 
 @pytest.fixture
@@ -92,38 +88,6 @@ def sees():
         return pixels[0].tolist()
 
     return pixel
-
-
-@pytest.fixture
-def capture(hand_camera, generator):
-    """Two photographs of unlike sizes with masks, taken by unlike pinholes, levels of 8 bits."""
-    rotation = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]], dtype=torch.float64)
-    )
-    other = rigid(rotation @ hand_camera[:3, :3], torch.tensor([0.3, -0.4, 9.0]).double())
-    K = [[[20.0, 0, 7], [0, 30, 5], [0, 0, 1]], [[21.0, 0, 6.25], [0, 19, 4.5], [0, 0, 1]]]
-    sizes = torch.tensor([[16, 12], [13, 9]])
-    images = linear_from_srgb(torch.randint(256, (2, 3, 12, 16), generator=generator) / 255)
-    masks = torch.rand(2, 12, 16, generator=generator) > 0.4
-    views = Views(
-        images=images,
-        sizes_px=sizes,
-        names=("first.jpg", "side/second.tif"),
-        masks=masks,
-        focals_px=torch.full((2,), torch.nan),
-    )
-    inside = views.inside
-    return Capture(
-        views=views.replace(images=images * inside[:, None], masks=masks & inside),
-        cameras=Cameras(
-            intrinsics=torch.tensor(K, dtype=torch.float64),
-            cam_from_world=torch.stack([hand_camera, other]),
-            sizes_px=sizes,
-        ),
-        truth=Truth(),
-        position=torch.arange(2),
-        light=torch.arange(2),
-    )
 
 
 @pytest.fixture

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 import torch
+from photographs import photographed
 from torch.testing import assert_close
 
-from pimper_bench.datasets import read_idr, write_idr
+from pimper_bench.datasets import read_idr
 from pimper_bench.datasets.idr import unit_sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.rigid import transform
@@ -67,11 +68,9 @@ def test_a_matrix_of_no_camera_is_refused(folder, matrix, needed):
         read_idr(folder)
 
 
-def test_the_unit_sphere_holds_the_points(capture, tmp_path, generator):
-    points = torch.tensor([3.0, -2, 7]) + torch.rand(50, 3, generator=generator)
-    write_idr(capture.views, capture.cameras, tmp_path, points_world=points)
-    scale_mat = np.load(tmp_path / "cameras.npz")["scale_mat_1"]
-    unit_from_world = torch.linalg.inv(torch.from_numpy(scale_mat))
+def test_the_unit_sphere_holds_the_points():
+    _, cameras, points = photographed(4)
+    unit_from_world = torch.linalg.inv(unit_sphere(cameras, points))
     radius = transform(unit_from_world, points.double()).norm(dim=-1).max()
     assert_close(float(radius), 0.9)
     # One factor for all axes, no rotation.
@@ -107,8 +106,9 @@ def test_read_idr_refuses_other_numbers_of_cameras_and_masks(folder, spoil, need
         read_idr(folder)
 
 
-def test_unit_sphere_refuses_what_has_no_size(capture):
+def test_unit_sphere_refuses_what_has_no_size():
+    _, cameras, _ = photographed(4)
     with pytest.raises(InputError, match="look the same way"):
-        unit_sphere(capture.cameras.take([0, 0]))
+        unit_sphere(cameras.take([0, 0]))
     with pytest.raises(InputError, match="has no size"):
-        unit_sphere(capture.cameras, torch.ones(4, 3))
+        unit_sphere(cameras, torch.ones(4, 3))

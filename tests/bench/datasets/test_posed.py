@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from photographs import photographed
 from PIL import Image
 from torch.testing import assert_close
 
@@ -27,9 +28,8 @@ from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.radiometry import LINEAR, linear_from_srgb
-from pimper_torch.records import Cameras, Lens, Views
+from pimper_torch.ground.radiometry import LINEAR
+from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import InputError
 
 LENS = Lens(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
@@ -210,32 +210,6 @@ LAYOUTS = {
     "transforms": (write_transforms, read_transforms),
     "idr": (write_idr, read_idr),
 }
-
-
-def photographed(seed: int, skewed: bool, masked: bool):
-    """Photographs of unlike sizes, of levels that 8 bits hold, by pinholes anywhere."""
-    generator = torch.Generator().manual_seed(seed)
-    count = 1 + seed % 3
-    sizes = torch.randint(6, 17, (count, 2), generator=generator)
-    width, height = sizes.amax(dim=0).tolist()
-    levels = torch.randint(256, (count, 3, height, width), generator=generator)
-    views = Views(
-        images=linear_from_srgb(levels / 255),
-        sizes_px=sizes,
-        names=tuple(f"{index}.jpg" for index in range(count)),
-        masks=torch.rand(count, height, width, generator=generator) > 0.4 if masked else None,
-        focals_px=torch.full((count,), torch.nan),
-    )
-    views = views.replace(images=views.images * views.inside[:, None])
-    rotation, _ = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator).double())
-    rotation = rotation * torch.linalg.det(rotation)[:, None, None]
-    K = torch.eye(3).double().repeat(count, 1, 1)
-    K[:, [0, 1], [0, 1]] = 10 + 20 * torch.rand(count, 2, generator=generator).double()
-    K[:, :2, 2] = sizes * (0.3 + 0.4 * torch.rand(count, 2, generator=generator).double())
-    K[:, 0, 1] = 5.0 * skewed
-    shift = 5 * torch.randn(count, 3, generator=generator).double()
-    cameras = Cameras(intrinsics=K, cam_from_world=rigid(rotation, shift), sizes_px=sizes)
-    return views, cameras, torch.rand(20, 3, generator=generator) * 9
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

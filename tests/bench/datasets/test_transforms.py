@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 import pytest
+from photographs import photographed
 from PIL import Image
 from torch.testing import assert_close
 
@@ -125,12 +126,13 @@ def test_a_frame_of_anything_else_is_refused(save, more, needed):
         read_transforms(save(files=("images/a.png",), **more))
 
 
-def test_intrinsics_shared_by_all_views_stand_once(capture, tmp_path):
-    write_transforms(capture.views.take([0]), capture.cameras.take([0]), tmp_path / "one")
+def test_intrinsics_shared_by_all_views_stand_once(tmp_path):
+    views, cameras, _ = photographed(4)
+    write_transforms(views.take([0]), cameras.take([0]), tmp_path / "one")
     said = json.loads((tmp_path / "one" / "transforms.json").read_text())
-    assert said["fl_x"] == 20
+    assert said["fl_x"] == pytest.approx(float(cameras.intrinsics[0, 0, 0]))
     assert "fl_x" not in said["frames"][0]
-    write_transforms(capture.views, capture.cameras, tmp_path / "two")
+    write_transforms(views, cameras, tmp_path / "two")
     said = json.loads((tmp_path / "two" / "transforms.json").read_text())
     assert "fl_x" not in said
-    assert [frame["w"] for frame in said["frames"]] == [16, 13]
+    assert [frame["w"] for frame in said["frames"]] == views.sizes_px[:, 0].tolist()
