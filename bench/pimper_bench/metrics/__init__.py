@@ -32,7 +32,6 @@ from pimper_bench.metrics.surface_distances import (
     TrueSurface,
     sample_surface,
 )
-from pimper_torch.ground.geometry.nearest import Nearest, NearestSurface
 
 __all__ = [
     "AlbedoFigures",
@@ -43,8 +42,6 @@ __all__ = [
     "Evaluation",
     "FigureRow",
     "LightFigures",
-    "Nearest",
-    "NearestSurface",
     "SurfaceComparison",
     "SurfaceSamples",
     "ViewFigures",

@@ -1,3 +1,5 @@
+import dataclasses
+import inspect
 import json
 from typing import get_args
 
@@ -8,7 +10,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.cli import convert
-from pimper_bench.cli.convert import Source, cloud, layouts
+from pimper_bench.cli.convert import ReadOptions, Source, cloud, layouts
 from pimper_bench.datasets import read_colmap, read_idr, read_transforms
 from pimper_bench.truth import Truth
 from pimper_torch.cli.main import main
@@ -135,8 +137,16 @@ def test_a_large_cloud_is_thinned_from_end_to_end():
     assert cloud(Truth()) is None
 
 
-def test_every_layout_that_is_offered_has_a_reader():
+def test_every_layout_that_is_offered_has_a_reader_that_knows_its_options():
     assert set(layouts()) == set(get_args(Source))
+    for layout in layouts().values():
+        known = dict(inspect.signature(layout.read).parameters)
+        if "options" in known:
+            (shared,) = get_args(known["options"].annotation)
+            known |= shared.__annotations__
+        offered = {field.name for field in dataclasses.fields(ReadOptions)}
+        assert offered & set(known) == set(layout.options)
+        assert ("encoding" in known) == (layout.encoding is not None)
 
 
 def test_one_light_a_position_is_kept_of_a_set_of_many_lights(converted, tmp_path, capsys):
