@@ -54,6 +54,7 @@ SOLE_IMPORTERS = {
     "tyro": {"cli/", "cli/batches/", "pimper_bench/cli/", "single_view/cli/"},
     "matplotlib": {"result/viz/", "pimper_bench/bench/contact_sheet.py"},
     "viser": {"result/viewer/"},
+    "onnxruntime": {"priors/network.py"},
     "distributed": {"cli/batches/engines.py"},
     "submitit": {"cli/batches/engines.py"},
 }

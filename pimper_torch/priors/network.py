@@ -1,6 +1,8 @@
 """Guesses of a network about photographs."""
 
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -12,7 +14,8 @@ from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.priors import from_maps
 from pimper_torch.records import AlbedoPrior, InlierPrior, Prior, SparseScene, Views
 from pimper_torch.runtime.config import require
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.runtime.parallel import side_by_side
 
 Picture = Float[Tensor, "1 channel height width"]
 Network = Callable[[Picture], Any]
@@ -21,7 +24,7 @@ _CHANNELS: dict[Kind, tuple[int, ...]] = {"normals": (3,), "albedo": (1, 3)}  # 
 
 
 def priors_of(
-    network: Network,
+    network: Network | Path | str,
     views: Views | SparseScene,
     kind: Kind,
     *,
@@ -37,7 +40,8 @@ def priors_of(
 
     Args:
         network: A module, or any function, from a picture to a map ``1 channel height width``
-            of the whole picture at any size; or to a pair of the map and its variance.
+            of the whole picture at any size; or to a pair of the map and its variance. Or an
+            ONNX file, whose first output is the map, and one called ``variance`` its variance.
         views: Photographs, or a scene's undistorted ones.
         kind: Of the guesses. ``inliers`` and ``silhouettes`` are probabilities.
         size_px: Width and height that pictures are resized to; their own unless given.
@@ -51,18 +55,14 @@ def priors_of(
             ``error``, in its own units.
 
     Raises:
-        InputError: A file is given, or the network returns something else.
+        InputError: The file is of another kind, or the network returns something else.
+        ConfigError: onnxruntime is not installed.
     """
-    if not callable(network):
-        raise InputError(
-            f"priors_of: network is {network}; needed: a module, or a function, of a picture. Load "
-            "it yourself: `torch.export.load(path).module()` if you trust it, as files of torch "
-            "may hold pickles, which run any program; or call onnxruntime in a function."
-        )
     photographs = views.views if isinstance(views, SparseScene) else views
     means, deviations = (
         photographs.images.new_tensor(list(part))[:, None, None] for part in (mean, std)
     )
+    run = network if callable(network) else _loaded(Path(network))
 
     def guess(view: int) -> tuple[Tensor, Tensor | None]:
         width, height = photographs.sizes_px[view].tolist()
@@ -71,9 +71,11 @@ def priors_of(
         if size_px is not None:
             size = size_px[::-1]
             picture = interpolate(picture, size, mode="bilinear", antialias=True)
-        return _map(network((picture - means) / deviations), kind)
+        return _map(run((picture - means) / deviations), kind)
 
-    found = {name: guess(view) for view, name in enumerate(photographs.names)}
+    numbers = range(photographs.num_views)
+    guesses = map(guess, numbers) if callable(network) else side_by_side(guess, numbers)
+    found = dict(zip(photographs.names, guesses, strict=True))
     return _prior(from_maps.stacked(found, photographs is not views), kind, meaning)
 
 
@@ -113,3 +115,35 @@ def _prior(maps: from_maps.Maps, kind: Kind, meaning: dict[str, Any]) -> Prior:
         variance = from_maps.variance_of(maps, known, error**2)
         return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **maps.about, **meaning)
     return InlierPrior(probability=values[..., 0], **maps.about, **meaning)
+
+
+def _loaded(path: Path) -> Network:
+    """Open an ONNX file; one thread a picture, so that bits do not depend on their number."""
+    if path.suffix.lower() != ".onnx":
+        raise InputError(
+            f"{path}: is no ONNX file. Files of `torch.export` (.pt2) and of `torch.save` hold "
+            "pickles, which may run any program when they are loaded. If you trust it, load it "
+            "yourself and give the module: `torch.export.load(path).module()`."
+        )
+    if find_spec("onnxruntime") is None:
+        raise ConfigError(
+            f"{path} needs onnxruntime, which is not installed: pip install 'pimper_torch[onnx]'."
+        )
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # its own kinds, one for each fault
+        raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
+    (into, *_), outputs = session.get_inputs(), [one.name for one in session.get_outputs()]
+    wanted = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
+
+    def run(picture: Picture) -> list[Tensor]:
+        found = session.run(wanted, {into.name: picture.detach().float().cpu().numpy()})
+        return [torch.from_numpy(one).to(picture) for one in found]
+
+    return run

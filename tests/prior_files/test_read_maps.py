@@ -150,14 +150,20 @@ def test_depth_in_levels_of_sixteen_bits_is_up_to_its_scale(views, tmp_path):
     assert found.variance[0, 0, 0].isinf()
 
 
-def test_logarithmic_depth_of_moge_is_refused(views, tmp_path):
+def test_logarithmic_depth_of_moge_is_metres(views, tmp_path):
+    """As its authors write it: 1 to 65534 are logarithms from near to far, 0 is nothing."""
+    near, far = 0.7, 12.5
+    depth = np.random.default_rng(4).uniform(near, far, size=(24, 32))
+    levels = (1 + np.round(np.log(depth / near) / np.log(far / near) * 65533)).astype(np.uint16)
+    levels[0, 0], levels[0, 1] = 0, 65535
     text = PngImagePlugin.PngInfo()
-    for name in ("near", "far"):
-        text.add_text(name, "1.5")
-    levels = np.ones((24, 32), np.uint16)
+    text.add_text("near", str(near))
+    text.add_text("far", str(far))
     Image.fromarray(levels).save(tmp_path / "a b.png", pnginfo=text)
-    with pytest.raises(InputError, match=r"a b.png: its levels are logarithms .*; needed: depth"):
-        read_depth(tmp_path, views)
+    found = read_depth(tmp_path, views)
+    assert found.variance[0, 0, :2].isinf().all()
+    expected = torch.from_numpy(depth.astype(np.float32))
+    assert_close(found.depth[0, 1:], expected[1:], rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("packing", [0, 2, 3])

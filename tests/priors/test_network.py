@@ -8,6 +8,7 @@ import pimper_torch as pt
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.priors.map_config import DEPTH_ERROR
 from pimper_torch.runtime.errors import ConfigError, InputError
+from tests.priors.onnx_files import model
 
 
 @pytest.fixture
@@ -125,9 +126,64 @@ def test_gradients_of_the_parameters_are_those_of_finite_differences(views):
     assert torch.autograd.gradcheck(guess, given)
 
 
-def test_a_file_is_refused_with_what_loads_it(views, tmp_path):
-    with pytest.raises(InputError, match=r"net.onnx; needed: a module.*call onnxruntime"):
-        pt.priors_of(tmp_path / "net.onnx", views, "depth")
+ONE, TWO = {"one": ((), (1.0,))}, {"two": ((), (2.0,))}
+GREY = {"grey": ((1, 3, 1, 1), (0.25, 0.5, 0.25))}
+
+
+def test_an_onnx_file_gives_what_its_nodes_compute(views, tmp_path):
+    """The map is 2 x - 1; there is another output, which is not looked at."""
+    pytest.importorskip("onnxruntime")
+    nodes = [
+        ("Mul", ("picture", "two"), "double"),
+        ("Sub", ("double", "one"), "map"),
+        ("Neg", ("map",), "else"),
+    ]
+    path = tmp_path / "net.onnx"
+    path.write_bytes(model(nodes, ONE | TWO, ("map", "else")))
+    found = pt.priors_of(path, views, "albedo", linear=True, error=0.5)
+    assert_close(found.albedo[1, :, :12, :16], 2 * views.images[1, :, :12, :16] - 1)
+    assert_close(found.variance[0], torch.full((20, 30), 0.25))
+    torch.set_num_threads(2)
+    again = pt.priors_of(str(path), views, "albedo", linear=True, error=0.5)
+    torch.set_num_threads(1)
+    assert torch.equal(again.albedo, found.albedo)
+    with pytest.raises(
+        InputError, match=r"returns \(1, 3, 20, 30\); needed for depth: a map \(1, 1"
+    ):
+        pt.priors_of(path, views, "depth")
+
+
+def test_an_output_called_variance_is_one(views, tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "net.onnx"
+    nodes = [
+        ("Conv", ("picture", "grey"), "map"),
+        ("Neg", ("picture",), "else"),
+        ("Mul", ("map", "two"), "variance"),
+    ]
+    path.write_bytes(model(nodes, TWO | GREY, ("map", "else", "variance")))
+    found = pt.priors_of(path, views, "depth", linear=True)
+    weights = torch.tensor([0.25, 0.5, 0.25])
+    mixed = torch.einsum("c,chw->hw", weights, views.images[0])
+    assert_close(found.depth[0], mixed)
+    assert_close(found.variance[0], 2 * mixed)
+
+
+@pytest.mark.parametrize("name", ["net.pt2", "net.pt", "net.safetensors"])
+def test_files_that_hold_pickles_are_refused(name, views, tmp_path):
+    with pytest.raises(InputError, match="which may run any program when they are loaded"):
+        pt.priors_of(tmp_path / name, views, "depth")
+
+
+def test_a_damaged_onnx_file_and_a_missing_package_are_told(views, tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "net.onnx"
+    path.write_bytes(b"none")
+    with pytest.raises(InputError, match="cannot be opened by onnxruntime"):
+        pt.priors_of(path, views, "depth")
+    monkeypatch.setattr("pimper_torch.priors.network.find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match=r"pip install 'pimper_torch\[onnx\]'"):
+        pt.priors_of(path, views, "depth")
 
 
 @pytest.mark.parametrize(

@@ -89,17 +89,19 @@ def _raster(path: Path, values: np.ndarray) -> np.ndarray:
 
 
 def _picture(path: Path, cut_out: bool) -> np.ndarray:
-    """Read samples; refuse depth that MoGe wrote, whose levels are logarithms."""
+    """Read samples; depth that MoGe wrote, whose levels are logarithms, as depth."""
     decoded = decode(path)
     if cut_out and decoded.alpha is not None and bool((decoded.alpha < 1).any()):
         return decoded.alpha.numpy()[..., None]
     values = decoded.samples.numpy().transpose(1, 2, 0)
     with Image.open(path, formats=("PNG", "JPEG")) as image:
-        if {"near", "far"} <= image.info.keys():
-            raise InputError(
-                f"{path}: its levels are logarithms from `near` to `far`, as MoGe writes them; "
-                "needed: depth in EXR, NPY or NPZ, such as the `depth.exr` of `moge infer --maps`."
-            )
+        near, far = (image.info.get(name) for name in ("near", "far"))
+    if near is not None and far is not None and decoded.bits == 16:
+        levels = np.rint(values * decoded.full)
+        part = (levels - 1) / 65533  # 0 is unknown, 65535 infinitely far
+        values = np.float32(near) ** (1 - part) * np.float32(far) ** part
+        unknown = (levels == 0) | (levels == decoded.full)
+        values = np.where(unknown, np.float32(np.nan), values)
     if decoded.alpha is not None:
         values = np.where(decoded.alpha.numpy()[..., None] < 1, np.float32(np.nan), values)
     return values

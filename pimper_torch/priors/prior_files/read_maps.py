@@ -57,8 +57,8 @@ def read_depth(
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
     A map has the photograph's name, with what estimators append, its shape, and any size. 0, NaN
-    and infinity say nothing. PNG counts in its full scale. ``NAME_variance.npy``, or ``variance``
-    in NPZ and EXR, has squared units.
+    and infinity say nothing. PNG counts in its full scale, that of MoGe in metres (text ``near``
+    and ``far``). ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has squared units.
 
     Args:
         inverse: Whether maps hold one over depth (disparity: Depth Anything 2, MiDaS); ``None``

@@ -1,0 +1,46 @@
+"""ONNX files by hand: a few nodes on one picture of 3 channels."""
+
+import struct
+
+
+def field(number: int, value: int | bytes | str) -> bytes:
+    """Write a field of protocol buffers: a number, or bytes."""
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    data = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | 2) + varint(len(data)) + data
+
+
+def varint(value: int) -> bytes:
+    """Write seven bits a byte, lowest first."""
+    out = b""
+    while value > 127:
+        out += bytes([value & 127 | 128])
+        value >>= 7
+    return out + bytes([value])
+
+
+def model(nodes, constants, outputs) -> bytes:
+    """Write a model.
+
+    Args:
+        nodes: Kind, inputs and output of each.
+        constants: Shape and numbers by name.
+        outputs: Names; the input is called ``picture``.
+    """
+
+    def port(name: str) -> bytes:
+        sides = b"".join(field(1, field(2, name + side)) for side in "nchw")
+        return field(1, name) + field(2, field(1, field(1, 1) + field(2, sides)))
+
+    graph = b"".join(
+        field(1, b"".join(field(1, one) for one in into) + field(2, out) + field(4, kind))
+        for kind, into, out in nodes
+    )
+    graph += field(2, "by hand")
+    for name, (shape, values) in constants.items():
+        sides = b"".join(field(1, side) for side in shape)
+        raw = struct.pack(f"<{len(values)}f", *values)
+        graph += field(5, sides + field(2, 1) + field(8, name) + field(9, raw))
+    graph += field(11, port("picture")) + b"".join(field(12, port(name)) for name in outputs)
+    return field(1, 8) + field(8, field(2, 13)) + field(7, graph)
