@@ -1,22 +1,17 @@
 """When one reading of data is believed: laws of the margins."""
 
-import pytest
 import torch
 
-from pimper_torch.priors.choice import standard_errors, surely_better
+from pimper_torch.priors.choice import surely_better
 
 
-def test_standard_errors_of_a_mean_are_those_of_statistics(generator):
-    differences = torch.randn(400, generator=generator, dtype=torch.float64) + 0.3
-    expected = differences.mean() / (differences.var() / 400).sqrt()
-    assert standard_errors(differences) == pytest.approx(float(expected))
-    # Neither the unit of a score counts, nor the order of the places; the sign turns round.
-    assert standard_errors(7 * differences.flip(0)) == pytest.approx(float(expected))
-    assert standard_errors(-differences) == pytest.approx(-float(expected))
-
-
-def test_places_that_are_too_few_tell_nothing():
-    assert standard_errors(torch.ones(7)) == 0
+def test_four_standard_errors_are_believed_and_places_that_are_too_few_tell_nothing(generator):
+    differences = torch.randn(400, generator=generator, dtype=torch.float64)
+    error = (differences.var() / 400).sqrt()
+    for wanted, believed in ((3.99, False), (4.01, True)):
+        moved = differences - differences.mean() + wanted * error
+        # Neither the unit of a score counts, nor the order of the places.
+        assert surely_better(7 * moved.flip(0), torch.zeros(400)) == believed
     assert surely_better(torch.ones(8), torch.zeros(8))
     assert not surely_better(torch.ones(7), torch.zeros(7))
 
