@@ -25,12 +25,6 @@ def write(path, **options):
     return path
 
 
-@pytest.fixture
-def stored():
-    v, u = np.mgrid[:48, :64]
-    return np.stack([40 + 3 * u, 60 + 3 * v, 60 + u + v], axis=-1).astype(np.uint8)
-
-
 @pytest.mark.parametrize("suffix", KINDS)
 def test_without_its_package_a_format_is_refused(tmp_path, monkeypatch, pixels, suffix):
     extra, kind, package = KINDS[suffix]
@@ -78,14 +72,12 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
     ("suffix", "name", "lossy"),
     [(".heic", "TIFF", False), (".cr2", "JPEG", True), (".png", "JPEG", True)],
 )
-def test_images_are_read_whatever_they_are_called(
-    tmp_path, stored, monkeypatch, suffix, name, lossy
-):
+def test_images_are_read_whatever_they_are_called(tmp_path, monkeypatch, suffix, name, lossy):
     monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # none is needed
     for index in range(3):
-        Image.fromarray(stored).save(tmp_path / f"{index}{suffix}", format=name)
+        Image.fromarray(STORED).save(tmp_path / f"{index}{suffix}", format=name)
     decoded = decode(tmp_path / f"0{suffix}")
-    wanted = torch.from_numpy(stored / 255).movedim(-1, 0).float()
+    wanted = torch.from_numpy(STORED / 255).movedim(-1, 0).float()
     assert_close(decoded.samples, wanted, rtol=0, atol=7 / 255 if lossy else 0)
     assert decoded.lossy == lossy
     assert load_views(tmp_path).num_views == 3

@@ -10,7 +10,7 @@ from pimper_torch.doors.io.decode import decode, read_header
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.radiometry import Srgb
 from pimper_torch.runtime.errors import PimperWarning
-from tests.io.heic_files import DEEP, UPRIGHT
+from tests.io.heic_files import DEEP, STORED, UPRIGHT
 
 # Of a lossy format: a level or three of 255.
 LOSS = 3.5 / 255
@@ -22,19 +22,12 @@ def needs_heif():
         pytest.skip("needs pi_heif or pillow_heif")
 
 
-@pytest.fixture
-def stored():
-    """The picture of both files before any rotation."""
-    v, u = np.mgrid[:48, :64]
-    return np.stack([40 + 3 * u, 60 + 3 * v, 60 + u + v], axis=-1).astype(np.uint8)
-
-
 def write(path, data):
     path.write_bytes(data)
     return path
 
 
-def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path, stored):
+def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path):
     path = write(tmp_path / "a.HEIC", UPRIGHT)
     header = read_header(path)
     assert (header.width, header.height, header.orientation) == (48, 64, 1)
@@ -43,23 +36,23 @@ def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path, stor
     assert header.colour.response == Srgb()
     assert header.colour.srgb_from_file is not None
     decoded = decode(path)
-    wanted = torch.from_numpy(np.rot90(stored, -1).copy() / 255).movedim(-1, 0).float()
+    wanted = torch.from_numpy(np.rot90(STORED, -1).copy() / 255).movedim(-1, 0).float()
     assert_close(decoded.samples, wanted, rtol=0, atol=LOSS)
     assert (decoded.lossy, decoded.full, decoded.alpha) == (True, 255, None)
 
 
-def test_heic_of_ten_bits_keeps_them(tmp_path, stored):
+def test_heic_of_ten_bits_keeps_them(tmp_path):
     decoded = decode(write(tmp_path / "a.heif", DEEP))
     assert decoded.full == 1023 << 6
-    wanted = torch.from_numpy(stored / 255).movedim(-1, 0).float()
+    wanted = torch.from_numpy(STORED / 255).movedim(-1, 0).float()
     assert_close(decoded.samples, wanted, rtol=0, atol=LOSS)
     assert len((decoded.samples * 1023).round().unique()) > 200
 
 
-def test_heic_beside_a_jpeg_of_the_same_name_is_passed_over(tmp_path, stored):
+def test_heic_beside_a_jpeg_of_the_same_name_is_passed_over(tmp_path):
     for index in range(3):
         write(tmp_path / f"{index}.heic", DEEP)
-        Image.fromarray(stored).save(tmp_path / f"{index}.jpg")
+        Image.fromarray(STORED).save(tmp_path / f"{index}.jpg")
     with pytest.warns(PimperWarning, match=r"were not read: HEIC \(3\)"):
         assert load_views(tmp_path).names == ("0.jpg", "1.jpg", "2.jpg")
 
