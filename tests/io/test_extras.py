@@ -12,7 +12,7 @@ from pimper_torch.doors.io.decode import decode, read_header
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import write_dng
-from tests.io.heic_files import DEEP
+from tests.io.heic_files import DEEP, STORED
 
 KINDS = {".heic": ("heic", "a HEIC image", "heif"), ".dng": ("raw", "camera raw", "rawpy")}
 
