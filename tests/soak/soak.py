@@ -16,7 +16,7 @@ from pathlib import Path
 from pimper_torch.cli.main import main as pimper
 from pimper_torch.runtime.memory import release_memory, resident_bytes
 
-_SCENE = "--table patterned --num-views 8 --width 240 --height 180 --processes 1 --supersample 1 -q"
+_SIZE = "--num-views 8 --width 240 --height 180 --processes 1 --supersample 1 -q"
 # Of memory, after the first two runs, which load modules and kernels and fill pools.
 MOST_GROWTH = 0.03
 
@@ -39,7 +39,8 @@ def soak(folder: Path, runs: int, command: list[str]) -> None:
     (folder / "tmp").mkdir()
     if not command:
         scene = folder / "scene"
-        assert pimper(["render", "mug", "-o", str(scene), *_SCENE.split()]) == 0
+        render = ["render", "mug", "--table", "patterned", "-o", str(scene)]
+        assert pimper([*render, *_SIZE.split()]) == 0
         command = ["reconstruct", str(scene / "photos"), "--preset", "fast"]
     found = []
     for run in range(runs):
