@@ -241,8 +241,8 @@ def colour_of_exif(exif: Image.Exif) -> Colour:
     gamma = tags.get(ExifTags.Base.Gamma)
     if gamma is not None and not _is_srgb(positive_number(gamma)):
         return Colour(source="EXIF", trouble="has a gamma that is not sRGB's")
-    index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)
-    uncalibrated = tags.get(ExifTags.Base.ColorSpace) == 65535
-    if uncalibrated and str(index).strip("\0 ") == "R03":  # Adobe RGB, as DCF 2.0 has it
+    marked = tags.get(ExifTags.Base.ColorSpace) == 65535 and ExifTags.IFD.Interop in tags
+    index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) if marked else ""
+    if str(index).strip("\0 ") == "R03":  # Adobe RGB, as DCF 2.0 has it
         return _colour("EXIF (Adobe RGB)", Gamma(exponent=563 / 256), primaries_of(ADOBE_RGB))
     return SILENT
