@@ -124,7 +124,7 @@ def _curve(tag: bytes) -> Response:
         raise InputError("has a tone curve that is cut short")
     values = struct.unpack_from(f">{count}H", tag, 12)
     if count < 2:
-        return _power(values[0] / 256 if values else 1)
+        return _power(values[0] / 256 if values else 1.0)
     return _table(torch.tensor(values, dtype=torch.float64) / 65535)
 
 

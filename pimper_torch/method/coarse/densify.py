@@ -116,7 +116,7 @@ def _search(
     scene: SparseScene,
     points: Int[Tensor, " chosen"],
     level: MatchingLevel,
-    chosen: Sequence[Int[Tensor, " source"]],
+    chosen: Sequence[Int[Tensor, " _"]],
     before: DepthMaps | None,
     view: int,
 ) -> tuple[Map, Map, float]:
@@ -200,7 +200,7 @@ def _checked(
     level: MatchingLevel,
     fields: Float[Tensor, "2 view height width"],
     steps: Sequence[float],
-    chosen: Sequence[Int[Tensor, " source"]],
+    chosen: Sequence[Int[Tensor, " _"]],
 ) -> DepthMaps:
     """Find as valid the depths whose windows match and that other views agree with."""
     inverse_depth, score = fields
