@@ -226,7 +226,7 @@ def colour_of_info(info: Mapping[Any, Any], cicp: bytes = b"") -> Colour:
         return Colour(source="PNG's sRGB", response=Srgb())
     gamma, points = info.get("gamma", 1 / _SRGB_GAMMA), info.get("chromaticity", _SRGB_XY)
     far = max(abs(one - other) for one, other in zip(points, _SRGB_XY, strict=True))
-    if not _is_srgb(1 / gamma if gamma else 0) or far > _NEAR_XY:
+    if not _is_srgb(1 / gamma if gamma else 0.0) or far > _NEAR_XY:
         return Colour(source="PNG", trouble=f"has gAMA {gamma:.5g} and cHRM that are not sRGB's")
     return Colour(source="PNG's gAMA", response=Srgb()) if "gamma" in info else SILENT
 
