@@ -24,6 +24,10 @@ STAGE, SCENE, WHOLE = 0.002, 0.005, 0.02
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
+# No step of the differences changes a choice of a patch here, such as whether it is fitted.
+FEW = {"seed": 36, "num_views": 5, "width": 32, "num_points": 11}
+
+
 @pytest.fixture(scope="module")
 def tiny():
     return small_scene(num_views=5, width=40, num_points=16)
@@ -72,7 +76,7 @@ def test_stages_of_the_published_chain_agree_with_finite_differences(published, 
 @pytest.mark.parametrize("light", ["soft", "point_light"])
 @pytest.mark.parametrize("loss", ["squares", "cauchy"])
 def test_factorization_agrees_with_finite_differences(light, loss, generator):
-    few = small_scene(num_views=5, width=32, num_points=11)
+    few = small_scene(**FEW)
     chain = in_iterations(light={"model": light}, factorize={"loss": loss})
     found = probes(chain, *few)["factorize"].check(generator, directions=1)
     assert_agree("factorize", found, STAGE)
@@ -98,7 +102,7 @@ def test_stages_agree_with_finite_differences_on_whole_scenes(tmp_path, scene, s
 
 @pytest.mark.slow
 def test_the_chain_whole_agrees_with_finite_differences(generator):
-    few = small_scene(num_views=5, width=32, num_points=11)
+    few = small_scene(**FEW)
     found = probes(in_iterations(), *few)["chain"].check(generator, directions=2, weights=4)
     assert_agree("chain", found, WHOLE)
 
@@ -125,7 +129,7 @@ class Network(FactorPrior):
 
 @pytest.mark.slow
 def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
-    scene, coarse = small_scene(num_views=5, width=32, num_points=11)
+    scene, coarse = small_scene(**FEW)
     chain = chain_of("default", scales=[1.0])
     chain.silhouettes = Given(Silhouettes.everything(scene.views))
     chain.coarse_surface = Given(coarse)
