@@ -6,6 +6,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.pixels import homogeneous
+from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.method.sfm.colmap import bundle, observation_errors
 from pimper_torch.method.sfm.model import SparseModel, longest_tracks
 from pimper_torch.method.sfm.reconstruct_config import MIN_POINTS
@@ -18,6 +19,7 @@ from pimper_torch.method.sfm.track_observations import (
 from pimper_torch.method.sfm.undistort import pinholes_for, undistorted
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.mapped import by_view
 
 # Residual at which a track observation counts half, before the residuals themselves tell; then
 # their spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
@@ -25,7 +27,7 @@ from pimper_torch.runtime.ledger import leave_out
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
 # Relative falls of the cost that end the adjustment that tells the spread, and the one after it.
-_FIRST_TOLERANCE, _TOLERANCE = 1e-4, 1e-5
+_FIRST_TOLERANCE, _TOLERANCE = 1e-3, 1e-5
 
 
 # Points a view in the rounds before the last, whose cameras are where the next one looks from. On
@@ -52,9 +54,10 @@ def refine_tracks(
         The same views. Points that nothing agrees about are left out.
     """
     rounds = iterations if cameras else min(iterations, 1)
+    gray = views.replace(images=by_view(_gray, views.images.detach()))
     for left in reversed(range(rounds)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, pinholes = _sighted(views, some)
+        found, pinholes = _sighted(gray, some)
         renewed, aligned = _renewed(some, found, pinholes)
         if not bool(aligned.any()):
             return model
@@ -71,6 +74,12 @@ def refine_tracks(
         lost = before - len(model.points_world)
         leave_out("sfm.tracks", lost, total=before)
     return model
+
+
+def _gray(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "1 height width"]:
+    """Average colours; what is saturated in one stays so."""
+    brightest = image.amax(dim=0, keepdim=True)
+    return torch.where(brightest >= SATURATED, brightest, image.mean(dim=0, keepdim=True))
 
 
 def _sighted(views: Views, model: SparseModel) -> tuple[TrackObservations, Cameras]:

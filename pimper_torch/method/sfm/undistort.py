@@ -74,9 +74,8 @@ def undistorted(
         grid = shared if alike else source_grid(lens, like=views.images)
         return _undistort_image(views, index, lens, grid)
 
-    for found in side_by_side(one, range(views.num_views)):
-        yield found
-        release_memory()  # of the photograph, and of its grid
+    yield from side_by_side(one, range(views.num_views))
+    release_memory()  # of the photographs, and of their grids
 
 
 def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
