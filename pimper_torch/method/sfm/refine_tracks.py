@@ -7,15 +7,11 @@ from torch import Tensor
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.pixels import homogeneous
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import Pixels
+from pimper_torch.method.sfm import track_observations as tracks
 from pimper_torch.method.sfm.colmap import bundle, observation_errors
 from pimper_torch.method.sfm.model import SparseModel, longest_tracks
 from pimper_torch.method.sfm.reconstruct_config import MIN_POINTS
-from pimper_torch.method.sfm.track_observations import (
-    TrackObservations,
-    log_pictures,
-    sight,
-    tangents,
-)
 from pimper_torch.method.sfm.undistort import pinholes_for, undistorted
 from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.runtime.ledger import leave_out
@@ -82,21 +78,21 @@ def _gray(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "1 heig
     return torch.where(brightest >= SATURATED, brightest, image.mean(dim=0, keepdim=True))
 
 
-def _sighted(views: Views, model: SparseModel) -> tuple[TrackObservations, Cameras]:
+def _sighted(views: Views, model: SparseModel) -> tuple[tracks.TrackObservations, Cameras]:
     """Find the points in undistorted photographs, which are held no longer than that."""
     raster = (views.num_views, *views.images.shape[-2:])
-    pictures = log_pictures(undistorted(views, model.lenses), raster)
+    pictures = tracks.log_pictures(undistorted(views, model.lenses), raster)
     cameras = Cameras(
         intrinsics=pinholes_for(model.lenses),
         cam_from_world=model.cam_from_world,
         sizes_px=views.sizes_px.cpu(),
     )
-    planes = tangents(model.points_world, model.observed, cameras)
-    return sight(pictures, cameras, planes), cameras
+    planes = tracks.tangents(model.points_world, model.observed, cameras)
+    return tracks.sight(pictures, cameras, planes), cameras
 
 
 def _renewed(
-    model: SparseModel, found: TrackObservations, cameras: Cameras
+    model: SparseModel, found: tracks.TrackObservations, cameras: Cameras
 ) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
     """Replace features by track observations; tell which observations are track observations."""
     often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
@@ -120,11 +116,8 @@ def _renewed(
 
 
 def _photographed(
-    pixels: Float[Tensor, "sighting 2"],
-    view: Int[Tensor, " sighting"],
-    cameras: Cameras,
-    model: SparseModel,
-) -> Float[Tensor, "sighting 2"]:
+    pixels: Pixels, view: Int[Tensor, " sighting"], cameras: Cameras, model: SparseModel
+) -> Pixels:
     """Carry pixels of the undistorted photographs to the photographs."""
     ends = homogeneous(pixels)
     found = torch.empty_like(pixels)
