@@ -55,7 +55,7 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
     options.num_threads = 1
     options.random_seed = seed
     options.mapper.abs_pose_min_num_inliers = MIN_POINTS
-    # Short adjustments, a third of the CPU s of COLMAP's own: here all is adjusted to tracks later.
+    # Short adjustments take half of the CPU s (docs/decisions.md): all is adjusted to tracks later.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
