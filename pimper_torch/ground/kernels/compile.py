@@ -72,11 +72,14 @@ def compiled(
     # A function that is called, not inlined, has two versions: its own machine code, and a copy in
     # each kernel, which is optimized again and rounds otherwise. The linker takes the first that is
     # loaded: its own where it has just been compiled, the copy where kernels come from disk.
+    called = bool(signatures or annotated)
     decorate = numba.njit(
-        cache=True,
-        nogil=True,
+        cache=called,
+        nogil=called,
         error_model="numpy",
-        forceinline=not (signatures or annotated),
+        forceinline=not called,
+        no_cpython_wrapper=not called,
+        no_cfunc_wrapper=True,
         fastmath=_FAST if fast else False,
     )
 

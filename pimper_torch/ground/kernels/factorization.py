@@ -225,53 +225,57 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
     size = lights.size
     slope, step = np.zeros((len(lights), 4)), np.zeros(size)
     new_slope, new_lights, new_shading = np.zeros_like(slope), lights.copy(), shading.copy()
-    curvature, factor = np.zeros((size, size)), np.empty((size, size))
-    scale_start = _robust_weights(patch, lights, shading, 0.0)
-    energy = _energy(patch)
-    _equations(patch, lights)
-    update_shading(patch.equations, shading, SHADING_STEPS)
-    cost = _evaluate(patch, lights, shading, slope)
-    _curvature(patch, lights, shading, curvature_samples, curvature)
-    damping, small = INITIAL_DAMPING, 0
-    for taken in range(1, max_iterations + 1):
-        for f in range(len(lights)):
-            for i in range(4):
-                step[4 * f + i] = slope[f, i]
-        trace = 0.0
-        for i in range(size):
-            trace += curvature[i, i]
-        mean = (trace + patch.slack) / (4 * patch.num_views)
-        after = np.inf
-        if solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
+    curvature, factor, mean = np.zeros((size, size)), np.empty((size, size)), 0.0
+    cost, energy, scale, damping, small = np.inf, 0.0, 0.0, INITIAL_DAMPING, 0
+    better, exact, stalled = True, False, False
+    # Round 0 evaluates the start, and every round judges the step before: each function that is
+    # inlined here has one call where it can, as compiling a copy takes seconds.
+    for taken in range(max_iterations + 2):
+        if better and taken != 1:
+            scale = _robust_weights(patch, lights, shading, scale)
+            if taken == 0:
+                energy = _energy(patch)
+            elif patch.loss != SQUARES:
+                cost = _evaluate(patch, lights, shading, slope)
+        if exact or small >= small_steps:
+            return taken - 1, _CONVERGED
+        if stalled:
+            return taken - 1, _STALLED
+        if taken > max_iterations:
+            break
+        if taken > 0:
+            if better:
+                _equations(patch, lights)
+                _curvature(patch, lights, shading, curvature_samples, curvature)
+            trace = 0.0
             for f in range(len(lights)):
                 for i in range(4):
-                    new_lights[f, i] = lights[f, i] + step[4 * f + i]
-            overwrite(new_shading, shading)
-            _keep_scale(patch, lights, new_lights, new_shading)
+                    step[4 * f + i] = slope[f, i]
+                    trace += curvature[4 * f + i, 4 * f + i]
+            mean = (trace + patch.slack) / (4 * patch.num_views)
+        after = np.inf
+        if taken == 0 or solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
+            if taken > 0:
+                for f in range(len(lights)):
+                    for i in range(4):
+                        new_lights[f, i] = lights[f, i] + step[4 * f + i]
+                overwrite(new_shading, shading)
+                _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
             update_shading(patch.equations, new_shading, SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
-        better = after < cost
-        exact = cost <= (ZERO_ROUNDINGS * _EPS) ** 2 * energy
-        if better:
-            small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
-        damping *= DAMPING_DECREASE if better else DAMPING_INCREASE
-        stalled = damping > 1 / _EPS and not exact
-        damping = max(damping, _EPS)
+        better = taken == 0 or after < cost
+        if taken > 0:
+            exact = cost <= (ZERO_ROUNDINGS * _EPS) ** 2 * energy
+            if better:
+                small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
+            damping *= DAMPING_DECREASE if better else DAMPING_INCREASE
+            stalled = damping > 1 / _EPS and not exact
+            damping = max(damping, _EPS)
         if better:
             overwrite(lights, new_lights)
             overwrite(shading, new_shading)
             slope, new_slope, cost = new_slope, slope, after
-            if patch.loss != SQUARES:
-                scale_start = _robust_weights(patch, lights, shading, scale_start)
-                cost = _evaluate(patch, lights, shading, slope)
-        if exact or small >= small_steps:
-            return taken, _CONVERGED
-        if stalled:
-            return taken, _STALLED
-        if better:
-            _equations(patch, lights)
-            _curvature(patch, lights, shading, curvature_samples, curvature)
     return max_iterations, _LIMIT
 
 
