@@ -13,15 +13,17 @@ from pimper_torch.ground.kernels.compile import (
     COARSE,
     GRADIENTS,
     PHOTOMETRY,
+    ROWS,
     SFM,
     SURFACE,
     SWEEP,
+    cache_folder,
     compiled,
-    forget_stale,
+    forget_unused,
     load,
 )
 
-AHEAD = "from pimper_torch.ground.kernels.compile import *; child = compile_ahead(); "
+AHEAD = "from pimper_torch.ground.kernels.compile import *; children = compile_ahead(); "
 
 
 @pytest.fixture
@@ -47,13 +49,14 @@ def test_compile_all_leaves_torchs_threads_alone_and_compile_ahead_nothing_to_do
     code = (
         "import torch; torch.set_num_threads(2)\n"
         "from pimper_torch.ground.kernels.compile import compile_ahead, compile_all\n"
-        "compile_all(); assert torch.get_num_threads() == 2; assert compile_ahead() is None"
+        "compile_all(); assert torch.get_num_threads() == 2; assert not compile_ahead.__wrapped__()"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_every_kernel_of_a_run_is_compiled():
-    listed = {*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE}
+    listed = [name for row in ROWS for name in row]
+    assert sorted(listed) == sorted((*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE))
     sources = Path(pimper_torch.ground.kernels.__path__[0]).glob("*.py")
     with_types = {
         path.stem
@@ -63,32 +66,30 @@ def test_every_kernel_of_a_run_is_compiled():
     assert with_types == {*listed, *GRADIENTS, "lookup"}  # which other kernels import
 
 
-def test_no_kernel_is_compiled_twice_at_once(fresh):
-    """What another process compiles comes last, and is waited for."""
+def test_a_run_waits_for_what_another_compiles_and_executes_it(fresh):
     code = (
         "from pimper_torch.ground.kernels.compile import cache_folder, load\n"
-        "from pimper_torch.runtime.progress import listening\n"
-        "print(cache_folder(), flush=True); input()\n"
-        "with listening(lambda done, total: print(done, flush=True)):\n"
-        "    load(('line_matches', 'lookup'))"
+        "print(cache_folder(), flush=True); input(); load(('line_matches',))\n"
+        "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
+        "print(*kernel.stats.cache_hits.values())"
     )
-    with started(code) as other:
-        assert other.stdout is not None
-        assert other.stdin is not None
-        folder = other.stdout.readline().strip()
-        with FileLock(f"{folder}/line_matches.lock"):
-            print(file=other.stdin, flush=True)
-            assert [other.stdout.readline() for _ in range(2)] == ["0\n", "1\n"]
-            time.sleep(0.4)
-            assert other.poll() is None
-        assert other.stdout.read() == "2\n"
-        assert other.wait() == 0
+    with started(code) as run:
+        assert run.stdout is not None
+        assert run.stdin is not None
+        folder = run.stdout.readline().strip()
+        with FileLock(f"{folder}/0.lock"):
+            print(file=run.stdin, flush=True)
+            time.sleep(2)
+            assert run.poll() is None
+        assert run.stdout.read() == "1\n"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="ends processes as POSIX does")
 @pytest.mark.parametrize("end", ["sys.exit()", "os.kill(os.getpid(), 9)"])
 def test_the_compiling_process_ends_with_its_parent(fresh, end):
-    with started(f"import os, sys; {AHEAD} print(child.pid, flush=True); input(); {end}") as parent:
+    with started(
+        f"import os, sys; {AHEAD} print(children[0].pid, flush=True); input(); {end}"
+    ) as parent:
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         os.kill(child, 0)
@@ -104,7 +105,7 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
 
 def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
     code = (
-        f"{AHEAD} child.kill(); child.wait(); load(('line_matches',))\n"
+        f"{AHEAD} [each.kill() for each in children]; load(('line_matches',))\n"
         "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
         "print(dict(kernel.stats.cache_misses))"
     )
@@ -114,10 +115,14 @@ def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
 
 
 @pytest.mark.slow
-def test_a_kernel_gives_the_same_bits_compiled_and_from_disk(fresh):
-    """The kernel calls many functions: its machine code has their copies, optimized again."""
+def test_a_kernel_gives_the_same_bits_compiled_and_from_disk_and_in_another_order(
+    fresh, tmp_path, monkeypatch
+):
+    """The kernel calls many functions, some of which another kernel calls, too."""
     code = (
         "import numpy as np\n"
+        "from pimper_torch.ground.kernels.compile import load\n"
+        "load(('lights_and_albedo',))\n"
         "from pimper_torch.ground.kernels import lights_and_albedo as lights\n"
         "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
         "normals = random.normal(size=(3, samples))\n"
@@ -131,10 +136,13 @@ def test_a_kernel_gives_the_same_bits_compiled_and_from_disk(fresh):
         "misses = sum(lights.fit.stats.cache_misses.values())\n"
         "print(misses, light.tobytes().hex(), albedo.tobytes().hex())"
     )
-    runs = [subprocess.check_output([sys.executable, "-c", code], text=True) for _ in range(2)]
-    (first, *compiled_bits), (later, *loaded_bits) = (run.split() for run in runs)
-    assert (first, later) == ("1", "0")
-    assert compiled_bits == loaded_bits
+    other = "import pimper_torch.ground.kernels.factorization\n" + code.replace("load((", "print((")
+    first, later = (subprocess.check_output([sys.executable, "-c", code]) for _ in range(2))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
+    anew = subprocess.check_output([sys.executable, "-c", other])
+    assert first.startswith(b"0 ")
+    assert first == later
+    assert anew.split()[-2:] == first.split()[-2:]
 
 
 def test_an_unknown_kernel_is_an_error():
@@ -142,17 +150,43 @@ def test_an_unknown_kernel_is_an_error():
         load(("no_such_kernel",))
 
 
-def test_kernels_are_compiled_anew_when_any_of_their_sources_changed(tmp_path, monkeypatch):
+def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch):
+    """Wherever the package is, and whenever it was installed."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
+    found = []
+    for place, code in (("one", "pass"), ("two", "pass"), ("two", "pass  # edited")):
+        (tmp_path / place).mkdir(exist_ok=True)
+        (tmp_path / place / "kernel.py").write_text(code)
+        monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path / place)])
+        found.append(cache_folder.__wrapped__())
+    assert found[0] == found[1] != found[2]
+    assert {folder.parent for folder in found} == {tmp_path / "cache"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such modes")
+def test_machine_code_is_read_from_folders_of_the_user_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path)])
-    kept = tmp_path / "__pycache__" / "one.py311.nbi"
-    kept.parent.mkdir()
-    for source in ("one.py", "two.py"):
-        (tmp_path / source).touch()
-        os.utime(tmp_path / source, (100, 100))
-    kept.touch()
-    os.utime(kept, (200, 200))
-    forget_stale(kept.parent)
-    assert kept.exists()
-    os.utime(tmp_path / "two.py", (300, 300))
-    forget_stale(kept.parent)
-    assert not kept.exists()
+    folder = cache_folder.__wrapped__()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o770)
+    beside = cache_folder.__wrapped__()
+    assert beside == tmp_path / "__pycache__" / folder.name
+    beside.rmdir()
+    beside.symlink_to(tmp_path)
+    assert tmp_path not in cache_folder.__wrapped__().parents
+
+
+def test_folders_of_other_code_go_when_they_were_not_used_for_long(tmp_path):
+    long_ago = time.time() - 40 * 86_400
+    for name, mode, used in (
+        ("kernels-" + "0" * 32, 0o700, time.time()),
+        ("kernels-" + "1" * 32, 0o755, long_ago),
+        ("kernels-of-others", 0o700, long_ago),
+        ("kernels-" + "2" * 32, 0o700, long_ago),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name).chmod(mode)
+        os.utime(tmp_path / name, (used, used))
+    forget_unused(tmp_path)
+    assert sorted(path.name[-1] for path in tmp_path.iterdir()) == ["0", "1", "s"]

@@ -1,63 +1,11 @@
-"""Tensors as contiguous arrays on the CPU, and records of arrays that kernels take."""
+"""Tensors as contiguous arrays on the CPU."""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-Floats1 = Annotated[NDArray[Any], "float32[::1]"]
-Floats2 = Annotated[NDArray[Any], "float32[:,::1]"]
-Floats3 = Annotated[NDArray[Any], "float32[:,:,::1]"]
-Floats4 = Annotated[NDArray[Any], "float32[:,:,:,::1]"]
-Floats5 = Annotated[NDArray[Any], "float32[:,:,:,:,::1]"]
-Doubles1 = Annotated[NDArray[Any], "float64[::1]"]
-Doubles2 = Annotated[NDArray[Any], "float64[:,::1]"]
-Doubles3 = Annotated[NDArray[Any], "float64[:,:,::1]"]
-Doubles4 = Annotated[NDArray[Any], "float64[:,:,:,::1]"]
-Integers1 = Annotated[NDArray[Any], "int64[::1]"]
-Integers2 = Annotated[NDArray[Any], "int64[:,::1]"]
-Bytes2 = Annotated[NDArray[Any], "uint8[:,::1]"]
-Masks3 = Annotated[NDArray[Any], "boolean[:,:,::1]"]
-Masks4 = Annotated[NDArray[Any], "boolean[:,:,:,::1]"]
-
-
-class PictureRows(NamedTuple):
-    """Pyramids of photographs, one in a row: the finest level, and the others."""
-
-    finest: Floats2
-    coarser: Floats2
-
-
-class FractionRows(NamedTuple):
-    """The same of fractions in 255ths."""
-
-    finest: Bytes2
-    coarser: Bytes2
-
-
-class Projection(NamedTuple):
-    """Projection of patches into views.
-
-    Attributes:
-        rows: Where each camera's photograph is among the pictures.
-        image_from_patch: Three by four, for every patch and view.
-        centers_patch: Of the cameras, for every patch and view.
-    """
-
-    rows: Integers1
-    image_from_patch: Doubles3
-    centers_patch: Doubles2
-
-
-class Samples(NamedTuple):
-    """Samples of templates, patch frame; ``outward`` is unit."""
-
-    origin: Doubles2
-    spacing: Doubles1
-    depth: Floats3
-    outward: Floats4
 
 
 def as_array(values: Tensor, dtype: torch.dtype | None = None) -> NDArray[Any]:

@@ -1,22 +1,28 @@
-"""Compilation of kernels: once per installation, some of them in a child process.
+"""Compilation of kernels: once for each state of their code, in child processes.
 
-Machine code is cached on disk, in numba's folder. A kernel is compiled when its module is imported.
-Every module has a lock there, so that no two processes compile the same kernel.
+Machine code is kept in a folder of the user's that is named by a hash of the kernels' sources, of
+numba's version and of the processor: every installation of the same code finds it there. It depends
+on what its process compiled before. So each row of modules is compiled by a process of its own,
+whole and in order, and a run executes what it loads from disk: the same code every time.
 """
 
 import atexit
+import hashlib
 import os
+import shutil
+import stat
 import subprocess
 import sys
+import tempfile
 import threading
-from collections import deque
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
 from inspect import unwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, TypeVar, get_origin, get_type_hints
 
 import pimper_torch.ground.kernels
@@ -37,6 +43,12 @@ SURFACE = (
     "decimation",
 )
 
+# What is compiled by a process each, in order: both take about as long.
+ROWS = (
+    (*SFM, *COARSE, *PHOTOMETRY[:2], *SWEEP, *SURFACE[:3]),
+    (*PHOTOMETRY[2:], *SURFACE[3:]),
+)
+
 # Of gradients alone: compiled where a run first asks for them.
 GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_adjoint")
 
@@ -44,10 +56,9 @@ GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_ad
 # NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
-_NICENESS = 10  # of the child: what the run itself does comes first
+_NICENESS = 10  # of the children: what the run itself does comes first
 
-# Whether a kernel that another process compiles is waited for.
-_blocking: ContextVar[bool] = ContextVar("blocking", default=True)
+_KEPT_DAYS = 30  # that a folder of other code is kept after its last use
 
 
 def compiled(
@@ -61,10 +72,7 @@ def compiled(
         signatures: Without any, the function is inlined into the kernels that call it.
         fast: Whether sums may be reordered, as vectorization needs.
         annotated: Whether it is compiled for the types that its annotations name, see
-            :mod:`~pimper_torch.ground.kernels.arrays`; it returns nothing.
-
-    Raises:
-        filelock.Timeout: Another process compiles its module, and :func:`load` has others to do.
+            :mod:`~pimper_torch.ground.kernels.signatures`; it returns nothing.
     """
     import numba
     from filelock import FileLock
@@ -74,7 +82,6 @@ def compiled(
     # loaded: its own where it has just been compiled, the copy where kernels come from disk.
     called = bool(signatures or annotated)
     decorate = numba.njit(
-        cache=called,
         nogil=called,
         error_model="numpy",
         forceinline=not called,
@@ -86,10 +93,11 @@ def compiled(
     def compile_now(function: Function) -> Function:
         # Shape checkers wrap functions; their wrappers cannot be compiled.
         kernel = decorate(unwrap(function))
-        wanted = [numba.void(*_numba_types(unwrap(function)))] if annotated else [*signatures]
-        if wanted:
+        if called:
+            kernel._cache = _cache_class()(kernel.py_func)
+            wanted = [numba.void(*_numba_types(kernel.py_func))] if annotated else signatures
             module = function.__module__.rpartition(".")[2]
-            with FileLock(cache_folder() / f"{module}.lock", blocking=_blocking.get()):
+            with FileLock(cache_folder() / f"{module}.lock"):
                 for signature in wanted:
                     kernel.compile(signature)
             kernel.disable_compile()
@@ -123,97 +131,130 @@ def _numba_types(annotated: object) -> list[object]:
 
 
 @cache
-def cache_folder() -> Path:
-    """Return numba's folder of these kernels: beside them unless that is read-only."""
-    import numba
+def _cache_class() -> Callable[[object], object]:
+    """Return numba's cache of a function, in :func:`cache_folder`: its name says all else."""
+    from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
-    folder = Path(numba.njit(cache=True)(_newest_source).stats.cache_path)
-    forget_stale(folder)
+    place = SimpleNamespace(
+        get_cache_path=lambda: str(cache_folder()),
+        get_source_stamp=str,
+        get_disambiguator=str,
+        ensure_cache_path=lambda: None,
+    )
+    found = [SimpleNamespace(from_function=lambda *_: place)]
+    implementation = type("Kernels", (CompileResultCacheImpl,), {"_locator_classes": found})
+    return type("KernelCache", (FunctionCache,), {"_impl_class": implementation})
+
+
+@cache
+def cache_folder() -> Path:
+    """Return the folder of machine code, which is the user's alone, as code is unpickled from it.
+
+    It is in ``NUMBA_CACHE_DIR`` or the user's cache, or beside the kernels where that cannot be
+    written, or a temporary folder.
+    """
+    import llvmlite
+    import numba
+    from numba.core.registry import cpu_target
+
+    sources = Path(pimper_torch.ground.kernels.__path__[0])
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    version = (sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, processor)
+    code = hashlib.sha256(repr(version).encode())
+    for source in sorted(sources.glob("*.py")):
+        code.update(source.read_bytes())
+    name = f"kernels-{code.hexdigest()[:32]}"
+    for folder in (_chosen_cache() / name, sources / "__pycache__" / name):
+        with suppress(OSError):
+            folder.mkdir(0o700, parents=True, exist_ok=True)
+            if _of_user_alone(folder):
+                os.utime(folder)  # in use
+                return folder
+    folder = Path(tempfile.mkdtemp(), name)
+    folder.mkdir(0o700)
+    atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     return folder
 
 
-def forget_stale(folder: Path) -> None:
-    """Delete machine code older than any kernel's source: kernels inline one another."""
-    newest = _newest_source()
-    for kept in folder.glob("*.nb[ci]"):
-        with suppress(FileNotFoundError, PermissionError):  # another process was first, or may not
-            if kept.stat().st_mtime < newest:
-                kept.unlink()
+def _chosen_cache() -> Path:
+    import numba
+
+    if numba.config.CACHE_DIR:
+        return Path(numba.config.CACHE_DIR)
+    from pimper_torch.runtime.store.user_cache import user_cache  # imports torch
+
+    return user_cache()
 
 
-def _newest_source() -> float:
-    """Return when a kernel was last edited."""
-    folder = Path(pimper_torch.ground.kernels.__path__[0])
-    return max(source.stat().st_mtime for source in folder.glob("*.py"))
+def _of_user_alone(folder: Path) -> bool:
+    """Return whether the user may write there, and nobody else."""
+    about = folder.lstat()
+    alone = os.name == "nt" or (about.st_uid == os.getuid() and not about.st_mode & 0o077)
+    return stat.S_ISDIR(about.st_mode) and alone and os.access(folder, os.W_OK)
 
 
 def load(names: Sequence[str]) -> None:
-    """Import modules of kernels; those that another process compiles come last."""
-    from filelock import Timeout
+    """Import modules of kernels, as soon as the children have compiled them.
 
-    queue, others_first = deque(names), len(names)
-    while queue:
-        name = queue.popleft()
-        token = _blocking.set(others_first <= 0)
-        try:
-            import_module(f"{pimper_torch.ground.kernels.__name__}.{name}")
-        except Timeout:
-            queue.append(name)
-        finally:
-            _blocking.reset(token)
-        others_first -= 1
-        report(len(names) - len(queue), len(names))
+    Where a child died, what it left is compiled here.
+    """
+    for done, name in enumerate(names, start=1):
+        while not _is_done(name) and any(child.poll() is None for child in compile_ahead()):
+            time.sleep(0.05)
+        import_module(f"{pimper_torch.ground.kernels.__name__}.{name}")
+        report(done, len(names))
 
 
 def compile_all() -> None:
     """Compile every kernel of a run that is not cached yet."""
-    load((*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE))
-    _stamp().touch()
-
-
-def _stamp() -> Path:
-    """Return the file that is newer than all kernels once all are compiled for this processor."""
-    import numba
-    from numba.core.registry import cpu_target
-
-    _, processor, _ = cpu_target.target_context.codegen().magic_tuple()
-    version = f"{sys.implementation.cache_tag}-{numba.__version__}"
-    return cache_folder() / f"compiled-{version}-{processor}"
+    load([name for row in ROWS for name in row])
 
 
 def all_compiled() -> bool:
     """Return whether no kernel of a run is left to compile."""
-    stamp = _stamp()
-    return stamp.exists() and stamp.stat().st_mtime >= _newest_source()
+    return all(_is_done(name) for row in ROWS for name in row)
+
+
+def _is_done(name: str) -> bool:
+    """Return whether a child has compiled a module whole."""
+    return (cache_folder() / f"{name}.done").exists()
 
 
 @cache
-def compile_ahead() -> "subprocess.Popen[bytes] | None":
-    """Start a process, once, that compiles what is not cached; ``None`` where all is.
+def compile_ahead() -> "tuple[subprocess.Popen[bytes], ...]":
+    """Start processes, once, that compile what is not cached; none where all is.
 
-    It ends with this one, however that ends: its standard input is closed then.
+    They end with this one, however that ends: their standard input is closed then.
     """
-    if all_compiled():
-        return None
     path = [str(Path(pimper_torch.__path__[0]).parent), os.environ.get("PYTHONPATH", "")]
-    child = subprocess.Popen(
-        [sys.executable, "-c", "from pimper_torch.ground.kernels.compile import _child; _child()"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))},
+    found = {
+        "PYTHONPATH": os.pathsep.join(filter(None, path)),
+        "NUMBA_CACHE_DIR": str(cache_folder().parent),
+    }
+    children = tuple(
+        subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import _child; _child({row})"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | found,
+        )
+        for row, names in enumerate(ROWS)
+        if not all(map(_is_done, names))
     )
 
     @atexit.register
     def end() -> None:
-        child.kill()
-        child.wait()
+        for child in children:
+            child.kill()
+            child.wait()
 
-    return child
+    return children
 
 
-def _child() -> None:
-    """Compile everything, behind whatever else the machine does."""
+def _child(row: int) -> None:
+    """Compile a row, behind whatever else the machine does."""
+    from filelock import FileLock
 
     def end_with_parent() -> None:
         sys.stdin.read()
@@ -222,5 +263,20 @@ def _child() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(AttributeError, OSError):  # Windows has no such number
         os.nice(_NICENESS)
-    compile_all()
+    folder = cache_folder()
+    with FileLock(folder / f"{row}.lock"):
+        if not all(map(_is_done, ROWS[row])):
+            # What others left is not loaded: code depends on what was compiled before it.
+            _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
+            for name in ROWS[row]:
+                import_module(f"{pimper_torch.ground.kernels.__name__}.{name}")
+                (folder / f"{name}.done").touch()
+    forget_unused(folder.parent)
     os._exit(0)
+
+
+def forget_unused(parent: Path) -> None:
+    """Delete folders of code that no run has used for long."""
+    for folder in parent.glob(f"kernels-{'[0-9a-f]' * 32}"):
+        if time.time() - folder.stat().st_mtime > _KEPT_DAYS * 86_400 and _of_user_alone(folder):
+            shutil.rmtree(folder, ignore_errors=True)

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.ground.kernels.arrays import Doubles1, Doubles2, Doubles3
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.dense_systems import eliminate
 from pimper_torch.ground.kernels.factorization import overwrite, samples_that_count
 from pimper_torch.ground.kernels.robust_scale import robust_variance
 from pimper_torch.ground.kernels.shading_steps import frame, project
+from pimper_torch.ground.kernels.signatures import Doubles1, Doubles2, Doubles3
 from pimper_torch.ground.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
 
 Doubles = NDArray[np.float64]

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.ground.kernels.arrays import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.dense_systems import solve_damped
 from pimper_torch.ground.kernels.robust_scale import robust_variance
 from pimper_torch.ground.kernels.shading_steps import TILE, update_shading, whitening
+from pimper_torch.ground.kernels.signatures import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.ground.kernels.twin_constants import (
     CAUCHY,
     DAMPING_DECREASE,

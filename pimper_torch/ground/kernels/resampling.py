@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.ground.kernels.arrays import (
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
+from pimper_torch.ground.kernels.signatures import (
     Floats5,
     FractionRows,
     Integers2,
@@ -20,8 +22,6 @@ from pimper_torch.ground.kernels.arrays import (
     Projection,
     Samples,
 )
-from pimper_torch.ground.kernels.compile import compiled
-from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
 Array = NDArray[Any]
 

@@ -5,7 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pimper_torch.ground.kernels.arrays import (
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import shrinkage
+from pimper_torch.ground.kernels.lookup_adjoint import spread
+from pimper_torch.ground.kernels.resampling import neighbours, project
+from pimper_torch.ground.kernels.signatures import (
     Doubles1,
     Doubles2,
     Doubles3,
@@ -17,10 +21,6 @@ from pimper_torch.ground.kernels.arrays import (
     Projection,
     Samples,
 )
-from pimper_torch.ground.kernels.compile import compiled
-from pimper_torch.ground.kernels.lookup import shrinkage
-from pimper_torch.ground.kernels.lookup_adjoint import spread
-from pimper_torch.ground.kernels.resampling import neighbours, project
 
 
 class ViewGradients(NamedTuple):

@@ -6,7 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.ground.kernels.arrays import (
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import shrinkage
+from pimper_torch.ground.kernels.lookup_adjoint import spread
+from pimper_torch.ground.kernels.signatures import (
     Doubles1,
     Doubles2,
     Doubles3,
@@ -18,9 +21,6 @@ from pimper_torch.ground.kernels.arrays import (
     Projection,
     Samples,
 )
-from pimper_torch.ground.kernels.compile import compiled
-from pimper_torch.ground.kernels.lookup import shrinkage
-from pimper_torch.ground.kernels.lookup_adjoint import spread
 from pimper_torch.ground.kernels.sweep_costs import (
     FLOOR,
     Shading,

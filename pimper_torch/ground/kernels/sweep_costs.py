@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pimper_torch.ground.kernels.arrays import (
+from pimper_torch.ground.kernels.compile import compiled
+from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
+from pimper_torch.ground.kernels.signatures import (
     Doubles1,
     Floats1,
     Floats2,
@@ -23,8 +25,6 @@ from pimper_torch.ground.kernels.arrays import (
     Projection,
     Samples,
 )
-from pimper_torch.ground.kernels.compile import compiled
-from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
 Array = NDArray[Any]
 

@@ -24,13 +24,12 @@ from pimper_torch.ground.geometry.pyramids import (
 )
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
-from pimper_torch.ground.kernels.arrays import (
+from pimper_torch.ground.kernels.arrays import as_array, pulled_back
+from pimper_torch.ground.kernels.signatures import (
     FractionRows,
     PictureRows,
     Projection,
     Samples,
-    as_array,
-    pulled_back,
 )
 from pimper_torch.ground.kernels.switch import compiled_for
 from pimper_torch.method.patches.patches_config import WarpConfig
