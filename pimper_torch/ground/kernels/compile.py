@@ -44,10 +44,9 @@ SURFACE = (
 )
 
 # What is compiled by a process each, in order: both take about as long.
-ROWS = (
-    (*SFM, *COARSE, *PHOTOMETRY[:2], *SWEEP, *SURFACE[:3]),
-    (*PHOTOMETRY[2:], *SURFACE[3:]),
-)
+_SECOND = ("factorization", "multigrid_levels", "decimation")
+_FIRST = (*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE)
+ROWS = (tuple(name for name in _FIRST if name not in _SECOND), _SECOND)
 
 # Of gradients alone: compiled where a run first asks for them.
 GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_adjoint")
@@ -57,8 +56,6 @@ GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_ad
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 _NICENESS = 10  # of the children: what the run itself does comes first
-
-_KEPT_DAYS = 30  # that a folder of other code is kept after its last use
 
 
 def compiled(
@@ -164,7 +161,12 @@ def cache_folder() -> Path:
     for source in sorted(sources.glob("*.py")):
         code.update(source.read_bytes())
     name = f"kernels-{code.hexdigest()[:32]}"
-    for folder in (_chosen_cache() / name, sources / "__pycache__" / name):
+    chosen = numba.config.CACHE_DIR
+    if not chosen:  # a child imports no torch
+        from pimper_torch.runtime.store.user_cache import user_cache
+
+        chosen = user_cache()
+    for folder in (Path(chosen) / name, sources / "__pycache__" / name):
         with suppress(OSError):
             folder.mkdir(0o700, parents=True, exist_ok=True)
             if _of_user_alone(folder):
@@ -174,16 +176,6 @@ def cache_folder() -> Path:
     folder.mkdir(0o700)
     atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     return folder
-
-
-def _chosen_cache() -> Path:
-    import numba
-
-    if numba.config.CACHE_DIR:
-        return Path(numba.config.CACHE_DIR)
-    from pimper_torch.runtime.store.user_cache import user_cache  # imports torch
-
-    return user_cache()
 
 
 def _of_user_alone(folder: Path) -> bool:
@@ -231,7 +223,7 @@ def compile_ahead() -> "tuple[subprocess.Popen[bytes], ...]":
         "PYTHONPATH": os.pathsep.join(filter(None, path)),
         "NUMBA_CACHE_DIR": str(cache_folder().parent),
     }
-    children = tuple(
+    return tuple(
         subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import _child; _child({row})"],
             stdin=subprocess.PIPE,
@@ -242,14 +234,6 @@ def compile_ahead() -> "tuple[subprocess.Popen[bytes], ...]":
         for row, names in enumerate(ROWS)
         if not all(map(_is_done, names))
     )
-
-    @atexit.register
-    def end() -> None:
-        for child in children:
-            child.kill()
-            child.wait()
-
-    return children
 
 
 def _child(row: int) -> None:
@@ -276,7 +260,7 @@ def _child(row: int) -> None:
 
 
 def forget_unused(parent: Path) -> None:
-    """Delete folders of code that no run has used for long."""
+    """Delete folders of code that no run has used for 30 days, a choice."""
     for folder in parent.glob(f"kernels-{'[0-9a-f]' * 32}"):
-        if time.time() - folder.stat().st_mtime > _KEPT_DAYS * 86_400 and _of_user_alone(folder):
+        if time.time() - folder.stat().st_mtime > 30 * 86_400 and _of_user_alone(folder):
             shutil.rmtree(folder, ignore_errors=True)

@@ -157,17 +157,16 @@ def samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
 
 @compiled()
 def _packed(
-    radiance: Floats,
-    given: Floats,
-    anchor: Floats,
-    regularization: Floats,
-    prior: Floats,
+    problem: ConeProblem,
+    p: int,
     views: Integers,
-    samples: Integers,
-    num_scale: int,
+    found: tuple[Integers, int],
     loss: int,
     scale: float,
 ) -> Patch:
+    samples, num_scale = found
+    radiance, given, anchor = problem.radiance[p], problem.given[p], problem.anchor[p]
+    regularization, prior = problem.regularization[p], problem.prior[p]
     num_views, num_samples = len(views), len(samples)
     padded = TILE * (-(-num_samples // TILE))
     shape = (num_views, padded)
@@ -422,7 +421,7 @@ def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -
 
 @compiled(fast=True)
 def _curvature(
-    patch: Patch, lights: Floats, shading: Floats, samples: int, curvature: Doubles
+    patch: Patch, lights: Floats, shading: Floats, samples: int, matrix: Doubles
 ) -> None:
     """Sum the upper triangle of the Gauss-Newton matrix, with the present equations."""
     num_views, num_samples = patch.radiance.shape
@@ -452,10 +451,10 @@ def _curvature(
         for k in range(chosen):
             weights_row[k] = patch.weight[f, k * stride]
         for g in range(f, num_views):
-            _block(white, f, g, weights_row, pairs, float(stride), curvature)
+            _block(white, f, g, weights_row, pairs, float(stride), matrix)
             weights_row[:] = 0
         for i in range(4):
-            curvature[4 * f + i, 4 * f + i] += patch.regularization[f]
+            matrix[4 * f + i, 4 * f + i] += patch.regularization[f]
 
 
 @compiled(fast=True)
@@ -523,23 +522,12 @@ def solve_on_cone(
         stride: The deviation is estimated from every ``stride``-th sample.
         solution: Its lights and shading are the start.
     """
-    radiance, given, anchor, regularization, prior = problem
+    _, given, anchor, regularization, _ = problem
     lights, shading, weight, iterations, residual, cause = solution
-    for p in range(len(radiance)):
+    for p in range(len(given)):
         views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
         samples, num_scale = samples_that_count(given[p], stride)
-        patch = _packed(
-            radiance[p],
-            given[p],
-            anchor[p],
-            regularization[p],
-            prior[p],
-            views,
-            samples,
-            num_scale,
-            loss,
-            scale,
-        )
+        patch = _packed(problem, p, views, (samples, num_scale), loss, scale)
         light = np.empty((len(views), 4), np.float32)
         shade = np.zeros((4, patch.radiance.shape[1]), np.float32)
         for f in range(len(views)):

@@ -10,24 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.ground.kernels import signatures
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
-from pimper_torch.ground.kernels.signatures import (
-    Floats5,
-    FractionRows,
-    Integers2,
-    Masks3,
-    Masks4,
-    PictureRows,
-    Projection,
-    Samples,
-)
 
 Array = NDArray[Any]
 
 
 @compiled()
-def project(m: Array, samples: Samples, patch: int, pixels: Array) -> None:
+def project(m: Array, samples: signatures.Samples, patch: int, pixels: Array) -> None:
     """Compute the pixels of a template's samples in a view: right and down."""
     origin, spacing, depth, _ = samples
     for row in range(pixels.shape[0]):
@@ -53,17 +44,17 @@ def neighbours(index: int, count: int) -> tuple[int, int]:
 
 @compiled(annotated=True)
 def register(
-    images: PictureRows,
-    unusable: FractionRows,
-    levels: Integers2,
-    projection: Projection,
-    samples: Samples,
-    sizes_px: Integers2,
-    inside: Masks3,
+    images: signatures.PictureRows,
+    unusable: signatures.FractionRows,
+    levels: signatures.Integers2,
+    projection: signatures.Projection,
+    samples: signatures.Samples,
+    sizes_px: signatures.Integers2,
+    inside: signatures.Masks3,
     min_facing: float,
     dark_level: float,
-    radiance: Floats5,
-    valid: Masks4,
+    radiance: signatures.Floats5,
+    valid: signatures.Masks4,
 ) -> None:
     """Resample the views, and mark valid samples, occlusion aside.
 

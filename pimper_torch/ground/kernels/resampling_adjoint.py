@@ -5,43 +5,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pimper_torch.ground.kernels import signatures
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.lookup import shrinkage
 from pimper_torch.ground.kernels.lookup_adjoint import spread
 from pimper_torch.ground.kernels.resampling import neighbours, project
-from pimper_torch.ground.kernels.signatures import (
-    Doubles1,
-    Doubles2,
-    Doubles3,
-    Floats2,
-    Floats5,
-    Integers2,
-    Masks4,
-    PictureRows,
-    Projection,
-    Samples,
-)
 
 
 class ViewGradients(NamedTuple):
     """Derivatives by pictures, and by what :class:`Projection` and :class:`Samples` hold."""
 
-    finest: Floats2
-    coarser: Floats2
-    image_from_patch: Doubles3
-    origin: Doubles2
-    spacing: Doubles1
-    depth: Doubles3
+    finest: signatures.Floats2
+    coarser: signatures.Floats2
+    image_from_patch: signatures.Doubles3
+    origin: signatures.Doubles2
+    spacing: signatures.Doubles1
+    depth: signatures.Doubles3
 
 
 @compiled(annotated=True)
 def pull_back(
-    images: PictureRows,
-    levels: Integers2,
-    projection: Projection,
-    samples: Samples,
-    valid: Masks4,
-    on_radiance: Floats5,
+    images: signatures.PictureRows,
+    levels: signatures.Integers2,
+    projection: signatures.Projection,
+    samples: signatures.Samples,
+    valid: signatures.Masks4,
+    on_radiance: signatures.Floats5,
     on_pixels: int,
     found: ViewGradients,
 ) -> None:

@@ -6,21 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.ground.kernels import signatures
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.lookup import shrinkage
 from pimper_torch.ground.kernels.lookup_adjoint import spread
-from pimper_torch.ground.kernels.signatures import (
-    Doubles1,
-    Doubles2,
-    Doubles3,
-    Doubles4,
-    Floats2,
-    Floats4,
-    Integers2,
-    PictureRows,
-    Projection,
-    Samples,
-)
 from pimper_torch.ground.kernels.sweep_costs import (
     FLOOR,
     Shading,
@@ -38,19 +27,19 @@ Array = NDArray[Any]
 class CostGradients(NamedTuple):
     """Derivatives by pictures, and by the arguments of the costs."""
 
-    finest: Floats2
-    coarser: Floats2
-    image_from_patch: Doubles3
-    centers_patch: Doubles2
-    focals: Doubles1
-    origin: Doubles2
-    spacing: Doubles1
-    depth: Doubles3
-    outward: Doubles4
-    normals: Doubles4
-    lights: Doubles3
-    gains: Doubles2
-    scale: Doubles1
+    finest: signatures.Floats2
+    coarser: signatures.Floats2
+    image_from_patch: signatures.Doubles3
+    centers_patch: signatures.Doubles2
+    focals: signatures.Doubles1
+    origin: signatures.Doubles2
+    spacing: signatures.Doubles1
+    depth: signatures.Doubles3
+    outward: signatures.Doubles4
+    normals: signatures.Doubles4
+    lights: signatures.Doubles3
+    gains: signatures.Doubles2
+    scale: signatures.Doubles1
 
 
 @compiled(
@@ -136,14 +125,14 @@ def _inconsistency(
 
 @compiled(annotated=True)
 def pull_back(
-    gray: PictureRows,
-    levels: Integers2,
-    projection: Projection,
-    focals: Doubles1,
-    samples: Samples,
+    gray: signatures.PictureRows,
+    levels: signatures.Integers2,
+    projection: signatures.Projection,
+    focals: signatures.Doubles1,
+    samples: signatures.Samples,
     shaded: Shading,
     trial: Trial,
-    on_cost: Floats4,
+    on_cost: signatures.Floats4,
     on_pixels: int,
     found: CostGradients,
 ) -> None:

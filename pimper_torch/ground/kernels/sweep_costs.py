@@ -9,22 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pimper_torch.ground.kernels import signatures
 from pimper_torch.ground.kernels.compile import compiled
 from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners, shrinkage
-from pimper_torch.ground.kernels.signatures import (
-    Doubles1,
-    Floats1,
-    Floats2,
-    Floats3,
-    Floats4,
-    Integers1,
-    Integers2,
-    Masks3,
-    Masks4,
-    PictureRows,
-    Projection,
-    Samples,
-)
 
 Array = NDArray[Any]
 
@@ -143,9 +130,9 @@ def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
 class Shading(NamedTuple):
     """Normals that light shades, lights of every patch and view, and factors of radiance."""
 
-    normals: Floats4
-    lights: Floats3
-    gains: Floats2
+    normals: signatures.Floats4
+    lights: signatures.Floats3
+    gains: signatures.Floats2
 
 
 class Trial(NamedTuple):
@@ -162,11 +149,11 @@ class Trial(NamedTuple):
         min_facing: Lower bound of the cosine that shrinks footprints.
     """
 
-    tested: Masks3
-    valid: Masks4
-    scale: Floats1
-    ladder: Doubles1
-    poses: Integers1
+    tested: signatures.Masks3
+    valid: signatures.Masks4
+    scale: signatures.Floats1
+    ladder: signatures.Doubles1
+    poses: signatures.Integers1
     num_views: int
     min_views: int
     min_facing: float
@@ -183,13 +170,13 @@ class Choice(NamedTuple):
         demoted: Ratings, less one for each better view of the same pose.
     """
 
-    views: Integers1
-    score: Floats1
-    shading: Floats1
-    facings: Doubles1
-    footprints: Doubles1
-    ratings: Floats1
-    demoted: Floats1
+    views: signatures.Integers1
+    score: signatures.Floats1
+    shading: signatures.Floats1
+    facings: signatures.Doubles1
+    footprints: signatures.Doubles1
+    ratings: signatures.Floats1
+    demoted: signatures.Floats1
 
 
 @compiled()
@@ -211,9 +198,9 @@ def choose(
     patch: int,
     row: int,
     column: int,
-    projection: Projection,
+    projection: signatures.Projection,
     focals: Array,
-    samples: Samples,
+    samples: signatures.Samples,
     shaded: Shading,
     trial: Trial,
     choice: Choice,
@@ -286,7 +273,7 @@ def choose(
 
 @compiled()
 def look_up(
-    gray: PictureRows,
+    gray: signatures.PictureRows,
     levels: Array,
     fractions: Array,
     row: int,
@@ -325,7 +312,9 @@ def look_up(
 
 
 @compiled()
-def trace(m: Array, samples: Samples, patch: int, row: int, column: int, path: Array) -> None:
+def trace(
+    m: Array, samples: signatures.Samples, patch: int, row: int, column: int, path: Array
+) -> None:
     """Project a sample, and its outward normal, by a 3x4 matrix."""
     origin, spacing, depth, outward = samples
     x = origin[patch, 0] + spacing[patch] * column
@@ -341,15 +330,15 @@ def trace(m: Array, samples: Samples, patch: int, row: int, column: int, path: A
 
 @compiled(annotated=True)
 def costs(
-    gray: PictureRows,
-    levels: Integers2,
-    projection: Projection,
-    focals: Doubles1,
-    samples: Samples,
+    gray: signatures.PictureRows,
+    levels: signatures.Integers2,
+    projection: signatures.Projection,
+    focals: signatures.Doubles1,
+    samples: signatures.Samples,
     shaded: Shading,
     trial: Trial,
-    cost: Floats4,
-    swept: Floats3,
+    cost: signatures.Floats4,
+    swept: signatures.Floats3,
 ) -> None:
     """Choose the views of each sample, and evaluate its cost at all heights.
 
