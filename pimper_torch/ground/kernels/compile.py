@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
+from importlib.metadata import version
 from inspect import unwrap
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,7 +83,6 @@ def compiled(
         nogil=called,
         error_model="numpy",
         forceinline=not called,
-        no_cpython_wrapper=not called,
         no_cfunc_wrapper=True,
         fastmath=_FAST if fast else False,
     )
@@ -150,14 +150,13 @@ def cache_folder() -> Path:
     It is in ``NUMBA_CACHE_DIR`` or the user's cache, or beside the kernels where that cannot be
     written, or a temporary folder.
     """
-    import llvmlite
     import numba
     from numba.core.registry import cpu_target
 
     sources = Path(pimper_torch.ground.kernels.__path__[0])
     processor = cpu_target.target_context.codegen().magic_tuple()
-    version = (sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, processor)
-    code = hashlib.sha256(repr(version).encode())
+    compiler = (sys.implementation.cache_tag, numba.__version__, version("llvmlite"), processor)
+    code = hashlib.sha256(repr(compiler).encode())
     for source in sorted(sources.glob("*.py")):
         code.update(source.read_bytes())
     name = f"kernels-{code.hexdigest()[:32]}"
