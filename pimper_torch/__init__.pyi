@@ -102,7 +102,7 @@ from .runtime.errors import ReconstructionError as ReconstructionError
 from .runtime.stage import Given as Given
 from .runtime.stage import Stage as Stage
 from .runtime.stage import Then as Then
-from .runtime.store.user_cache import user_cache as user_cache
+from .runtime.user_cache import user_cache as user_cache
 from .single_view.integration import integrate_normal_map as integrate_normal_map
 from .single_view.photometric_stereo.stereo import photometric_stereo as photometric_stereo
 

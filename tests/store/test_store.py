@@ -12,7 +12,7 @@ from torch import Tensor
 from pimper_torch.records import Cameras, Record, StageReport
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.store import Store, digest, opened, settled
-from pimper_torch.runtime.store.user_cache import user_cache
+from pimper_torch.runtime.user_cache import user_cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

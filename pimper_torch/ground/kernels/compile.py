@@ -28,6 +28,7 @@ from typing import Annotated, TypeVar, get_origin, get_type_hints
 
 import pimper_torch.ground.kernels
 from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.user_cache import user_cache
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -160,12 +161,8 @@ def cache_folder() -> Path:
     for source in sorted(sources.glob("*.py")):
         code.update(source.read_bytes())
     name = f"kernels-{code.hexdigest()[:32]}"
-    chosen = numba.config.CACHE_DIR
-    if not chosen:  # a child imports no torch
-        from pimper_torch.runtime.store.user_cache import user_cache
-
-        chosen = user_cache()
-    for folder in (Path(chosen) / name, sources / "__pycache__" / name):
+    chosen = Path(numba.config.CACHE_DIR or user_cache())
+    for folder in (chosen / name, sources / "__pycache__" / name):
         with suppress(OSError):
             folder.mkdir(0o700, parents=True, exist_ok=True)
             if _of_user_alone(folder):

@@ -2,6 +2,5 @@
 
 from pimper_torch.runtime.store.digest import digest
 from pimper_torch.runtime.store.store import Store, kept, opened, settled
-from pimper_torch.runtime.store.user_cache import user_cache
 
-__all__ = ["Store", "digest", "kept", "opened", "settled", "user_cache"]
+__all__ = ["Store", "digest", "kept", "opened", "settled"]
