@@ -14,8 +14,6 @@ from pimper_torch.ground.linalg.aggregation import (
 from pimper_torch.ground.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles
 
-CPU = torch.device("cpu")
-
 
 @pytest.mark.parametrize(
     ("side", "decades"),
@@ -67,32 +65,11 @@ def test_entries_off_the_diagonal_are_added_up_by_sign():
         np.testing.assert_allclose(size, abs(off[first:last]).sum(), rtol=1e-12)
 
 
-@pytest.mark.parametrize("sides", [(), (3,)])
-def test_a_level_is_that_of_torch_for_any_number_of_sides(sides):
-    matrix = triangles(160, 3.0)  # more rows than one thread is given
-    side = torch.randn(25600, *sides, generator=torch.Generator().manual_seed(1)).double()
-    found = Hierarchy(matrix, CPU).precondition(side)
-    expected = Hierarchy(
-        matrix, CPU, product=lambda vectors: torch.from_numpy(matrix @ vectors.numpy())
-    ).precondition(side)
-    assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("sides", [1, 3])
 def test_a_cycle_in_float32_is_that_in_float64_but_for_rounding(sides):
     matrix = triangles(160, 3.0)
     side = torch.randn(25600, sides, generator=torch.Generator().manual_seed(1)).double()
-    expected = Hierarchy(matrix, CPU).precondition(side)
-    found = Hierarchy(matrix, CPU, dtype=torch.float32).precondition(side.float())
+    expected = Hierarchy(matrix).cycle(side)
+    found = Hierarchy(matrix, torch.float32).cycle(side.float())
     assert found.dtype == torch.float32
     assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
-
-
-def test_a_cycle_leaves_what_the_one_before_gave_only_if_asked_to():
-    hierarchy = Hierarchy(triangles(60, 3.0), CPU)
-    one, other = torch.randn(2, 3600, generator=torch.Generator().manual_seed(1)).double()
-    kept, lent = hierarchy.precondition(one), hierarchy.cycle(one)
-    before = kept.clone()
-    assert_close(lent, before, rtol=0, atol=0)
-    hierarchy.cycle(other)
-    assert_close(kept, before, rtol=0, atol=0)

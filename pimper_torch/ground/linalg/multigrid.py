@@ -7,8 +7,8 @@ from jaxtyping import Float
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients, conjugate_gradients
-from pimper_torch.ground.linalg.hierarchy import Hierarchy, Product, sparse_product, with_product
+from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients
+from pimper_torch.ground.linalg.hierarchy import Hierarchy, with_product
 from pimper_torch.ground.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
 
 # A choice: the hardest systems of `benchmarks/linear_systems.py` take 25 cycles.
@@ -27,20 +27,20 @@ class Iterate:
     iterations: int
 
 
-def solve_with_hierarchy(
-    product: Product,
+def solve_by_cycles(
+    matrix: csr_array,
     hierarchy: Hierarchy,
     diagonal: Float[Tensor, " unknown"],
-    rhs: Float[Tensor, "unknown ..."],
+    rhs: Float[Tensor, "unknown side"],
     tolerance: float,
     what: str,
-    start: Float[Tensor, "unknown ..."] | None = None,
+    start: Float[Tensor, "unknown side"] | None = None,
 ) -> Iterate:
     """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
 
     Args:
         diagonal: Of A; only to measure the residual.
-        rhs: ``b``, one column a right-hand side if there are several.
+        rhs: ``b``, on the CPU.
         tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
             the solution.
         start: Where to begin; zero if not given.
@@ -48,53 +48,11 @@ def solve_with_hierarchy(
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.
     """
-    found, cycles, converged = conjugate_gradients(
-        product,
-        hierarchy.precondition,
-        rhs,
-        start=start,
-        dims=(0,),
-        tolerance=tolerance,
-        max_iterations=_MAX_CYCLES,
+    found, cycles, converged = compressed_gradients(
+        matrix, hierarchy, rhs, start=start, tolerance=tolerance, max_iterations=_MAX_CYCLES
     )
-    reached = found, cycles, converged
-    return _checked(reached, rhs - product(found), diagonal, rhs, tolerance, what)
-
-
-def solve_by_cycles(
-    matrix: csr_array,
-    diagonal: Float[Tensor, " unknown"],
-    rhs: Float[Tensor, "unknown side"],
-    tolerance: float,
-    what: str,
-    start: Float[Tensor, "unknown side"] | None = None,
-) -> Iterate:
-    """Solve as :func:`solve_with_hierarchy`, by kernels on the CPU, the hierarchy in float32."""
-    half = torch.float32
-    reached = compressed_gradients(
-        matrix,
-        Hierarchy(matrix, rhs.device, dtype=half).cycle,
-        rhs,
-        start=start,
-        tolerance=tolerance,
-        max_iterations=_MAX_CYCLES,
-        dtype=half,
-    )
-    residual = with_product(matrix, reached[0], rhs, keep=1.0, gain=-1.0)
-    return _checked(reached, residual, diagonal, rhs, tolerance, what)
-
-
-def _checked(
-    reached: tuple[Float[Tensor, "unknown ..."], int, bool],
-    residual: Float[Tensor, "unknown ..."],
-    diagonal: Float[Tensor, " unknown"],
-    rhs: Float[Tensor, "unknown ..."],
-    tolerance: float,
-    what: str,
-) -> Iterate:
-    """Return the result of conjugate gradients, or refuse it."""
-    found, cycles, converged = reached
-    scale = diagonal.rsqrt().reshape(-1, *[1] * (rhs.ndim - 1))
+    residual = with_product(matrix, found, rhs, keep=1.0, gain=-1.0)
+    scale = diagonal.rsqrt()[:, None]
     left, side = (scale * residual).norm(dim=0), (scale * rhs).norm(dim=0)
     # Smooth solutions have a right-hand side that is small beside their energy norm.
     energy = (found * rhs).sum(dim=0).clamp_min(0).sqrt()
@@ -114,9 +72,10 @@ def _checked(
 class Multigrid(PreparedMatrix):
     r"""Solves a sparse system by conjugate gradients with a multigrid preconditioner.
 
-    For millions of unknowns, and on CUDA: memory and time are linear in the unknowns, unlike those
-    of :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky`. For graph Laplacians and similar
-    matrices, whose off-diagonal entries are mostly negative.
+    For millions of unknowns: memory and time are linear in the unknowns, unlike those of
+    :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky`. For graph Laplacians and similar
+    matrices, whose off-diagonal entries are mostly negative. Cycles run on the CPU, wherever the
+    right-hand side is.
 
     >>> index = torch.tensor([0, 1])
     >>> grid = Multigrid(index, index, torch.tensor([2.0, 4.0]), size=2)
@@ -126,26 +85,15 @@ class Multigrid(PreparedMatrix):
 
     def _prepare(self, tolerance: float) -> None:
         self._tolerance = tolerance
-        device = self._values.device
-        self._diagonal = self._diagonal.to(device)
-        self._product = sparse_product(self._matrix, device)
-        self._hierarchy = Hierarchy(self._matrix, device)
+        self._hierarchy = Hierarchy(self._matrix)
 
     def iterate(self, rhs: Float[Tensor, "unknown ..."]) -> Iterate:
-        """Solve and report the iterations; not differentiable."""
-        with torch.no_grad():
-            return solve_with_hierarchy(
-                self._product,
-                self._hierarchy,
-                self._diagonal,
-                rhs.detach().to(self._diagonal),
-                self._tolerance,
-                self._what,
-            )
+        """Solve and report the iterations; not differentiable, and on the CPU."""
+        columns = rhs.detach().cpu().double().reshape(len(rhs), -1).contiguous()
+        given = self._matrix, self._hierarchy, self._diagonal, columns
+        found = solve_by_cycles(*given, self._tolerance, self._what)
+        return Iterate(values=found.values.reshape(rhs.shape), iterations=found.iterations)
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Solve; constant to autograd."""
-        if rhs.numel() == 0:
-            return rhs.clone()
-        columns = rhs if rhs.ndim == 1 else rhs.reshape(len(rhs), -1)
-        return self.iterate(columns).values.reshape(rhs.shape).to(rhs)
+        return rhs.clone() if rhs.numel() == 0 else self.iterate(rhs).values.to(rhs)

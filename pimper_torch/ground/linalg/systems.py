@@ -7,6 +7,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.ground.linalg.aggregation import parts_of
+from pimper_torch.ground.linalg.hierarchy import Hierarchy
 from pimper_torch.ground.linalg.multigrid import Multigrid, solve_by_cycles
 from pimper_torch.ground.linalg.prepared import (
     DEFAULT_TOLERANCE,
@@ -103,7 +104,10 @@ def solve_compressed(
         if positive <= _POSITIVE_FRACTION * total:
             refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
             try:
-                return solve_by_cycles(matrix, diagonal, sides, tolerance, what, start).values
+                levels = Hierarchy(matrix, torch.float32)
+                return solve_by_cycles(
+                    matrix, levels, diagonal, sides, tolerance, what, start
+                ).values
             except SingularSystemError as error:
                 _by_factor(what, error)
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
