@@ -131,7 +131,7 @@ def test_offsets_along_slanting_normals_are_longer_along_the_direction():
     offsets = torch.tensor([0.1, 0.1, 0.1], dtype=torch.float64)
     information = torch.tensor([4.0, 4.0, 0.0], dtype=torch.float64)
     facing = torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64)
-    found = swept_heights(transferred, offsets, information, facing, 25.0)
+    found = swept_heights(transferred, offsets, information, facing, torch.full_like(facing, 25.0))
     assert found.unknowns.flatten().tolist() == [0, 1]
     assert_close(found.targets, torch.tensor([1.1, 1.2], dtype=torch.float64))
     assert_close(found.information, torch.tensor([4.0, 1.0], dtype=torch.float64))
@@ -142,8 +142,8 @@ def test_heights_that_err_alike_know_no_more_together_than_their_common_error_le
     nothing = torch.zeros(count, dtype=torch.float64)
     own = torch.full_like(nothing, 25.0)
     common = Common(variance=torch.tensor(0.01).double(), count=torch.full_like(own, count))
-    alone = swept_heights(nothing, nothing, own, torch.ones_like(own), 4.0)
-    found = swept_heights(nothing, nothing, own, torch.ones_like(own), 4.0, common)
+    terms = nothing, nothing, own, torch.ones_like(own), torch.full_like(own, 4.0)
+    alone, found = swept_heights(*terms), swept_heights(*terms, common)
     assert_close(alone.information.sum(), own.sum())
     # The mean has the variance of the mean of what each has for itself, and the common one.
     assert_close(1 / found.information.sum(), 1 / own.sum() + common.variance)

@@ -82,7 +82,7 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
     information = torch.ones_like(nothing)
     information[facet == 399] = 0
     found = swept_heights(
-        nothing, shared[facet] + 0.1 * own, information, torch.ones_like(nothing), 1.0
+        nothing, shared[facet] + 0.1 * own, information, *torch.ones(2, len(nothing))
     )
     variance = common_variance(found, nothing, facet, torch.arange(400).repeat(2))
     shared = common(variance, facet, information > 0)
@@ -94,6 +94,6 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
 def test_heights_that_nothing_else_can_judge_are_taken_at_their_word():
     facet = torch.zeros(4, dtype=torch.long)
     ones = torch.ones(4, dtype=torch.float64)
-    found = swept_heights(0 * ones, ones, ones, ones, 1.0)
+    found = swept_heights(0 * ones, ones, ones, ones, ones)
     nowhere = common_variance(found, 0 * ones, facet, torch.zeros(0, dtype=torch.long))
     assert float(nowhere) == 0

@@ -12,10 +12,12 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.ground.geometry.template_normals import transferred_normals
+from pimper_torch.method.fusion.blend import vertex_spacing
+from pimper_torch.method.fusion.detail import spacing_of
 from pimper_torch.method.fusion.estimate import fuse_terms
 from pimper_torch.method.fusion.fuse import Fuse
 from pimper_torch.method.fusion.fuse_config import FuseConfig
-from pimper_torch.method.fusion.problem import pose
+from pimper_torch.method.fusion.problem import laid, pose
 from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights
 from pimper_torch.method.patches.decompose import Decompose
 from pimper_torch.method.patches.patches_config import DecomposeConfig
@@ -129,8 +131,62 @@ def noisy(cap, rotation, lift, generator):
     return cap.replace(photometric=cap.photometric.replace(buckets=photometry), buckets=heights)
 
 
+def rippled(cap, period, **sizes):
+    """Waves of a period in samples, in albedo, normals or heights of one facet."""
+    photometry, heights = list(cap.photometric.buckets), list(cap.buckets)
+    first = torch.arange(len(photometry[0].albedo)) == 0
+    columns = torch.arange(photometry[0].albedo.shape[2])
+    wave = first[:, None, None] * (columns * math.tau / period).sin().double()
+    found = photometry[0]
+    across = found.normals_patch.new_tensor([sizes.get("normals", 0.0), 0, 0])
+    photometry[0] = found.replace(
+        albedo=found.albedo * (1 + sizes.get("albedo", 0.0) * wave[..., None]),
+        normals_patch=normalize(found.normals_patch + across * wave[..., None], dim=-1),
+    )
+    offset = heights[0].offset + sizes.get("heights", 0.0) * wave
+    heights[0] = heights[0].replace(offset=offset)
+    photometric = cap.photometric.replace(buckets=tuple(photometry))
+    return cap.replace(photometric=photometric, buckets=tuple(heights))
+
+
+@pytest.mark.parametrize(
+    ("period", "sizes", "apart"),
+    [
+        (4, {}, 4),
+        (4, {"normals": 0.02}, 1),  # twice what they claim
+        (4, {"normals": 0.002}, 4),
+        (16, {"normals": 0.025}, 2),
+        (4, {"heights": 0.2 * SPACING}, 1),
+        (4, {"heights": 0.02 * SPACING}, 4),
+        (4, {"albedo": 0.2}, 1),
+        (4, {"albedo": 0.02}, 4),
+    ],
+)
+def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(cap, period, sizes, apart):
+    swept = rippled(cap, period, **sizes)
+    finest = vertex_spacing(swept.patches, 1.0)
+    expected = torch.full_like(finest, 4.0)
+    expected[swept.patches.buckets[0].facet[0]] = apart
+    assert torch.equal(spacing_of(swept, 1.0, 0.15) / finest, expected)
+    assert torch.equal(spacing_of(swept, 0.5, 0.0), 0.5 * finest)
+
+
+def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(cap):
+    """Its slopes are photometric: heights have the wave's amplitude over its wave number."""
+    swept = rippled(cap, 8, normals=0.2)
+    some, every = (Fuse(FuseConfig(max_lost=lost))(swept, free()) for lost in (0.1, 0.0))
+    assert 3 * len(some.vertices_world) < len(every.vertices_world)
+    facet = swept.patches.buckets[0].facet[0]
+    inner = (some.facet == facet) & (some.barycentric > 0.2).all(dim=1)
+    same = (every.facet == facet) & (every.barycentric > 0.2).all(dim=1)
+    assert torch.equal(some.barycentric[inner], every.barycentric[same])
+    apart = (some.vertices_world[inner] - every.vertices_world[same]).norm(dim=1)
+    assert apart.max() < 0.02 * SPACING
+    assert off_sphere(some.vertices_world[inner]).std() > 0.1 * SPACING
+
+
 def test_flat_facets_come_to_lie_on_the_sphere(cap):
-    surface = Fuse()(cap, free())
+    surface = Fuse(FuseConfig(max_lost=0))(cap, free())
     mesh = cap.patches.coarse.mesh
     sag = off_sphere(mesh.vertices_world[mesh.faces].mean(dim=1)).abs().max()
     assert sag > 0.7 * SPACING
@@ -174,7 +230,7 @@ def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
     swept = cap.replace(
         photometric=cap.photometric.replace(buckets=tuple(photometry)), buckets=tuple(heights)
     )
-    problem = pose(swept, 1.0, True)
+    problem = pose(swept, laid(swept, vertex_spacing(swept.patches, 1.0)), True)
     own, coarse = kinds = SweptHeights().equations(problem)
     assert not torch.isin(own.unknowns, coarse.unknowns).any()
     kinds += [*Normals().equations(problem), *KeptSlopes().equations(problem)]

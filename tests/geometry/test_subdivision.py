@@ -26,7 +26,9 @@ def euler(num_vertices, faces):
 
 
 def all_spacings(facets, length):
-    return torch.full((len(facets),), length, dtype=torch.float64)
+    """The same of all facets, or by turns."""
+    lengths = torch.as_tensor(length, dtype=torch.float64).flatten()
+    return lengths.repeat(len(facets))[: len(facets)]
 
 
 SCENES = {
@@ -34,6 +36,9 @@ SCENES = {
     "ragged": (*ragged_fan(), 0.05),
     "ragged, coarse": (*ragged_fan(seed=42), 0.7),
     "one piece an edge": (*icosphere(0), 5.0),
+    "unlike spacings": (*icosphere(1), [0.05, 0.2, 0.1, 0.4, 0.07]),
+    "one piece beside many": (*icosphere(0), [5.0, 0.1, 0.03]),
+    "ragged, unlike spacings": (*ragged_fan(), [0.05, 0.4]),
     "sliver with 1, 1 and 2 pieces": (
         torch.tensor([[0.0, 0.1, 0], [-0.76, 0, 0], [0.76, 0, 0]], dtype=torch.float64),
         torch.tensor([[1, 2, 0]]),
@@ -70,7 +75,7 @@ def test_no_face_is_turned_and_areas_add_up(scene):
         face_normals(vertices, facets),
     )
     along = torch.nn.functional.normalize(whole, dim=-1)[subdivision.face_facet]
-    assert ((normals * along).sum(-1) > 1e-6 * length**2).all()
+    assert ((normals * along).sum(-1) > 1e-6 * min(all_spacings(facets, length)) ** 2).all()
     areas = whole.new_zeros(len(facets)).index_add(0, subdivision.face_facet, normals.norm(dim=-1))
     assert_close(areas, whole.norm(dim=-1))
 
@@ -106,6 +111,8 @@ def test_an_edge_follows_the_finer_of_its_facets():
     centre = subdivision.points[edges].mean(dim=1)
     rim = (centre[:, :2].min(dim=1).values < 1e-9) | (centre[:, :2].max(dim=1).values > 1 - 1e-9)
     assert (inside == ~rim).all()
+    within = (subdivision.points[:, 1] > coordinate + 1e-9) & (coordinate > 1e-9) & ~on_top
+    assert within.sum() == 1  # the coarser facet is fine along that edge alone
 
 
 def test_every_vertex_lies_where_its_facet_and_coordinates_say():

@@ -1,9 +1,10 @@
 """Barycentric subdivided meshes: a coarse triangle mesh subdivided into a dense, conforming one.
 
-Every edge of the coarse mesh is cut into as many pieces as its length asks for, and every
-facet carries the triangular subdivided mesh of its most finely cut edge. Where another edge has
-fewer pieces, the subdivided mesh points on it slide to the nearest cut, and triangles that vanish
-thereby are left out. Both facets of an edge so use the same cuts, whatever their sizes.
+Every edge of the coarse mesh is cut into as many pieces as the finer of its facets asks for, and
+every facet carries the triangular grid of its own most finely cut edge. Where an edge has fewer
+pieces, the grid's points on it slide to the nearest cut, and triangles that vanish thereby are left
+out. Where it has more, the triangles along it are cut into fans. Both facets of an edge so use the
+same cuts, whatever their sizes.
 
 A long and narrow facet would be far too fine across its length, so the cuts of its edges are
 limited by its area: it is then a little too coarse along its length.
@@ -35,6 +36,7 @@ class Subdivision(Record):
         facet: A facet each vertex lies in; a vertex on an edge or a corner of the coarse
             mesh exists once and names one of its facets.
         barycentric: Where in that facet; exactly 0 on its edges.
+        spacing: Wanted length of the pieces' edges in each facet.
     """
 
     points: Vertices
@@ -42,6 +44,7 @@ class Subdivision(Record):
     barycentric: Vertices
     faces: Faces
     face_facet: Int[Tensor, " face"]
+    spacing: Float[Tensor, " facet"]
 
     def interpolate(
         self, per_corner: Float[Tensor, "corner channel"], facets: Int[Tensor, "facet 3"]
@@ -83,10 +86,12 @@ def subdivide(
     (12, 14)
     """
     edges, facet_edges = face_edges(facets)
-    pieces = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
-    # Slot 0 opposite to a longest edge: that edge carries the subdivided mesh's own cuts, so that
-    # only two edges ever slide, both counted from slot 0.
-    first = pieces[facet_edges].argmax(dim=1)
+    own = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
+    pieces = own.new_zeros(len(edges)).scatter_reduce(
+        0, facet_edges.flatten(), own.flatten(), "amax"
+    )
+    # Slot 0 opposite to a longest edge: the others are counted from slot 0.
+    first = own.argmax(dim=1)
     slots = (first[:, None] + torch.arange(3, device=first.device)) % 3
     cuts = _Cuts(
         pieces=pieces,
@@ -94,10 +99,11 @@ def subdivide(
         corner=facets.gather(1, slots),
         edge=facet_edges.gather(1, slots),
         slot=slots,
+        size=own.amax(dim=1),
         first_cut=len(vertices) + _starts(pieces - 1),
         first_inner=len(vertices) + int((pieces - 1).sum()),
     )
-    return _assemble(vertices, facets, cuts)
+    return _assemble(vertices, facets, cuts, spacing.detach())
 
 
 def transferred(
@@ -126,15 +132,32 @@ class _Cuts:
     corner: Int[Tensor, "facet 3"]
     edge: Int[Tensor, "facet 3"]  # opposite to the corner in the same place
     slot: Int[Tensor, "facet 3"]  # which corner of the coarse facet that is
+    size: Int[Tensor, " facet"]  # pieces of a side of its grid
     first_cut: Int[Tensor, " edge"]
     first_inner: int
 
+    def named(self, edge: Int[Tensor, "..."], cut: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
+        """Number the points of edges, by their cuts from the lower end on."""
+        low, high = self.edges[edge].unbind(dim=-1)
+        name = torch.where(cut == self.pieces[edge], high, self.first_cut[edge] + cut - 1)
+        return torch.where(cut == 0, low, name)
+
+    def cut(self, edge: Int[Tensor, "..."], name: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
+        """Return the cuts of points on edges; -1 of others."""
+        low, high = self.edges[edge].unbind(dim=-1)
+        cut, pieces = name - self.first_cut[edge] + 1, self.pieces[edge]
+        cut = torch.where((cut > 0) & (cut < pieces), cut, -1)
+        return torch.where(name == low, 0, torch.where(name == high, pieces, cut))
+
 
 def _assemble(
-    vertices: Float[Tensor, "corner 3"], facets: Int[Tensor, "facet 3"], cuts: _Cuts
+    vertices: Float[Tensor, "corner 3"],
+    facets: Int[Tensor, "facet 3"],
+    cuts: _Cuts,
+    spacing: Float[Tensor, " facet"],
 ) -> Subdivision:
     """Lay the subdivided meshes of all facets, like sizes together, and number their points."""
-    sizes = cuts.pieces[cuts.edge[:, 0]]
+    sizes = cuts.size
     inner_start = cuts.first_inner + _starts((sizes - 1) * (sizes - 2) // 2)
     names, places, owners, faces, owned = [], [], [], [], []
     for size in torch.unique(sizes).tolist():
@@ -153,21 +176,45 @@ def _assemble(
     name, owner, place = torch.cat(names), torch.cat(owners), torch.cat(places)
     face, face_facet = torch.cat(faces), torch.cat(owned)
 
+    whole = (face != face.roll(1, dims=1)).all(dim=1)
+    face, face_facet = _fanned(face[whole], face_facet[whole], cuts)
+
     used, index = torch.unique(name, return_inverse=True)
     row = torch.empty_like(used).scatter_reduce_(
         0, index, torch.arange(len(name), device=name.device), "amin", include_self=False
     )
     facet, barycentric = owner[row], place[row]
     points = (barycentric[..., None] * vertices[facets[facet]]).sum(dim=1)
-    whole = (face != face.roll(1, dims=1)).all(dim=1)
-    renumbered = torch.searchsorted(used, face[whole])
     return Subdivision(
         points=points,
         facet=facet,
         barycentric=barycentric,
-        faces=renumbered,
-        face_facet=face_facet[whole],
+        faces=torch.searchsorted(used, face),
+        face_facet=face_facet,
+        spacing=spacing,
     )
+
+
+def _fanned(
+    faces: Faces, owner: Int[Tensor, " face"], cuts: _Cuts
+) -> tuple[Faces, Int[Tensor, " face"]]:
+    """Cut faces along finely cut edges into fans; edge by edge at a corner of their facet."""
+    for slot in range(3):
+        edge = cuts.edge[owner, slot]
+        cut = cuts.cut(edge[:, None].expand_as(faces), faces)
+        both = (cut >= 0) & (cut.roll(-1, dims=1) >= 0)
+        # On from the corner that the edge's part begins at.
+        order = (both.long().argmax(dim=1)[:, None] + torch.arange(3, device=cut.device)) % 3
+        start, end, _ = cut.gather(1, order).unbind(dim=1)
+        step = torch.where(both.any(dim=1), end - start, 0)
+        count = step.abs().clamp_min(1)
+        row = torch.arange(len(faces), device=faces.device).repeat_interleave(count)
+        at = torch.arange(len(row), device=row.device) - _starts(count)[row]
+        at = start[row] + step.sign()[row] * at
+        faces, owner, edge, step = faces.gather(1, order)[row], owner[row], edge[row], step[row]
+        fan = [cuts.named(edge, at), cuts.named(edge, at + step.sign()), faces[:, 2]]
+        faces = torch.where((step.abs() > 1)[:, None], torch.stack(fan, dim=1), faces)
+    return faces, owner
 
 
 def _pieces(
@@ -176,21 +223,18 @@ def _pieces(
     edges: Int[Tensor, "edge 2"],
     facet_edges: Int[Tensor, "facet 3"],
     spacing: Float[Tensor, " facet"],
-) -> Int[Tensor, " edge"]:
-    """Count the pieces each edge is cut into."""
+) -> Int[Tensor, "facet 3"]:
+    """Count the pieces that each facet asks for of its edges."""
     ends = vertices[edges]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
     area = face_normals(vertices, facets).norm(dim=-1) / 2
     equilateral = (4 / 3**0.5 * area).sqrt()  # the side of one of that area
-
-    def least(per_facet: Float[Tensor, " facet"]) -> Float[Tensor, " edge"]:
-        spread = per_facet.repeat_interleave(3)
-        unset = torch.full_like(length, torch.inf)
-        return unset.scatter_reduce(0, facet_edges.flatten(), spread, "amin")
-
+    narrowest = torch.full_like(length, torch.inf).scatter_reduce(
+        0, facet_edges.flatten(), equilateral.repeat_interleave(3), "amin"
+    )
     # The pieces of a half square's diagonal: at most 2 points a spacing squared.
-    length = torch.minimum(length, 1.32 * least(equilateral))
-    return (length / least(spacing)).round().long().clamp_min(1)
+    length = torch.minimum(length, 1.32 * narrowest)
+    return (length[facet_edges] / spacing[:, None]).round().long().clamp_min(1)
 
 
 def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:
@@ -243,12 +287,10 @@ def _name(
 ) -> Int[Tensor, "member point"]:
     """Number points so that facets agree: corners, then cuts of edges, then insides."""
     start_slot, end_slot, cut, pieces = slid.unbind(dim=-1)
-    corner = cuts.corner[members]
-    start, end = corner.gather(1, start_slot), corner.gather(1, end_slot)
+    start = cuts.corner[members].gather(1, start_slot)
     edge = cuts.edge[members].gather(1, 3 - start_slot - end_slot)
     from_lower = torch.where(start == cuts.edges[edge, 0], cut, pieces - cut)
-    named = cuts.first_cut[edge] + from_lower - 1
-    named = torch.where(cut == 0, start, torch.where(cut == pieces, end, named))
+    named = cuts.named(edge, from_lower)
     inner: Bool[Tensor, " point"] = (steps > 0).all(dim=1)
     return torch.where(inner, inner_start[:, None] + inner.cumsum(dim=0) - 1, named)
 

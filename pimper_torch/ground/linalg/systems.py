@@ -91,7 +91,7 @@ def solve_compressed(
     sides: Float[Tensor, "unknown side"],
     *,
     what: str,
-    tolerance: float,
+    tolerance: float = DEFAULT_TOLERANCE,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
     """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""

@@ -117,6 +117,7 @@ def block_of(
         barycentric=whole.barycentric[vertex],
         faces=number[whole.faces[chosen]],
         face_facet=whole.face_facet[chosen],
+        spacing=whole.spacing,
     )
     held = corners_of(whole.faces, ~chosen, len(own))[vertex]
 

@@ -161,7 +161,7 @@ def swept_heights(
     offsets: PerVertex,
     information: PerVertex,
     facing: PerVertex,
-    correlated: float,
+    correlated: PerVertex,
     common: Common | None = None,
 ) -> Equations:
     """State where the sweep has the surface.
@@ -176,7 +176,7 @@ def swept_heights(
     known = upright_heights(information, facing).nonzero()[:, 0]
     steep = facing[known]
     together = 1 / (information[known] * steep.square())
-    each = together / correlated
+    each = together / correlated[known]
     if common is not None:
         each = each + common.variance
         together = together + common.variance * common.count[known]

@@ -23,7 +23,7 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.continuation import about_mean, enclosed
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.shapes import PerVertex, Scalar
-from pimper_torch.method.fusion.blend import Blend, ray_directions, vertex_spacing
+from pimper_torch.method.fusion.blend import Blend, ray_directions
 from pimper_torch.method.fusion.blocks import (
     Coarse,
     Key,
@@ -33,6 +33,7 @@ from pimper_torch.method.fusion.blocks import (
     pooled,
     sampled,
 )
+from pimper_torch.method.fusion.detail import spacing_of
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.method.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error
@@ -131,14 +132,15 @@ class Fuse(Stage):
                 is not finite.
         """
         config = self.config
-        problem = pose(swept, _COARSER * config.samples_per_vertex, self._lit)
+        spacing = spacing_of(swept, config.samples_per_vertex, config.max_lost)
+        problem = pose(swept, laid(swept, _COARSER * spacing), self._lit)
         terms = tuple(term.bound(problem, contours) for term in self._terms)
         problem = _sloped(problem, terms)
         several = _COARSER**2 * len(problem.points) > most
         shared = self._shared(problem, terms, expected, several)
         del problem
         release_memory()
-        subdivision = laid(swept, config.samples_per_vertex)
+        subdivision = laid(swept, spacing).subdivision
         blend, heights, albedo = self._blended(swept, subdivision, shared, most)
         directions = ray_directions(subdivision, swept.patches.coarse)
         points = subdivision.points + blend.heights[:, None] * directions
@@ -152,8 +154,7 @@ class Fuse(Stage):
         if coarse.expected is not None:
             along = transferred(coarse.expected, coarse.subdivision, subdivision.points).to(normals)
             facing = (normals.detach() * directions.detach()).sum(dim=-1).abs()
-            spacing = vertex_spacing(swept.patches, config.samples_per_vertex).median()
-            error = torch.hypot(along * facing, FINEST * spacing.detach())
+            error = torch.hypot(along * facing, FINEST * spacing[subdivision.facet])
         moved = (heights - blend.heights).detach()
         return Surface(
             vertices_world=vertices,
@@ -211,7 +212,7 @@ class Fuse(Stage):
     ) -> Problem:
         """Pose the problem of some facets, without the tilt that the normals of each share."""
         block = block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
-        problem = pose(swept, self.config.samples_per_vertex, self._lit, block)
+        problem = pose(swept, block, self._lit)
         problem = _sloped(problem.replace(typical=typical), shared.terms)
         release_memory()
         if shared.tilt is None:

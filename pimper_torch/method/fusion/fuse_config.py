@@ -17,8 +17,11 @@ class FuseConfig:
     """Which terms take part, and how the noise of each kind is estimated.
 
     Attributes:
-        samples_per_vertex: Template samples between neighbouring vertices of the surface.
-            Time and memory fall with its square.
+        samples_per_vertex: Template samples between neighbouring vertices of the surface, where
+            they lie closest. Time and memory fall with its square.
+        max_lost: Part of the variance of a facet's normals, or of its swept heights, that its grid
+            may lose, see :mod:`~pimper_torch.method.fusion.detail`. Of twice or four times the
+            spacing it has a quarter or a sixteenth of the vertices. 0 spaces all alike.
         terms: Kinds of evidence, in the order that they are summed up, see
             :mod:`~pimper_torch.method.fusion.terms`.
         bias_iterations: How often the tilt that the normals of a facet have in common, and the
@@ -32,6 +35,7 @@ class FuseConfig:
     """
 
     samples_per_vertex: float = 1.0
+    max_lost: Annotated[float, Range(least=0, most=1)] = 0.15
     terms: tuple[str, ...] = KINDS
     bias_iterations: Annotated[int, Range(least=0, most=1000)] = 2
     noise_iterations: Annotated[int, Range(least=1, most=1000)] = 3

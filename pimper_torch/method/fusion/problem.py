@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide
@@ -34,7 +34,8 @@ class Problem(Record):
         known: Vertices with a photometric normal.
         sloped: Edges that terms tell the slope of.
         spacing: Median distance between vertices, scene units.
-        correlated: Vertices in a window of the sweep.
+        correlated: Vertices in a window of the sweep, of the spacing at each.
+        density: Vertices of the finest spacing that each one stands for.
         cloud: Points of the cloud on facets, if any.
         photometric: Normals, with or without the tilt that facets have in common.
         tilt_variance: Of the tilt that the normals of a facet have in common, squared radians;
@@ -55,7 +56,8 @@ class Problem(Record):
     known: VertexMask
     sloped: Bool[Tensor, " edge"]
     spacing: Scalar
-    correlated: float
+    correlated: PerVertex
+    density: PerVertex
     cloud: FacetPoints | None
     photometric: Vertices
     block: Block
@@ -109,38 +111,27 @@ class Problem(Record):
         return self.blend.heights + self.block.shape.to(self.blend.heights)
 
 
-def laid(swept: SweptPatches, samples_per_vertex: float) -> Subdivision:
-    """Lay a subdivided mesh over the facets.
-
-    Args:
-        samples_per_vertex: Template samples between neighbouring vertices.
-    """
-    patches = swept.patches
-    mesh = patches.coarse.mesh
-    return subdivide(mesh.vertices_world, mesh.faces, vertex_spacing(patches, samples_per_vertex))
+def laid(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> Block:
+    """Lay a subdivided mesh over all facets, of that distance between vertices in each."""
+    mesh = swept.patches.coarse.mesh
+    return Block.whole(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
 
 
-def pose(
-    swept: SweptPatches, samples_per_vertex: float, slopes: bool, block: Block | None = None
-) -> Problem:
-    """Lay a subdivided mesh over the facets, and blend the patches on it.
+def pose(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
+    """Blend the patches on a subdivided mesh.
 
     Args:
         swept: Photometry and swept heights of all patches.
-        block: Of a mesh that is laid already; without, one is laid over all facets.
     """
     patches = swept.patches
-    facets = patches.coarse.mesh.faces
-    spacing = vertex_spacing(patches, samples_per_vertex)
-    block = block or Block.whole(laid(swept, samples_per_vertex), facets)
-    subdivision = block.subdivision
+    subdivision, spacing = block.subdivision, block.subdivision.spacing
     directions = ray_directions(subdivision, patches.coarse)
     some = swept.of_facets(block.facets)
     height_fields = transferred_height_fields(some)
     blend = blend_patches(height_fields, subdivision, directions, 4.0, some.buckets)
     del some, height_fields
     # A vertex stands for so many samples, each of which has its own information.
-    density = samples_per_vertex**2
+    density = (spacing / vertex_spacing(patches, 1.0)).square()[subdivision.facet]
     blend = blend.replace(offset_information=density * blend.offset_information)
     release_memory()
     points = subdivision.points + blend.heights[:, None] * directions
@@ -149,7 +140,7 @@ def pose(
     lit = known[edges].all(dim=1) & upright(edges, directions, blend.normals_world)
     return Problem(
         subdivision=subdivision,
-        facets=facets,
+        facets=patches.coarse.mesh.faces,
         directions=directions,
         blend=blend,
         points=points,
@@ -159,7 +150,8 @@ def pose(
         known=known,
         sloped=lit,
         spacing=spacing.median(),
-        correlated=max(1.0, swept.averaged / density),
+        correlated=(swept.averaged / density).clamp_min(1),
+        density=(spacing / spacing.min()).square()[subdivision.facet],
         cloud=patches.coarse.points,
         photometric=blend.normals_world,
         block=block,

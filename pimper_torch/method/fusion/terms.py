@@ -131,7 +131,7 @@ class Normals(Term):
                 problem.subdivision.points,
                 problem.directions,
                 problem.photometric,
-                slope_variance(problem.blend.normal_information),
+                slope_variance(problem.blend.normal_information) / problem.density,
                 together,
             )
         ]
@@ -167,7 +167,7 @@ class SweptHeights(Term):
         ]
 
     def _stated(
-        self, problem: Problem, offsets: PerVertex, information: PerVertex, correlated: float
+        self, problem: Problem, offsets: PerVertex, information: PerVertex, correlated: PerVertex
     ) -> Equations:
         facing, together = problem.facing, None
         if self.variance is not None:
@@ -227,7 +227,8 @@ class PriorNormals(Term):
         together = None
         if self.variance is not None:
             together = common(self.variance, problem.facet, information > 0)
-        flat, variance = problem.subdivision.points, slope_variance(information)
+        flat = problem.subdivision.points
+        variance = slope_variance(information) / problem.density
         return [slopes(edges, flat, problem.directions, normals, variance, together)]
 
     def evaluated(
@@ -258,11 +259,10 @@ class PriorDepths(SweptHeights):
 
     def equations(self, problem: Problem) -> list[Equations]:
         """State the heights, if anything was guessed."""
-        blend = problem.blend
-        known = upright_heights(blend.prior_offset_information, problem.facing)
-        if not bool(known.any()):
+        offsets, information = problem.blend.prior_offsets, problem.blend.prior_offset_information
+        if not bool(upright_heights(information, problem.facing).any()):
             return []
-        return [self._stated(problem, blend.prior_offsets, blend.prior_offset_information, 1.0)]
+        return [self._stated(problem, offsets, information, torch.ones_like(offsets))]
 
 
 class CloudPoints(Term):
@@ -345,7 +345,7 @@ class KeptSlopes(Term):
         kept = ~problem.sloped & ~over
         level = kept & upright(edges, along, problem.normals)
         swept = (problem.blend.offset_information > 0)[edges].all(dim=1)
-        windows = torch.full_like(start, problem.correlated)
+        windows = problem.correlated.to(start)
         return [
             slopes(edges[over], flat, along, normals, together).replace(
                 correlated=(together / variance)[edges[over]].mean(dim=1), evaluated=False

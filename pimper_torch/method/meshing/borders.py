@@ -28,7 +28,6 @@ _REACH = 8.0
 # right angle is rounded (0.59 at its tip), and arcs of a few lengths stay; with 0.9 a skull lost
 # the edge of its teeth, with 0.55 flaps stay.
 _STRAIGHT = 0.75
-_TOLERANCE = 3e-4  # a choice, relative: far below that
 
 
 def protruding(vertices: Vertices, faces: Faces, length: float, unsure: FaceMask) -> FaceMask:
@@ -133,4 +132,4 @@ def _smoothed(
     matrix = csr_array((torch.cat([entries, mass]).numpy(), cells), shape=(mesh.count, mesh.count))
     sides, near = (mass * values)[:, None], start[:, None]
     what = "the smoothing of borders"
-    return solve_compressed(matrix, sides, what=what, tolerance=_TOLERANCE, start=near)[:, 0]
+    return solve_compressed(matrix, sides, what=what, start=near)[:, 0]

@@ -3,9 +3,10 @@
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.surfaces import component_areas
+from pimper_torch.ground.geometry.surfaces import component_areas, face_normals
 from pimper_torch.ground.geometry.topology import face_components, vertex_fans
-from pimper_torch.ground.shapes import FaceMask, Faces, Vertices
+from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Scalar, Vertices
 from pimper_torch.method.meshing.borders import protruding
 from pimper_torch.method.meshing.faults import diagonal, faults, small_groups
 from pimper_torch.method.meshing.meshing_config import ExtractConfig
@@ -16,7 +17,7 @@ from pimper_torch.runtime.stage import Stage
 
 # Of a facet's side: what sticks out of a border and is about so wide is cut off. A choice: with 1,
 # a skull lost the edge of its teeth; with 0.6 its base ends smoothly and they stay.
-_TOOTH = 0.6
+_TOOTH = 0.7
 # Expected error, in multiples of the surface's median, from which surface is not determined. Of the
 # skull's flaps 3 in 4 faces have more than 8, of its other faces the median has 1; with 5 the
 # flaps go, and 8 % of what is cut without this limit stays.
@@ -71,7 +72,7 @@ class Extract(Stage):
                 f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
                 "of missing data that the report gives."
             )
-        unsure = ~surface.supported if error is None else error > _UNSURE * error.median()
+        unsure = ~surface.supported if error is None else error > _UNSURE * _typical(surface, error)
         length = _TOOTH * facet_side(surface)
         teeth = protruding(vertices, faces, length, unsure[faces].any(dim=1))
         leave_out("extract.borders", teeth & ~teeth.all(), at=(vertices, faces))
@@ -91,12 +92,18 @@ class Extract(Stage):
         )
 
 
+def _typical(surface: Surface, values: PerVertex) -> Scalar:
+    """Return the median over facets of the mean on each: vertices lie closer on some."""
+    count = torch.bincount(surface.facet)
+    mean = torch.bincount(surface.facet, values.detach(), len(count)) / count
+    return mean[count > 0].median()
+
+
 def facet_side(surface: Surface) -> float:
-    """Return the side of a typical facet, scene units."""
-    edges = (len(surface.faces) / max(len(torch.unique(surface.facet)), 1)) ** 0.5
-    corners = surface.vertices_world.detach()[surface.faces]
-    sides = (corners - corners.roll(1, dims=1)).norm(dim=-1)
-    return edges * float(sides.median())
+    """Return the side of an equilateral facet of the mean area, scene units."""
+    area = face_normals(surface.vertices_world.detach(), surface.faces).norm(dim=1) / 2
+    count = max(len(torch.unique(surface.facet)), 1)
+    return float((4 / 3**0.5 * total(area) / count).sqrt())
 
 
 def large_components(vertices: Vertices, faces: Faces, fraction: float) -> FaceMask:
