@@ -64,7 +64,13 @@ def cap():
     return cap_of(2)
 
 
-def cap_of(count):
+@pytest.fixture(scope="module")
+def wide():
+    """Facets of 38 samples a side."""
+    return cap_of(1, samples_per_pixel=2.0)
+
+
+def cap_of(count, samples_per_pixel=1.0):
     """Facets in some rings, whose corners lie on the sphere, with its exact normals and heights."""
     rings = [torch.zeros(1, 2, dtype=torch.float64)]
     for ring in range(1, count + 1):
@@ -76,7 +82,8 @@ def cap_of(count):
     faces = torch.where((face_normals(vertices, faces)[:, 2] > 0)[:, None], faces.flip(1), faces)
     mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces))
     coarse = CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
-    patches = Decompose(DecomposeConfig(overlap_samples=3.0))(coarse, cameras())
+    config = DecomposeConfig(overlap_samples=3.0, samples_per_pixel=samples_per_pixel)
+    patches = Decompose(config)(coarse, cameras())
     normals, heights = zip(
         *(exact(coarse, templates) for templates in patches.buckets), strict=True
     )
@@ -155,15 +162,15 @@ def rippled(cap, period, **sizes):
         (4, {}, 4),
         (4, {"normals": 0.02}, 1),  # twice what they claim
         (4, {"normals": 0.002}, 4),
-        (16, {"normals": 0.025}, 2),
+        (16, {"normals": 0.04}, 2),
         (4, {"heights": 0.2 * SPACING}, 1),
         (4, {"heights": 0.02 * SPACING}, 4),
         (4, {"albedo": 0.2}, 1),
         (4, {"albedo": 0.02}, 4),
     ],
 )
-def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(cap, period, sizes, apart):
-    swept = rippled(cap, period, **sizes)
+def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(wide, period, sizes, apart):
+    swept = rippled(wide, period, **sizes)
     finest = vertex_spacing(swept.patches, 1.0)
     expected = torch.full_like(finest, 4.0)
     expected[swept.patches.buckets[0].facet[0]] = apart
@@ -171,9 +178,9 @@ def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(cap, period
     assert torch.equal(spacing_of(swept, 0.5, 0.0), 0.5 * finest)
 
 
-def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(cap):
+def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(wide):
     """Its slopes are photometric: heights have the wave's amplitude over its wave number."""
-    swept = rippled(cap, 8, normals=0.2)
+    swept = rippled(wide, 8, normals=0.2)
     some, every = (Fuse(FuseConfig(max_lost=lost))(swept, free()) for lost in (0.1, 0.0))
     assert 3 * len(some.vertices_world) < len(every.vertices_world)
     facet = swept.patches.buckets[0].facet[0]
@@ -182,7 +189,7 @@ def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(cap):
     assert torch.equal(some.barycentric[inner], every.barycentric[same])
     apart = (some.vertices_world[inner] - every.vertices_world[same]).norm(dim=1)
     assert apart.max() < 0.02 * SPACING
-    assert off_sphere(some.vertices_world[inner]).std() > 0.1 * SPACING
+    assert off_sphere(some.vertices_world[inner]).std() > 0.05 * SPACING
 
 
 def test_flat_facets_come_to_lie_on_the_sphere(cap):

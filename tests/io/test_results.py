@@ -174,6 +174,7 @@ def test_the_summary_counts(reconstruction):
         "vertices": 225,
         "seconds": 2.0,
         "peak_memory_mb": 310.0,
+        "peak_memory_stage": "extract",
         "convergence": {"patches": 2, "converged": 1, "mean_iterations": 26.0},
     }
     assert {key: summary[key] for key in wanted} == wanted

@@ -30,6 +30,7 @@ SUMMARY = {
     "warnings": ["two photographs are blurred; take them again"],
     "seconds": 12.0,
     "peak_memory_mb": 900.0,
+    "peak_memory_stage": "fuse",
     "stages": [
         {"name": "warp", "seconds": 4.0, "peak_memory_mb": 500.0, "kept": False, "samples": 12345},
         {"name": "fuse", "seconds": 8.0, "peak_memory_mb": 900.0, "kept": False},

@@ -133,6 +133,8 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     samples, missing = figures.get("samples"), figures.get("missing_samples", 0)
     ends = [bucket.convergence for bucket in result.patches.photometric.buckets]
     patches = sum(len(end.converged) for end in ends)
+    # Peaks are of the process so far: the first that reaches the highest raised it.
+    peak = max(result.report, key=lambda report: report.peak_memory_mb, default=None)
     return {
         "pimper_torch": installed_version(),
         **about,
@@ -152,7 +154,8 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "vertices": len(result.mesh.vertices_world),
         "faces": len(result.mesh.faces),
         "seconds": sum(report.seconds for report in result.report),
-        "peak_memory_mb": max((report.peak_memory_mb for report in result.report), default=None),
+        "peak_memory_mb": None if peak is None else peak.peak_memory_mb,
+        "peak_memory_stage": None if peak is None else peak.name,
         "convergence": {
             "patches": patches,
             "converged": sum(int(end.converged.sum()) for end in ends),

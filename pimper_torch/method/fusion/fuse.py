@@ -97,8 +97,8 @@ class Fuse(Stage):
 
     The surface's normals are its own; its albedo is continued where it is not known, with
     information 0. Differentiable in templates, normals, albedo, information, swept heights and the
-    cloud, through every solve; which patches, samples, edges, vertices and faces take part is
-    constant.
+    cloud, through every solve; where vertices lie on their facets, and which patches, samples,
+    edges and faces take part, is constant.
     """
 
     def __init__(

@@ -154,6 +154,8 @@ def _stages(summary: Summary) -> Json:
         for stage in stages
     ]
     total = f"{summary['seconds']:.0f} s, {summary['peak_memory_mb'] or 0:.0f} MB at most"
+    if summary.get("peak_memory_stage"):
+        total += f", in {summary['peak_memory_stage']}"
     return {"title": "Stages", "text": total, "table": _table(columns | {"figures": "text"}, rows)}
 
 

@@ -2,5 +2,6 @@
 
 from pimper_torch.runtime.store.digest import digest
 from pimper_torch.runtime.store.store import Store, kept, opened, settled
+from pimper_torch.runtime.user_cache import user_cache
 
-__all__ = ["Store", "digest", "kept", "opened", "settled"]
+__all__ = ["Store", "digest", "kept", "opened", "settled", "user_cache"]
