@@ -235,7 +235,7 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
         buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     tilted = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     points = near_plane(lifted, 0.3 * spacing, count=60)
-    surface = Fuse(FuseConfig(max_lost=0))(with_points(tilted, points, 0.02 * spacing), FREE)
+    surface = Fuse(FuseConfig(max_lost=0.0))(with_points(tilted, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
     edges = face_edges(surface.faces)[0]
     edges = torch.cat([edges, edges.flip(1)])
@@ -309,7 +309,7 @@ def test_what_is_continued_does_not_outvote_points(swept):
     lifted, given = swept(0.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     holed = with_dark_dents(given, 0.0)
-    fuse = Fuse(FuseConfig(max_lost=0))  # vertices as close in and beside the holes
+    fuse = Fuse(FuseConfig(max_lost=0.0))  # vertices as close in and beside the holes
     flat = fuse(holed, FREE)
     (dark,) = torch.nonzero((flat.confidence == 0) & (flat.facet == 0), as_tuple=True)
     places = flat.vertices_world[dark].double()

@@ -193,7 +193,7 @@ def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(wide):
 
 
 def test_flat_facets_come_to_lie_on_the_sphere(cap):
-    surface = Fuse(FuseConfig(max_lost=0))(cap, free())
+    surface = Fuse(FuseConfig(max_lost=0.0))(cap, free())
     mesh = cap.patches.coarse.mesh
     sag = off_sphere(mesh.vertices_world[mesh.faces].mean(dim=1)).abs().max()
     assert sag > 0.7 * SPACING

@@ -197,7 +197,7 @@ def _assemble(
 
 def _fanned(
     faces: Faces, owner: Int[Tensor, " face"], cuts: _Cuts
-) -> tuple[Faces, Int[Tensor, " face"]]:
+) -> tuple[Int[Tensor, "piece 3"], Int[Tensor, " piece"]]:
     """Cut faces along finely cut edges into fans; edge by edge at a corner of their facet."""
     for slot in range(3):
         edge = cuts.edge[owner, slot]
