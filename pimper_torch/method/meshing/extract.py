@@ -16,7 +16,7 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
 # Of a facet's side: what sticks out of a border and is about so wide is cut off. A choice: with 1,
-# a skull lost the edge of its teeth; with 0.6 its base ends smoothly and they stay.
+# a skull lost the edge of its teeth; so its base ends smoothly and they stay.
 _TOOTH = 0.7
 # Expected error, in multiples of the surface's median, from which surface is not determined. Of the
 # skull's flaps 3 in 4 faces have more than 8, of its other faces the median has 1; with 5 the
