@@ -43,10 +43,6 @@ class NumericalError(PimperError):
     """Equations that the data leave open or contradict."""
 
 
-class MissingProgramError(ReconstructionError):
-    """A program that somebody else wrote is not installed here."""
-
-
 class PimperWarning(UserWarning):
     """The result is delivered, but something about it should be known."""
 

@@ -13,10 +13,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table as Grid
 from rich.text import Text
 
+from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.bench.measure import Machine
 from pimper_bench.metrics.figure_rows import plain
 from pimper_torch.records import Record
-from pimper_torch.runtime.errors import MissingProgramError
 
 _COST = "cost"
 _RAYS = "along the rays of the reference view"

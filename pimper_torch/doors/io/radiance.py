@@ -1,5 +1,6 @@
 """Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import prod
@@ -27,8 +28,8 @@ from pimper_torch.ground.radiometry.saturation import PIXELS
 from pimper_torch.ground.shapes import Mask, Scalar
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError, caution
-from pimper_torch.runtime.mapped import drop_pages, zeros
-from pimper_torch.runtime.progress import track
+from pimper_torch.runtime.mapped import zeros
+from pimper_torch.runtime.parallel import side_by_side
 
 OPAQUE = 0.5
 # What sensors digitize to; 16 bits hold all of it.
@@ -170,10 +171,8 @@ def _fill(
             are counted.
     """
     given = None if encoding.response == "auto" else response_of(encoding)
-    opaque: list[Tensor | None] = []
-    drawn: Tensor | None = None
-    tallies: dict[_Kind, _Tally] = {}
-    for index in track(range(len(paths))):
+
+    def of_file(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
         response = file_response(decoded) if given is None else given
         kind = _Kind(decoded.full, decoded.full_told, response)
@@ -183,18 +182,29 @@ def _fill(
         if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
             radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
-        opaque.append(None)
-        if decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any()):
-            if drawn is None:
-                drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
-            drawn[index, :high, :wide] = resized_mask(decoded.alpha, wide, high)
-            opaque[-1] = drawn[index]
-        if encoding.saturation == "auto" and not whites:
-            levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
-            counts = torch.stack([one.bincount(minlength=decoded.full + 1) for one in levels])
-            tally = torch.stack([counts, (counts >= PIXELS).long()])
-            tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
-        drop_pages()
+        drawn = decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any())
+        mask = resized_mask(decoded.alpha, wide, high) if drawn else None
+        if encoding.saturation != "auto" or whites:
+            return mask, kind, None
+        levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
+        counts = torch.stack([one.bincount(minlength=decoded.full + 1) for one in levels])
+        return mask, kind, torch.stack([counts, (counts >= PIXELS).long()])
+
+    opaque: list[Tensor | None] = []
+    drawn: Tensor | None = None
+    tallies: dict[_Kind, _Tally] = {}
+    with warnings.catch_warnings():
+        # Decoders catch warnings, which in threads mixes up the filters; these are put back.
+        warnings.simplefilter("ignore")
+        for index, (mask, kind, tally) in enumerate(side_by_side(of_file, range(len(paths)))):
+            opaque.append(None)
+            if mask is not None:
+                if drawn is None:
+                    drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
+                drawn[index, : len(mask), : mask.shape[1]] = mask
+                opaque[-1] = drawn[index]
+            if tally is not None:
+                tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
     return tuple(opaque), tallies
 
 

@@ -5,10 +5,8 @@ coarser subdivided mesh, and its expected error drawn there; then it is solved f
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 from typing import cast
 
 import torch
@@ -393,7 +391,8 @@ class _Made:
     def without(self, unwanted: Callable[[Term], bool]) -> "_Made":
         """Leave out some terms."""
         pairs = zip(self.terms, self.kinds, strict=True)
-        return _Made.of_pairs(pair for pair in pairs if not unwanted(pair[0]))
+        terms, kinds = zip(*(pair for pair in pairs if not unwanted(pair[0])), strict=True)
+        return _Made(terms, kinds)
 
     def again(self, problem: Problem) -> "_Made":
         """Make the equations of tilted terms anew, for other normals or another tilt."""
@@ -423,14 +422,8 @@ class _Made:
         )
         return _Made(terms, kinds), problem
 
-    @classmethod
-    def of_pairs(cls, pairs: Iterable[tuple[Term, list[Equations]]]) -> "_Made":
-        """Put terms beside their equations."""
-        terms, kinds = zip(*pairs, strict=True)
-        return cls(terms, kinds)
-
 
 def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:
     """Collect the edges that terms tell the slope of."""
-    told = (term.sloped(problem) for term in terms)
-    return problem.replace(sloped=reduce(or_, told, torch.zeros_like(problem.lit)))
+    known = [torch.zeros_like(problem.lit), *(term.sloped(problem) for term in terms)]
+    return problem.replace(sloped=torch.stack(known).any(dim=0))

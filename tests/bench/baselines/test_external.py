@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from pimper_bench.baselines import openmvs
+from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.baselines.openmvs import find_program, run_program
-from pimper_torch.runtime.errors import MissingProgramError, ReconstructionError
+from pimper_torch.runtime.errors import ReconstructionError
 
 
 def soon(minutes):

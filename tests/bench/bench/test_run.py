@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.bench import run_bench as runner
 from pimper_bench.bench.bench_inputs import BenchConfig, Inputs, MethodRun, method_named
 from pimper_bench.bench.contact_sheet import error_along_rays
@@ -20,12 +21,7 @@ from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.outputs.marker import MARKER
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.records import CoarseMesh, Estimate, Mesh
-from pimper_torch.runtime.errors import (
-    ConfigError,
-    MissingProgramError,
-    PimperWarning,
-    ReconstructionError,
-)
+from pimper_torch.runtime.errors import ConfigError, PimperWarning, ReconstructionError
 
 COUNTS = {"samples": 1000, "missing_samples": 250}
 RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.bench.bench_table import (
     MISSING,
     PUBLISHED,
@@ -24,7 +25,7 @@ from pimper_bench.bench.bench_table import (
 from pimper_bench.bench.measure import Machine, this_machine
 from pimper_torch.runtime.config import build
 from pimper_torch.runtime.cores import usable_cores
-from pimper_torch.runtime.errors import MissingProgramError, ReconstructionError
+from pimper_torch.runtime.errors import ReconstructionError
 
 MACHINE = Machine(
     cpu="Abacus 12",
