@@ -21,7 +21,7 @@ def test_bilinear_samples_are_those_of_grid_sample(real):
     rows = images.reshape(3, -1).numpy()
     points = list(zip(x.tolist(), y.tolist(), strict=True))
     at = [corners(height, width, u, v) for u, v in points]
-    found = torch.tensor([[bilinear(rows, view, *corner) for corner in at] for view in range(3)])
+    found = torch.tensor([[bilinear(row, *corner) for corner in at] for row in rows])
     grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
     expected = grid_sample(
         images[:, None].float(),

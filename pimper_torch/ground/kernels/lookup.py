@@ -11,7 +11,7 @@ from pimper_torch.ground.kernels.compile import compiled
 Array = NDArray[Any]
 
 
-@compiled("Tuple((int64, int64, int64, float32, float32))(int64, int64, float64, float64)")
+@compiled()
 def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
     """Return the upper left one of the four pixels around a point, and bilinear weights.
 
@@ -28,7 +28,8 @@ def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int,
     column, row = int(x), int(y)
     right = 1 if column < width - 1 else 0
     below = width if row < height - 1 else 0
-    return row * width + column, right, below, x - column, y - row
+    across, down = np.float32(x - column), np.float32(y - row)
+    return row * width + column, right, below, across, down
 
 
 @compiled("Tuple((int64, float32))(float64, int64)")
@@ -45,18 +46,13 @@ def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
     return finer, level - finer
 
 
-@compiled(
-    "float32(float32[:,::1], int64, int64, int64, int64, float32, float32)",
-    "float32(uint8[:,::1], int64, int64, int64, int64, float32, float32)",
-)
-def bilinear(
-    pixels: Array, view: int, at: int, right: int, below: int, across: float, down: float
-) -> float:
-    """Blend four pixels as :func:`corners` gives them."""
-    here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
+@compiled()
+def bilinear(pixels: Array, at: int, right: int, below: int, across: float, down: float) -> float:
+    """Blend four pixels of a row as :func:`corners` gives them."""
+    here, beside = np.float32(pixels[at]), np.float32(pixels[at + right])
     above = here + across * (beside - here)
     at += below
-    here, beside = np.float32(pixels[view, at]), np.float32(pixels[view, at + right])
+    here, beside = np.float32(pixels[at]), np.float32(pixels[at + right])
     blended: Any = above + down * (here + across * (beside - here) - above)
     return blended
 

@@ -79,6 +79,8 @@ def register(
     for patch in range(patches):
         for view in range(views):
             image = rows[view]
+            fine, coarse = finest[image], coarser[image]
+            fine_unusable, coarse_unusable = unusable_finest[image], unusable_coarser[image]
             m = image_from_patch[patch * views + view]
             center = centers_patch[patch * views + view]
             any_sample = False
@@ -124,10 +126,7 @@ def register(
                             for step in range(2 if blend > 0 else 1):
                                 weight = blend if step == 1 else np.float32(1) - blend
                                 here = level + step
-                                tall, wide = (
-                                    levels[here, 0],
-                                    levels[here, 1],
-                                )
+                                tall, wide = levels[here, 0], levels[here, 1]
                                 at, aside, under, across, down = corners(
                                     tall,
                                     wide,
@@ -136,22 +135,22 @@ def register(
                                 )
                                 if here == 0:
                                     lost += weight * bilinear(
-                                        unusable_finest, image, at, aside, under, across, down
+                                        fine_unusable, at, aside, under, across, down
                                     )
                                     for channel in range(channels):
                                         blended[channel] = weight * bilinear(
-                                            finest, image, at, aside, under, across, down
+                                            fine, at, aside, under, across, down
                                         )
                                         at += fine_plane
                                     continue
                                 start = levels[here, 2]
                                 lost += weight * bilinear(
-                                    unusable_coarser, image, start + at, aside, under, across, down
+                                    coarse_unusable, start + at, aside, under, across, down
                                 )
                                 at += channels * start
                                 for channel in range(channels):
                                     value = weight * bilinear(
-                                        coarser, image, at, aside, under, across, down
+                                        coarse, at, aside, under, across, down
                                     )
                                     blended[channel] = (
                                         value if step == 0 else blended[channel] + value

@@ -18,91 +18,68 @@ Array = NDArray[Any]
 FLOOR = float(np.finfo(np.float32).eps)
 
 
-@compiled(
-    "float32(float32[:,::1], float32[:,::1], int64[:,::1], float64[:,::1], int64, int64, float32,"
-    "float64, float64)"
-)
-def _gray(
-    finest: Array,
-    coarser: Array,
-    levels: Array,
-    fractions: Array,
-    view: int,
-    level: int,
-    blend: float,
-    u: float,
-    v: float,
-) -> float:
-    """Sample the pyramid trilinearly."""
+@compiled()
+def _gray(pixels: Array, levels: Array, fractions: Array, level: int, u: float, v: float) -> float:
+    """Sample one level of a photograph's pyramid."""
     tall, wide = levels[level, 0], levels[level, 1]
-    index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
-    at, right, below, across, down = index
-    if level == 0:
-        value = bilinear(finest, view, at, right, below, across, down)
-    else:
-        value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
-    if blend > 0:
-        level += 1
-        tall, wide = levels[level, 0], levels[level, 1]
-        index = corners(tall, wide, u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5)
-        at, right, below, across, down = index
-        coarser_value = bilinear(coarser, view, levels[level, 2] + at, right, below, across, down)
-        value += blend * (coarser_value - value)
-    return value
+    x, y = u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5
+    at, right, below, across, down = corners(tall, wide, x, y)
+    start = levels[level, 2] if level > 0 else 0
+    return bilinear(pixels, start + at, right, below, across, down)
 
 
-@compiled("float32(float32[::1], int64[::1], int64)")
-def lower_median(values: Array, order: Array, count: int) -> float:
-    """Return the lower median of the first ``count`` values.
-
-    By insertion sort of ``order``: linear time if it is nearly sorted.
-    """
-    for last in range(1, count):
-        candidate = order[last]
-        index = last
-        while index > 0 and values[order[index - 1]] > values[candidate]:
-            order[index] = order[index - 1]
-            index -= 1
-        order[index] = candidate
-    return values[order[(count - 1) // 2]]
-
-
-@compiled(
-    "float64(float32[:,::1], int64, float32[::1], float32[::1], int64, float32, float32[::1],"
-    "int64[::1])",
-    fast=True,
-)
+@compiled(fast=True)
 def _inconsistency(
     radiance: Array,
-    step: int,
     shading: Array,
     per_shading: Array,
     count: int,
     per_scale: float,
-    ratios: Array,
-    order: Array,
-) -> float:
-    """See :func:`~pimper_torch.method.sweep.costs.inconsistency`; for one sample and height."""
+    ranked: Array,
+    work: tuple[Array, Array, Array, Array],
+    cost: Array,
+) -> None:
+    """See :func:`~pimper_torch.method.sweep.costs.inconsistency`; for one sample.
+
+    All heights side by side: they are what is vectorized.
+    """
+    albedo, square, product, factors = work
+    heights, middle, one = len(cost), (count - 1) // 2, np.float32(1)
+    # The lower median, by insertion.
     for view in range(count):
-        ratios[view] = radiance[step, view] * per_shading[view]
-    albedo = np.float32(lower_median(ratios, order, count))
-    one = np.float32(1)
+        for step in range(heights):
+            albedo[step] = radiance[view, step] * per_shading[view]
+        for rank in range(min(view, middle + 1)):
+            for step in range(heights):
+                first, second = ranked[rank, step], albedo[step]
+                ranked[rank, step], albedo[step] = min(first, second), max(first, second)
+        if view <= middle:
+            for step in range(heights):
+                ranked[view, step] = albedo[step]
+    for step in range(heights):
+        albedo[step] = ranked[middle, step]
     for _ in range(2):
-        square, product = np.float32(0), np.float32(0)
+        for step in range(heights):
+            square[step], product[step] = 0, 0
         for view in range(count):
-            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
-            lit = shading[view] / (one + residual * residual)
-            square += lit * shading[view]
-            product += lit * radiance[step, view]
-        albedo = product / square if square > 0 else product
-    cost = 0.0
-    for first in range(0, count, 8):  # products of eight do not overflow
-        factors = 1.0
-        for view in range(first, min(first + 8, count)):
-            residual = (radiance[step, view] - albedo * shading[view]) * per_scale
-            factors *= 1.0 + np.float64(residual) * np.float64(residual)
-        cost += math.log(factors)
-    return 0.5 * cost
+            for step in range(heights):
+                residual = (radiance[view, step] - albedo[step] * shading[view]) * per_scale
+                lit = shading[view] / (one + residual * residual)
+                square[step] += lit * shading[view]
+                product[step] += lit * radiance[view, step]
+        for step in range(heights):
+            albedo[step] = product[step] / (square[step] if square[step] > 0 else one)
+    for step in range(heights):
+        cost[step] = 0
+    for start in range(0, count, 8):  # products of eight do not overflow
+        for step in range(heights):
+            factors[step] = 1
+        for view in range(start, min(start + 8, count)):
+            for step in range(heights):
+                residual = (radiance[view, step] - albedo[step] * shading[view]) * per_scale
+                factors[step] *= 1.0 + np.float64(residual) * np.float64(residual)
+        for step in range(heights):
+            cost[step] += 0.5 * math.log(factors[step])
 
 
 @compiled("int64(float32[::1], int64[::1], float32[::1])")
@@ -294,21 +271,19 @@ def look_up(
         radiance: Set to ``gain`` times the picture, for every height.
     """
     level, blend = blended_level(squared_footprint, len(levels))
+    coarse = gray.coarser[row]
+    fine = coarse if level > 0 else gray.finest[row]
+    more = level + (1 if blend > 0 else 0)
     for step in range(len(ladder)):
         move = spacing * ladder[step]
         z_cam = path[0, 2] + move * path[1, 2]
         inverse_z = 1 / z_cam if z_cam != 0 else 1.0
-        radiance[step] = gain * _gray(
-            gray.finest,
-            gray.coarser,
-            levels,
-            fractions,
-            row,
-            level,
-            blend,
-            inverse_z * (path[0, 0] + move * path[1, 0]),
-            inverse_z * (path[0, 1] + move * path[1, 1]),
-        )
+        u = inverse_z * (path[0, 0] + move * path[1, 0])
+        v = inverse_z * (path[0, 1] + move * path[1, 1])
+        value = _gray(fine, levels, fractions, level, u, v)
+        if blend > 0:
+            value += blend * (_gray(coarse, levels, fractions, more, u, v) - value)
+        radiance[step] = gain * value
 
 
 @compiled()
@@ -351,10 +326,15 @@ def costs(
     choice = room(views, limit)
     lit = np.empty(limit, np.float32)
     per_lit = np.empty(limit, np.float32)
-    ratios = np.empty(limit, np.float32)
-    order = np.empty(limit, np.int64)
     fractions = shrinkage(levels)
-    radiance = np.empty((heights, limit), np.float32)
+    radiance = np.empty((limit, heights), np.float32)
+    ranked = np.empty((limit, heights), np.float32)
+    one, other, third = (
+        np.empty(heights, np.float32),
+        np.empty(heights, np.float32),
+        np.empty(heights, np.float32),
+    )
+    work, evaluated = (one, other, third, np.empty(heights)), np.empty(heights)
     path = np.empty((2, 3))
     for patch in range(patches):
         per_scale = np.float32(1) / trial.scale[patch]
@@ -369,7 +349,6 @@ def costs(
                     view = choice.views[slot]
                     lit[slot] = choice.shading[view]
                     per_lit[slot] = np.float32(1) / choice.shading[view]
-                    order[slot] = slot
                     m = projection.image_from_patch[patch * views + view]
                     trace(m, samples, patch, row, column, path)
                     footprint = choice.footprints[view]
@@ -383,10 +362,9 @@ def costs(
                         trial.ladder,
                         footprint * footprint * max(choice.facings[view], trial.min_facing),
                         shaded.gains[patch, view],
-                        radiance[:, slot],
+                        radiance[slot],
                     )
                 swept[patch, row, column] = 1
+                _inconsistency(radiance, lit, per_lit, count, per_scale, ranked, work, evaluated)
                 for step in range(heights):
-                    cost[patch, step, row, column] = _inconsistency(
-                        radiance, step, lit, per_lit, count, per_scale, ratios, order
-                    )
+                    cost[patch, step, row, column] = evaluated[step]
