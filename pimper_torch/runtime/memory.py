@@ -7,6 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar, TypeVarTuple
 
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
 from torch.utils.checkpoint import checkpoint
 
 from pimper_torch.ground.geometry.surfaces import face_normals
@@ -107,5 +110,8 @@ def recomputed(work: Callable[[*Given], Result], *given: *Given) -> Result:
     Args:
         work: Fast, and without side effects.
     """
+    leaves = pytree.tree_leaves(given) if torch.is_grad_enabled() else []
+    if not any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves):
+        return work(*given)  # the first checkpoint of a process imports a compiler, for seconds
     found: Result = checkpoint(work, *given, use_reentrant=False, preserve_rng_state=False)
     return found
