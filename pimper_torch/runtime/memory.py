@@ -7,8 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar, TypeVarTuple
 
-import torch
-from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.checkpoint import checkpoint
 
@@ -50,8 +48,6 @@ def largest_problem(limit: float, patches: PatchSet, scale: float, last: float) 
     Raises:
         ReconstructionError: The last round would take more memory than it may, by blocks too.
     """
-    if math.isinf(limit):
-        return math.inf
     mesh, spacing = patches.coarse.mesh, float(patches.buckets[0].spacing[0].detach())
     area = float(face_normals(mesh.vertices_world.detach(), mesh.faces).norm(dim=1).sum()) / 2
     vertices = _PER_SQUARE * area / (spacing * scale / last) ** 2
@@ -103,15 +99,12 @@ def release_memory() -> None:
 
 
 def recomputed(work: Callable[[*Given], Result], *given: *Given) -> Result:
-    """Call a function whose intermediate results the pass backward computes again.
-
-    They are most of the memory that autograd would hold.
+    """Call a function whose intermediate results, most of autograd's memory, are computed again.
 
     Args:
         work: Fast, and without side effects.
     """
-    leaves = pytree.tree_leaves(given) if torch.is_grad_enabled() else []
-    if not any(isinstance(leaf, Tensor) and leaf.requires_grad for leaf in leaves):
+    if not any(getattr(leaf, "requires_grad", False) for leaf in pytree.tree_leaves(given)):
         return work(*given)  # the first checkpoint of a process imports a compiler, for seconds
     found: Result = checkpoint(work, *given, use_reentrant=False, preserve_rng_state=False)
     return found

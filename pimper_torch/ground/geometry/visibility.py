@@ -194,7 +194,7 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     rays = rays_through(
         pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
     ).reshape(height, width, 3)
-    caster = RayCaster(mesh.vertices_world, mesh.faces) if isinstance(mesh, Mesh) else mesh
+    caster = ray_caster(mesh) if isinstance(mesh, Mesh) else mesh
     return caster.cast(cameras.centers_world[view], rays)
 
 

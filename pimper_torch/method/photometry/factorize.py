@@ -126,6 +126,7 @@ class Factorize(Stage):
         super().__init__()
         self.config = config = config or FactorizeConfig()
         require(config.loss in LOSSES, "factorize.loss", config.loss, " or ".join(LOSSES))
+        self.loss = LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else []))
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
             priors = [*own, Guesses()]
@@ -166,7 +167,6 @@ class Factorize(Stage):
             registered=_balanced(registered, light.field),
             normals=transferred_normals(coarse, templates),
         )
-
         illuminated = _illuminated(bucket, light.field, caster)
         solved = self._photometry(bucket, *self._prepare(bucket, *illuminated, light))
         exposure = light.field.exposure
@@ -264,7 +264,7 @@ class Factorize(Stage):
         registered: Observations,
         variance: Scalar,
     ) -> Bilinear:
-        config, cone = self.config, Cone()
+        cone = Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
         basis = harmonics(rows.normals).mT
@@ -304,7 +304,7 @@ class Factorize(Stage):
             regularization=light_weight.clamp_min(1e-6) * unit,
             prior=prior,
             manifold=cone,
-            loss=LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else [])),
+            loss=self.loss,
             stride=max(1, raster // 512),  # some 500 samples tell the residuals' deviation
         )
         for each in known:

@@ -141,7 +141,7 @@ def fit_albedo(
     shading = lights @ basis
     weighted = weight * shading
     square = (weighted * shading).sum(dim=1)[:, None]
-    product = torch.einsum("pfk,pfck->pck", weighted, radiance)
+    product = (weighted[:, :, None] * radiance).sum(dim=1)
     some = square > torch.finfo(square.dtype).tiny ** 0.5
     return torch.where(some, product / torch.where(some, square, 1), 0).clamp_min(0)
 

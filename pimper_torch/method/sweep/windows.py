@@ -1,12 +1,11 @@
 """Averages over small windows that stop at the edges of a patch."""
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import pad
 
 
 def window_mean(
@@ -23,39 +22,21 @@ def window_mean(
 
     Zero where no sample of the window has weight. Differentiable.
     """
-    reach = max(1, round(2.5 * radius))
-    steps = torch.arange(-reach, reach + 1, device=values.device, dtype=values.dtype)
-    kernel = torch.exp(-0.5 * (steps / radius).square())
-    kernel = kernel / kernel.sum()
     heavy = torch.cat([values * weight[:, None], weight[:, None]], dim=1)
-    count, channels, height, width = heavy.shape
-    flat = heavy.reshape(count * channels, 1, height, width)
-    blurred: Tensor = _Blurred.apply(flat, kernel)  # type: ignore[no-untyped-call]
-    summed = blurred.reshape(count, channels, height, width)
+    rows, columns = (_blur(size, radius).to(heavy) for size in heavy.shape[2:])
+    summed = rows @ (heavy @ columns)
     total = summed[:, -1:]
     some = total > torch.finfo(total.dtype).eps
     return torch.where(some, summed[:, :-1] / torch.where(some, total, 1), 0)
 
 
-class _Blurred(torch.autograd.Function):
-    """Sums over a window that is symmetric: their own adjoint."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, flat: Float[Tensor, "item 1 height width"], kernel: Float[Tensor, " tap"]
-    ) -> Float[Tensor, "item 1 height width"]:
-        """Sum along columns, then along rows."""
-        ctx.save_for_backward(kernel)
-        reach = len(kernel) // 2
-        flat = conv2d(flat, kernel.reshape(1, 1, -1, 1), padding=(reach, 0))
-        return conv2d(flat, kernel.reshape(1, 1, 1, -1), padding=(0, reach))
-
-    @staticmethod
-    def backward(
-        ctx: Any, upstream: Float[Tensor, "item 1 height width"]
-    ) -> tuple[Float[Tensor, "item 1 height width"], None]:
-        """Sum the gradients in the same way."""
-        return _Blurred.apply(upstream, *ctx.saved_tensors), None  # type: ignore[no-untyped-call]
+def _blur(size: int, radius: float) -> Float[Tensor, "size size"]:
+    """Return the symmetric matrix that sums over the window along an axis of so many samples."""
+    reach = max(1, round(2.5 * radius))
+    steps = torch.arange(max(size, reach + 1))
+    away = (steps[:size, None] - steps[:size]).abs()
+    taps = torch.exp(-0.5 * (steps.double() / radius).square()) * (steps <= reach)
+    return (taps / (2 * taps.sum() - 1))[away]
 
 
 def window_size(radius: float) -> float:

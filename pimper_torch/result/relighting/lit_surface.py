@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
-from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
+from pimper_torch.ground.geometry.visibility import Hits, cast_view, ray_caster
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Cameras, Mesh, Record, Textured
@@ -105,7 +105,7 @@ class LitSurface:
         self.mesh = mesh
         self.normals_world = carried_normals(mesh)
         self.base_color = base_color(mesh)
-        self._caster = RayCaster(mesh.vertices_world, mesh.faces)
+        self._caster = ray_caster(mesh)
         low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
         self.center_world = (low + high) / 2
         self.radius = float((high - low).norm()) / 2

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.geometry.visibility import Hits, RayCaster, cast_view
+from pimper_torch.ground.geometry.visibility import Hits, cast_view
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.result.viz.maps import albedo_scale
@@ -49,7 +49,6 @@ def draw_turn(
         reference: View whose side of the surface is seen first.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
-    caster = RayCaster(mesh.vertices_world, mesh.faces)
     circle = circling(
         mesh, up_world(cameras), cameras.centers_world[reference], _FRAMES, side_px * _OVERSAMPLING
     )
@@ -59,7 +58,7 @@ def draw_turn(
     look = torch.cat([normals, colors], dim=1)
 
     def drawn(view: int) -> Image.Image:
-        return _drawn(cast_view(caster, circle, view), look, mesh, circle.cam_from_world[view])
+        return _drawn(cast_view(mesh, circle, view), look, mesh, circle.cam_from_world[view])
 
     frames = list(side_by_side(drawn, range(_FRAMES), tracked=False))
     frames[0].save(
@@ -106,13 +105,13 @@ def _drawn(hits: Hits, look: Float[Tensor, "vertex 6"], mesh: Mesh, pose: Tensor
     Args:
         look: Normal and albedo of every vertex.
     """
-    values, seen = hits.interpolate(look, mesh.faces), (hits.face >= 0)[..., None].float()
-    shading = lambertian(normalize(rotate(pose, values[..., :3]), dim=-1))[..., None]
-    lit = srgb_from_linear((_EXPOSURE * shading * values[..., 3:]).clamp(0, 1))
-    both = torch.cat([tone(shading).expand_as(lit), lit], dim=1)
-    opacity = torch.cat([seen, seen], dim=1)
-    layers = torch.cat([opacity * both, opacity], dim=-1).movedim(-1, 0)
-    colors = avg_pool2d(layers, _OVERSAMPLING).movedim(0, -1)
+    seen = hits.face >= 0
+    values = hits.take(seen).interpolate(look, mesh.faces)
+    shading = lambertian(normalize(rotate(pose, values[:, :3]), dim=-1))[:, None]
+    lit = srgb_from_linear((_EXPOSURE * shading * values[:, 3:]).clamp(0, 1))
+    layers = seen.float().repeat(4, 2, 1, 1)
+    layers[:3, :, seen] = torch.stack([tone(shading).expand_as(lit), lit]).movedim(-1, 0)
+    colors = avg_pool2d(layers.transpose(1, 2).flatten(2), _OVERSAMPLING).movedim(0, -1)
     opacity = colors[..., 3:]
     picture = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
     return Image.fromarray((255 * picture).round().to(torch.uint8).numpy())
