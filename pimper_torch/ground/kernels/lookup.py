@@ -28,7 +28,8 @@ def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int,
     column, row = int(x), int(y)
     right = 1 if column < width - 1 else 0
     below = width if row < height - 1 else 0
-    across, down = np.float32(x - column), np.float32(y - row)
+    across: Any = np.float32(x - column)
+    down: Any = np.float32(y - row)
     return row * width + column, right, below, across, down
 
 
