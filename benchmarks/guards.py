@@ -78,8 +78,8 @@ PATCHES: dict[str, dict[str, object]] = {
     "fuse.outvoted": {"fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)},
     "repair": {"meshing.repair.Repair.forward": lambda _, surface: surface},
     "extract.spikes": {
-        "meshing.faults.Faults.folded_over": lambda found, _: nothing(0)(found.faces),
-        "meshing.faults.Faults.stretched": lambda found, _: nothing(0)(found.faces),
+        "meshing.faults.Faults.folded_over": lambda found, *_: nothing(0)(found.faces),
+        "meshing.faults.Faults.stretched": lambda found, *_: nothing(0)(found.faces),
     },
     "extract.borders": {"meshing.extract.protruding": nothing(1)},
 }

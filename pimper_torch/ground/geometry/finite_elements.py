@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.shapes import Faces, PerVertex, Vertices
@@ -25,28 +24,22 @@ class Elements:
     """The faces of a mesh as its functions see them.
 
     Attributes:
-        rotated: Of each corner, the gradient of the function that is 1 there and 0 at the
-            other two, times twice the area: the opposite edge, turned into the face.
+        opposite: To each corner, the edge; turned into the face, the gradient of the function that
+            is 1 there and 0 at the other two, times twice the area.
     """
 
     faces: Faces
-    rotated: Float[Tensor, "face 3 3"]
+    opposite: Float[Tensor, "face 3 3"]
     area: Float[Tensor, " face"]
     count: int
 
 
 def elements(vertices: Vertices, faces: Faces) -> Elements:
     """Measure the faces of a mesh; differentiable, and in the dtype of the vertices."""
-    doubled = face_normals(vertices, faces)
     corners = vertices[faces]
     opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
-    normal = normalize(doubled, dim=-1)[:, None].expand_as(opposite)
-    return Elements(
-        faces=faces,
-        rotated=torch.linalg.cross(normal, opposite),
-        area=doubled.norm(dim=-1) / 2,
-        count=len(vertices),
-    )
+    area = face_normals(vertices, faces).norm(dim=-1) / 2
+    return Elements(faces=faces, opposite=opposite, area=area, count=len(vertices))
 
 
 def cotangent_laplacian(
@@ -63,9 +56,9 @@ def cotangent_laplacian(
         of a component are free. Differentiable in the weights and, through the elements, in
         the vertices.
     """
-    longest = mesh.rotated.square().sum(-1).amax(dim=1)
+    longest = mesh.opposite.square().sum(-1).amax(dim=1)
     shape = torch.maximum(mesh.area, min_shape * longest)
-    blocks = (weight / (4 * shape))[:, None, None] * (mesh.rotated @ mesh.rotated.mT)
+    blocks = (weight / (4 * shape))[:, None, None] * (mesh.opposite @ mesh.opposite.mT)
     rows = mesh.faces[:, :, None].expand_as(blocks)
     cols = mesh.faces[:, None, :].expand_as(blocks)
     return rows.flatten(), cols.flatten(), blocks.flatten()

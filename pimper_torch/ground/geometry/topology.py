@@ -11,6 +11,10 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import FaceMask, Faces, VertexMask
 
+Pairs = Int[Tensor, "pair 2"]
+Ends = Int[Tensor, "edge 2"]
+FaceEdges = tuple[Ends, Faces]
+
 
 def half_edges(faces: Faces) -> Int[Tensor, "half_edge 2"]:
     """List the three edges of every face in its direction: opposite to corners 0, 1 and 2.
@@ -23,45 +27,45 @@ def half_edges(faces: Faces) -> Int[Tensor, "half_edge 2"]:
     return faces[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2)
 
 
-def face_edges(faces: Faces) -> tuple[Int[Tensor, "edge 2"], Faces]:
+def face_edges(faces: Faces) -> FaceEdges:
     """List every edge once, its lower vertex first, and which one is opposite to each corner."""
     if len(faces) == 0:
         return faces[:, :2], faces
-    key, index = torch.unique(_edge_keys(faces), return_inverse=True)
-    return _ends(key, faces), index
+    # A number for each: rows of two would take far longer to compare.
+    ahead, behind, size = faces.roll(-1, dims=1), faces.roll(1, dims=1), faces.max() + 1
+    number = torch.minimum(ahead, behind) * size + torch.maximum(ahead, behind)
+    key, index = torch.unique(number, return_inverse=True)
+    return torch.stack([key // size, key % size], dim=1), index
 
 
-def open_edges(faces: Faces) -> Int[Tensor, "edge 2"]:
+def open_edges(faces: Faces) -> Ends:
     """List the edges that do not have exactly two faces, once each, their lower vertex first."""
-    if len(faces) == 0:
-        return faces[:, :2]
-    keys = _edge_keys(faces).flatten().sort().values
-    key, counts = torch.unique_consecutive(keys, return_counts=True)
-    return _ends(key[counts != 2], faces)
+    edges, index = face_edges(faces)
+    return edges[face_counts(index) != 2]
 
 
-def _edge_keys(faces: Faces) -> Faces:
-    """Number the edge opposite to each corner: rows of two would take far longer to compare."""
-    ahead, behind = faces.roll(-1, dims=1), faces.roll(1, dims=1)
-    return torch.minimum(ahead, behind) * (faces.max() + 1) + torch.maximum(ahead, behind)
-
-
-def _ends(key: Int[Tensor, " edge"], faces: Faces) -> Int[Tensor, "edge 2"]:
-    size = faces.max() + 1
-    return torch.stack([key // size, key % size], dim=1)
-
-
-def face_pairs(faces: Faces) -> tuple[Int[Tensor, "pair 2"], Int[Tensor, "pair 2"]]:
+def face_pairs(faces: Faces, edges: FaceEdges | None = None) -> tuple[Pairs, Pairs]:
     """Find which faces share an edge.
+
+    Args:
+        edges: The result of :func:`face_edges`; if of more faces, with the rows of these.
 
     Returns:
         For every edge with exactly two faces: the faces, and the edge's two vertices.
     """
-    edges, index = face_edges(faces)
-    counts = face_counts(index)
-    order = index.flatten().argsort(stable=True)
-    first = (counts.cumsum(dim=0) - counts)[counts == 2]
-    return torch.stack([order[first], order[first + 1]], dim=1) // 3, edges[counts == 2]
+    corners, ends = _paired(faces, edges)
+    return corners // 3, ends
+
+
+def _paired(faces: Faces, edges: FaceEdges | None) -> tuple[Pairs, Pairs]:
+    """List the corners opposite to every edge with exactly two faces, and the edge's vertices."""
+    ends, index = face_edges(faces) if edges is None else edges
+    edge, none = index.flatten(), index.new_zeros(len(ends))
+    corner = torch.arange(len(edge), device=edge.device)
+    first = none.scatter_reduce(0, edge, corner, "amin", include_self=False)
+    last = none.scatter_reduce(0, edge, corner, "amax", include_self=False)
+    two = face_counts(index, len(ends)) == 2
+    return torch.stack([first[two], last[two]], dim=1), ends[two]
 
 
 def first_of_each(rows: Int[Tensor, "row column"]) -> Int[Tensor, " kept"]:
@@ -76,9 +80,9 @@ def first_of_each(rows: Int[Tensor, "row column"]) -> Int[Tensor, " kept"]:
     return first[: int(label.max()) + 1 if len(label) else 0].sort().values
 
 
-def face_counts(face_edge: Faces) -> Int[Tensor, " edge"]:
+def face_counts(face_edge: Faces, num_edges: int = 0) -> Int[Tensor, " edge"]:
     """Count the faces at every edge, from the edges of every face of :func:`face_edges`."""
-    return torch.bincount(face_edge.flatten())
+    return torch.bincount(face_edge.flatten(), minlength=num_edges)
 
 
 def boundary_vertices(faces: Faces, num_vertices: int) -> Bool[Tensor, " {num_vertices}"]:
@@ -134,8 +138,11 @@ def face_components(faces: Faces, among: FaceMask | None = None) -> Int[Tensor, 
     return graph_components(pairs, len(faces))
 
 
-def vertex_fans(faces: Faces) -> tuple[Int[Tensor, " fan"], Faces]:
+def vertex_fans(faces: Faces, edges: FaceEdges | None = None) -> tuple[Int[Tensor, " fan"], Faces]:
     """Split non-manifold vertices: every fan of faces round one gets a vertex of its own.
+
+    Args:
+        edges: As for :func:`face_pairs`.
 
     Returns:
         The old vertex each new one is a copy of, ascending, and the faces in new vertices.
@@ -146,32 +153,31 @@ def vertex_fans(faces: Faces) -> tuple[Int[Tensor, " fan"], Faces]:
     >>> vertex_fans(bow_tie)[0]
     tensor([0, 1, 2, 2, 3, 4])
     """
-    label = graph_components(_fan_links(faces), 3 * len(faces)).long()
+    label = graph_components(_fan_links(faces, edges), 3 * len(faces)).long()
     old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
     order = old.argsort(stable=True)
     rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
     return old[order], rank[label].reshape(-1, 3)
 
 
-def _fan_links(faces: Faces) -> Int[Tensor, "link 2"]:
+def _fan_links(faces: Faces, edges: FaceEdges | None) -> Int[Tensor, "link 2"]:
     """List the corners that two faces have in common, at both ends of every edge of theirs.
 
     Half as many bits as indices have elsewhere: there are six corners a vertex, and as many links.
     """
-    pairs, ends = face_pairs(faces)
-    links = torch.empty(2, *pairs.shape, dtype=torch.int32, device=faces.device)
-    for end, at in zip(ends.unbind(dim=1), links, strict=True):
-        for column, face in enumerate(pairs.unbind(dim=1)):
-            second, third = (faces[face, corner] == end for corner in (1, 2))
-            at[:, column] = 3 * face + second.int() + 2 * third.int()
-    return links.flatten(0, 1)
+    corners = _paired(faces, edges)[0].int()
+    vertex, first = faces.flatten(), corners - corners % 3
+    (one, other), (two, another) = ((first + (corners + by) % 3).unbind(dim=1) for by in (1, 2))
+    along = vertex[one] == vertex[other]  # where the faces are oriented differently
+    links = one, torch.where(along, other, another), two, torch.where(along, another, other)
+    return torch.stack(links, dim=1).reshape(-1, 2)
 
 
-def boundary_loops(faces: Faces) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " edge"]]:
+def boundary_loops(faces: Faces, bare: Pairs | None = None) -> tuple[Ends, Int[Tensor, " edge"]]:
     """Group the edges of a surface's border: every hole, and every outer border, is one loop.
 
     Holes that meet in a vertex are one, as the surface is not connected there. An edge of three
-    faces or more is border of them all.
+    faces or more is border of them all. The result of :func:`open_edges` is ``bare``, if known.
 
     Returns:
         The border's edges, and the index of the loop each is part of.
@@ -182,7 +188,7 @@ def boundary_loops(faces: Faces) -> tuple[Int[Tensor, "edge 2"], Int[Tensor, " e
             [1, 3],
             [2, 3]]), tensor([0, 0, 0]))
     """
-    border = open_edges(faces)
+    border = open_edges(faces) if bare is None else bare
     if len(border) == 0:
         return border, border[:, 0]
     on_border = _marked(border, int(faces.max()) + 1)

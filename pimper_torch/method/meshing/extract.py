@@ -3,8 +3,8 @@
 import torch
 from torch.nn.functional import normalize
 
+from pimper_torch.ground.geometry import topology
 from pimper_torch.ground.geometry.surfaces import component_areas, face_normals
-from pimper_torch.ground.geometry.topology import face_components, vertex_fans
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Scalar, Vertices
 from pimper_torch.method.meshing.borders import protruding
@@ -61,9 +61,10 @@ class Extract(Stage):
             keep &= near
         with_support = int(keep.sum())
         defects = faults(vertices, surface.faces, surface.facet, self.config.max_stretch)
-        spikes = defects.stretched(vertices) | defects.folded_over(vertices)
+        edges, index = topology.face_edges(surface.faces)
+        spikes = defects.stretched(vertices) | defects.folded_over(vertices, (edges, index))
         leave_out("extract.spikes", keep & spikes, at=(vertices, surface.faces))
-        faces = surface.faces[keep & ~spikes]
+        faces, index = surface.faces[keep & ~spikes], index[keep & ~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
                 f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
@@ -74,14 +75,13 @@ class Extract(Stage):
             )
         unsure = ~surface.supported if error is None else error > _UNSURE * _typical(surface, error)
         length = _TOOTH * facet_side(surface)
-        teeth = protruding(vertices, faces, length, unsure[faces].any(dim=1))
+        teeth = protruding(vertices, faces, length, unsure[faces].any(dim=1), (edges, index))
         leave_out("extract.borders", teeth & ~teeth.all(), at=(vertices, faces))
         if not bool(teeth.all()):  # where all is as narrow as a facet, it is the surface
-            faces = faces[~teeth]
-        large = large_components(vertices, faces, self.config.min_piece)
+            faces, index = faces[~teeth], index[~teeth]
+        large = large_components(vertices, faces, self.config.min_piece, (edges, index))
         leave_out("extract.pieces", ~large, at=(vertices, faces))
-        faces = faces[large]
-        source, faces = vertex_fans(faces)
+        source, faces = topology.vertex_fans(faces[large], (edges, index[large]))
         return Mesh(
             vertices_world=surface.vertices_world[source],
             faces=faces,
@@ -106,12 +106,14 @@ def facet_side(surface: Surface) -> float:
     return float((4 / 3**0.5 * total(area) / count).sqrt())
 
 
-def large_components(vertices: Vertices, faces: Faces, fraction: float) -> FaceMask:
+def large_components(
+    vertices: Vertices, faces: Faces, fraction: float, edges: topology.FaceEdges
+) -> FaceMask:
     """Find the components, connected by edges, with a fraction of the largest one's area.
 
     With a fraction of 1 only the first of the largest is marked.
     """
-    label = face_components(faces)
+    label = topology.graph_components(topology.face_pairs(faces, edges)[0], len(faces))
     areas = component_areas(vertices, faces, label)
     if fraction == 1:
         return label == label[areas.argmax()]

@@ -49,18 +49,18 @@ class Faults:
         """Find faces turned by more than 90 degrees from the mean normal of their facet."""
         return (face_normals(vertices, self.faces) * self.along).sum(dim=1) < 0
 
-    def folded_over(self, vertices: Vertices) -> FaceMask:
+    def folded_over(self, vertices: Vertices, edges: topology.FaceEdges | None = None) -> FaceMask:
         """Find overturned faces where a fold bounds their component."""
-        return self._folded(vertices) & self.overturned(vertices)
+        return self._folded(vertices, edges) & self.overturned(vertices)
 
-    def _folded(self, vertices: Vertices) -> FaceMask:
+    def _folded(self, vertices: Vertices, edges: topology.FaceEdges | None = None) -> FaceMask:
         normals, overturned = unit_face_normals(vertices, self.faces), self.overturned(vertices)
-        pairs, _ = topology.face_pairs(self.faces)
+        pairs, _ = topology.face_pairs(self.faces, edges)
         one, other = pairs.unbind(dim=1)
         fold = (normals[one] * normals[other]).sum(dim=1) < math.cos(_FOLD)
         found = torch.zeros_like(overturned)
         found[pairs[fold].flatten()] = True
-        label = topology.graph_components(pairs[overturned[pairs].all(dim=1)], len(found))
+        label = topology.graph_components(pairs[overturned[one] & overturned[other]], len(found))
         bounded = torch.zeros_like(found)
         bounded[label[found & overturned]] = True
         return found | (overturned & bounded[label])
