@@ -82,17 +82,14 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | Non
         )
         pose = pycolmap.Rigid3d(model.cam_from_world[index, :3].numpy())
         reconstruction.add_image_with_trivial_frame(image, pose)
-    order = np.argsort(model.observation_point.numpy(), kind="stable")
-    starts = np.searchsorted(
-        model.observation_point.numpy()[order], np.arange(len(model.points_world) + 1)
-    )
-    black = torch.zeros(len(model.points_world), 3, dtype=torch.uint8)
+    tracks = [pycolmap.Track() for _ in model.points_world]
+    ends = (model.observation_point.tolist(), (view + 1).tolist(), position.tolist())
+    for point, image_id, place in zip(*ends, strict=True):
+        tracks[point].add_element(image_id, place)
+    black = torch.zeros(len(tracks), 3, dtype=torch.uint8)
     rgb = (black if colors is None else colors.cpu()).numpy()
-    for index, xyz in enumerate(model.points_world.numpy()):
-        track = pycolmap.Track()
-        for observation in order[starts[index] : starts[index + 1]]:
-            track.add_element(int(view[observation]) + 1, int(position[observation]))
-        reconstruction.add_point3D(xyz, track, rgb[index])
+    for xyz, track, color in zip(model.points_world.numpy(), tracks, rgb, strict=True):
+        reconstruction.add_point3D(xyz, track, color)
     reconstruction.update_point_3d_errors()
     return reconstruction
 
@@ -156,6 +153,11 @@ def bundle(
         if cameras:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
-    return model_of(reconstruction).replace(
-        background_from_view=model.background_from_view, series=model.series
+    points = [reconstruction.point3D(point + 1).xyz for point in range(len(model.points_world))]
+    images = [reconstruction.image(view + 1) for view in range(model.num_views)]
+    poses = torch.from_numpy(np.array([one.cam_from_world().matrix() for one in images]))
+    return model.replace(
+        lenses=tuple(lens_of(reconstruction.camera(lens.camera)) for lens in model.lenses),
+        cam_from_world=torch.cat([poses, model.cam_from_world[:, 3:]], dim=1),
+        points_world=torch.from_numpy(np.array(points).reshape(-1, 3)),
     )

@@ -152,7 +152,8 @@ def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[i
         move as before a camera in its place, where there is another one to go on with.
     """
     spread = [count_spread_views(model, fewest) for model in models]
-    moving = [following_fraction(model) <= _MOST_FOLLOWING for model in models]
+    only = len(models) == 1
+    moving = [only or following_fraction(model) <= _MOST_FOLLOWING for model in models]
     deep = [count if moves else 0 for count, moves in zip(spread, moving, strict=True)]
     return deep if max(deep, default=0) >= FEWEST_VIEWS else spread
 

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize, pad
+from torch.nn.functional import grid_sample, normalize
 
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
@@ -379,7 +379,7 @@ def _look_up(
     mode: str = "bilinear",
     outside: float | None = None,
 ) -> Float[Tensor, "point sample"]:
-    """Look patches up: as many batches as threads, each is one thread's on the CPU.
+    """Look patches up.
 
     Bilinear: torch's cubic kernel displaces patches by a twentieth of a pixel, this by a hundredth.
     """
@@ -388,17 +388,13 @@ def _look_up(
     ahead = homogeneous[:, 2] > 0
     pixels = homogeneous[:, :2] / torch.where(ahead, homogeneous[:, 2], torch.inf)[:, None]
     grid = grid_from_pixels(pixels.mT, width, height).to(picture)
-    flat = grid.clamp(-3, 3).reshape(-1, 2)
-    threads = torch.get_num_threads()
-    filled = pad(flat, (0, 0, 0, -len(flat) % threads)).reshape(threads, 1, -1, 2)
     found = grid_sample(
-        picture.expand(threads, 1, -1, -1),
-        filled,
+        picture[None, None],
+        grid.clamp(-3, 3)[None],
         mode=mode,
         padding_mode="border",
         align_corners=False,
-    ).flatten()[: len(flat)]
-    found = found.reshape(grid.shape[:-1])
+    )[0, 0]
     if outside is None:
         return found
     return torch.where((grid.abs() <= 1).all(dim=-1) & ahead, found, outside)
