@@ -8,14 +8,11 @@ from pimper_torch.cli.doctor.findings import Finding
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.photograph import Photograph
 
-# Lines through the runs of benchmarks/README.md, "Speed", with `default` on 2 cores: the demo (24
-# photographs of 900x600, 13.0 megapixels in all) 112 s and 2.06 GB, the jar (30 of 1600x1200, 57.6
-# megapixels) 364 s and 6.7 GB. Stages share the time as in runs of the jar, the mug and the demo,
-# from 0.3 to 57.6 megapixels. Of the memory 64 bytes a pixel were photographs, which are on disk
-# where they are large; what is left grows with the surface, and so with the pixels of one
-# photograph: 1.2 GB for the demo, 3.0 for the jar. Depth maps take 7.3 MB a photograph
-# (docs/decisions.md, "Photographs on disk").
-_GB, _GB_A_MEGAPIXEL_OF_ONE, _GB_A_VIEW = 0.9, 1.25, 0.0073
+# Fitted by hand to runs of `default` on 2 cores, 10 to 30 photographs of 0.3 to 1.9 megapixels,
+# each met within 1.5 times (benchmarks/README.md, "How cost grows"). Memory grows with the
+# surface, and so with the pixels of one photograph: photographs are on disk where they are large.
+# Depth maps take 7.3 MB a photograph (docs/decisions.md, "Photographs on disk").
+_GB, _GB_A_MEGAPIXEL_OF_ONE, _GB_A_VIEW = 1.1, 0.75, 0.0073
 
 
 def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
@@ -23,9 +20,10 @@ def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
 
     >>> seconds, gigabytes = estimate(57.6, 30)
     >>> round(seconds), round(gigabytes, 2)
-    (355, 3.3)
+    (298, 2.54)
     """
-    seconds = sum(seconds for _, seconds in planned(megapixels, num_views))
+    # Programs are loaded, photographs read, records hashed and kept.
+    seconds = 3.0 + 0.35 * megapixels + sum(each for _, each in planned(megapixels, num_views))
     surface = _GB_A_MEGAPIXEL_OF_ONE * megapixels / max(1, num_views)
     return seconds, _GB + max(surface, _GB_A_VIEW * num_views)
 
@@ -41,33 +39,33 @@ def planned(
     """List the stages of the chain from coarse to fine with their estimated seconds on 2 cores.
 
     Compilation, next to nothing but for an installation's first run, is none of them. Stages that
-    look at photographs grow with all pixels, those on the surface with the pixels of one, in the
-    scale's square.
+    look at photographs grow with all pixels, or where they shrink them with their number, those on
+    the surface with the pixels of one, in the scale's square.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
-    found = 1.2 * megapixels + 0.05 * pairs
+    if num_views > 66:  # each is matched with 20 that look alike, many of them in both directions
+        pairs = 14.0 * num_views
     stages = [
-        ("reconstruct", 0.5 if cameras else found),
-        ("silhouettes", 0.1 if masks else 4.0 + 0.35 * megapixels),
+        ("reconstruct", 0.5 if cameras else 0.6 * megapixels + 0.05 * pairs + 1.0 * num_views),
+        ("silhouettes", 0.1 if masks else 1.0 + 0.7 * num_views),
         ("contours", 0.3 + 0.1 * megapixels),
-        ("coarse_surface", 3.8 + 0.25 * megapixels),
+        ("coarse_surface", 3.0 + 0.5 * num_views),
     ]
     for scale in scales:
         stages += [
             ("decompose", 0.1 + 3.0 * one * scale**2),
-            ("light", 1.5),
-            ("photometry", 1.6 * megapixels**0.75 * scale**2),
-            ("fuse", 0.7 + 42.0 * one * scale**2),
-            ("repair", 1.5 * one * scale**2),
+            ("light", 3.0),
+            ("photometry", 1.2 * megapixels**0.75 * scale**2),
+            ("fuse", 0.7 + 22.0 * one * scale**2),
+            ("repair", 0.8 * one * scale**2),
         ]
-    # Shares as of 30 photographs of 1600x1200, and of the demo.
     finish = [
-        ("simplify", 0.5 * one),
-        ("relight", 1.0 + 0.8 * one),
-        ("texture", 0.3 + 1.7 * one),
-        ("write", 1.7 + 2.0 * one),
+        ("simplify", 1.7 * one),
+        ("relight", 4.0 + 0.5 * one),
+        ("texture", 1.5 + 3.7 * one),
+        ("write", 3.0 + 2.5 * one),
     ]
-    return [*stages, ("extract", 0.5 + 18.0 * one * scales[-1] ** 2), *finish]
+    return [*stages, ("extract", 0.5 + 4.0 * one * scales[-1] ** 2), *finish]
 
 
 def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Finding:
