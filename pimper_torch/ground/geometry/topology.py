@@ -91,7 +91,7 @@ def boundary_vertices(faces: Faces, num_vertices: int) -> Bool[Tensor, " {num_ve
 
 
 def corners_of(
-    faces: Faces, chosen: FaceMask, num_vertices: int
+    faces: Faces, chosen: FaceMask | Int[Tensor, " chosen"], num_vertices: int
 ) -> Bool[Tensor, " {num_vertices}"]:
     """Find the vertices of some faces."""
     return _marked(faces[chosen], num_vertices)
