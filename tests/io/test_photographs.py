@@ -1,6 +1,7 @@
 import struct
 import time
 import tracemalloc
+import warnings
 import zlib
 
 import numpy as np
@@ -32,6 +33,12 @@ def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
     stored = torch.from_numpy(pixels / 255).permute(2, 0, 1)
     assert_close(views.images[0].double(), linear_from_srgb(stored), rtol=0, atol=1e-6)
     assert_close(load_views(photos, encoding=LINEAR).images[1].double(), stored, rtol=0, atol=1e-6)
+
+
+def test_filters_of_warnings_are_kept_though_threads_decode(photos):
+    filters = list(warnings.filters)
+    load_views(photos)
+    assert warnings.filters == filters
 
 
 def test_other_files_and_hidden_ones_are_passed_over(photos):

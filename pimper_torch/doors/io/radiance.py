@@ -182,8 +182,8 @@ def _fill(
         if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
             radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
-        drawn = decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any())
-        mask = resized_mask(decoded.alpha, wide, high) if drawn else None
+        transparent = decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any())
+        mask = resized_mask(decoded.alpha, wide, high) if transparent else None
         if encoding.saturation != "auto" or whites:
             return mask, kind, None
         levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
@@ -194,7 +194,7 @@ def _fill(
     drawn: Tensor | None = None
     tallies: dict[_Kind, _Tally] = {}
     with warnings.catch_warnings():
-        # Decoders catch warnings, which in threads mixes up the filters; these are put back.
+        # Decoders ignore warnings, in threads that exchange their filters; this restores them.
         warnings.simplefilter("ignore")
         for index, (mask, kind, tally) in enumerate(side_by_side(of_file, range(len(paths)))):
             opaque.append(None)

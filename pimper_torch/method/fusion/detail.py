@@ -1,8 +1,8 @@
-"""How far apart the vertices of a facet lie: further where its patch shows no detail between them.
+"""The distance between a facet's vertices: larger where its patch shows no detail between them.
 
-A grid of twice the spacing loses, at the samples that it leaves out, what these differ by from the
-mean of their neighbours. Where that is little beside the errors of what the patch knows, the facet
-does without them. Spacings go in powers of two.
+A grid of twice the spacing loses, at the samples that it leaves out, their difference from the mean
+of their neighbours. Where that is small compared with the errors of the patch's values, the facet
+does without them. Spacings are powers of two.
 """
 
 import math
@@ -14,11 +14,11 @@ from torch import Tensor
 from pimper_torch.records import Heights, Photometry, SweptPatches, Templates
 
 # Root mean square of albedo that a coarser grid may lose, relative: 4 of 255 sRGB levels of a
-# bright surface, half of what simplification may change.
+# bright surface, half of the change that simplification may make.
 _MAX_ALBEDO = 0.05
 
-# The same of the height that templates carry, in finest spacings: twice what simplification may
-# move a vertex by.
+# The same of the height that templates carry, in finest spacings: twice the distance that
+# simplification may move a vertex.
 _MAX_HEIGHT = 0.1
 
 
@@ -44,7 +44,7 @@ def spacing_of(
 def _apart(
     templates: Templates, photometry: Photometry, heights: Heights, max_lost: float
 ) -> Float[Tensor, " patch"]:
-    """Return how many finest spacings the vertices of each facet lie apart."""
+    """Return the distance between the vertices of each facet, in finest spacings."""
     own = (templates.barycentric >= 0).all(dim=-1)
     shown, albedo = photometry.observed, photometry.albedo
     bright = _MAX_ALBEDO * _mean(albedo.mean(dim=-1), own & shown)
@@ -62,7 +62,7 @@ def _apart(
     smooth = apart > 0
     # Eight pieces a side stay: a small facet of a cap, curved as a whole, was too stiff with four.
     enough = own.sum(dim=(1, 2)) / (math.sqrt(3) / 4 * 16**2)
-    for step in (1, 2):  # a choice: a sixteenth of the vertices is little beside the rest
+    for step in (1, 2):  # a choice: a sixteenth of the vertices is few
         for values, known, limit in limits:
             smooth &= _lost(values, known, own, step) <= limit
         smooth &= enough >= step**2

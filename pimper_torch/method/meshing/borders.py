@@ -22,8 +22,8 @@ from pimper_torch.ground.geometry.surfaces import side_lengths
 from pimper_torch.ground.linalg.systems import solve_compressed
 from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Points, VertexMask, Vertices
 
-# Lengths round vertices that may go, and off the border, on which the distance is smoothed. At full
-# size 0.8 % of what went with 8 stays, and a straight border is met exactly.
+# Lengths around vertices that may go, and from the border, on which the distance is smoothed. At
+# full size 0.8 % of the faces that went with 8 stay, and a straight border is met exactly.
 _REACH = 4.0
 # Of the smoothed distance on a straight border, below which the surface sticks out. A choice: a
 # right angle is rounded (0.59 at its tip), and arcs of a few lengths stay; with 0.9 a skull lost

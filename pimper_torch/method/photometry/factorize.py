@@ -126,7 +126,6 @@ class Factorize(Stage):
         super().__init__()
         self.config = config = config or FactorizeConfig()
         require(config.loss in LOSSES, "factorize.loss", config.loss, " or ".join(LOSSES))
-        self.loss = LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else []))
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
             priors = [*own, Guesses()]
@@ -264,7 +263,7 @@ class Factorize(Stage):
         registered: Observations,
         variance: Scalar,
     ) -> Bilinear:
-        cone = Cone()
+        config, cone = self.config, Cone()
         gray = rows.radiance.mean(dim=2)
         weight = rows.seen.to(gray.dtype)
         basis = harmonics(rows.normals).mT
@@ -304,7 +303,7 @@ class Factorize(Stage):
             regularization=light_weight.clamp_min(1e-6) * unit,
             prior=prior,
             manifold=cone,
-            loss=self.loss,
+            loss=LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else [])),
             stride=max(1, raster // 512),  # some 500 samples tell the residuals' deviation
         )
         for each in known:
