@@ -84,7 +84,7 @@ class Hull(Record):
         within = torch.minimum(torch.maximum(points_world, low), high)
         # grid_sample's last axis runs fastest and is named first.
         place = 2 * (within - low) / (high - low) - 1
-        field = self.distance.clamp_min(-float((high - low).norm()))
+        field = self.distance.clamp_min(-float((high - low).detach().norm()))
         value = grid_sample(
             field[None, None],
             place.flip(-1).reshape(1, -1, 1, 1, 3).to(field),
