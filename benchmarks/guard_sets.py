@@ -96,7 +96,7 @@ SETS = {
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
     "inverted": Set("mug", 16, 480, PATTERN, ("remesh.outside",), inverted, masks=True),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),
-    "flaps": Set("skull", 8, 900, {}, ("extract.borders", "coarse.fringes", "extract.pieces")),
+    "flaps": Set("skull", 8, 900, {}, ("extract.borders", "extract.pieces")),
     "shadows": Set(
         "limbs", 24, 480, ROUND | PATTERN, ("silhouettes.shadows", "photometry.shadows")
     ),

@@ -70,7 +70,6 @@ PATCHES: dict[str, dict[str, object]] = {
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
     "silhouettes.shadows": {"silhouettes.reliability._without_shadows": lambda cuts: cuts},
     "coarse.seen_through": {"coarse.trim._MIN_BEHIND": 10**9},
-    "coarse.fringes": {"coarse.trim.fringes": nothing(1)},
     "remesh.outside": {
         "coarse.remesh.within": lambda *given: torch.ones(given[2], dtype=torch.bool)
     },

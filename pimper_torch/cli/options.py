@@ -273,8 +273,6 @@ def every_option(command: str) -> list[Option]:
 
 
 def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
-    """Refuse an option that this preset lacks and others have."""
-
     def options(name: str) -> set[str]:
         every = options_of(_command(command, load_config(name)))
         return {name for option in every for name in option.names}

@@ -12,11 +12,7 @@ from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normal
 from pimper_torch.ground.geometry.topology import face_components, face_counts, face_edges
 from pimper_torch.ground.shapes import FaceMask, Faces, Mask, Vertices
 from pimper_torch.method.coarse.reference import reference_view
-from pimper_torch.method.coarse.surface import (
-    point_covariances,
-    reliable_points,
-    smoothed_normals,
-)
+from pimper_torch.method.coarse.surface import point_covariances, reliable_points, smoothed_normals
 from pimper_torch.paper import cloud_filters
 from pimper_torch.paper.paper_config import TriangulateConfig
 from pimper_torch.records import Cameras, CoarseMesh, FacetPoints, Mesh, SparseScene, Views

@@ -110,7 +110,6 @@ def settled_normals(
 def _read(
     normals: Float[Tensor, "pixel 3"], rotation: Float[Tensor, "pixel 3 3"]
 ) -> Float[Tensor, "reading pixel 3"]:
-    """Return world normals of every reading."""
     found = [
         ((normals * normals.new_tensor(signs))[:, None] @ rotation)[:, 0] if signs else normals
         for signs in _READINGS.values()

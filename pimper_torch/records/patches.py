@@ -139,7 +139,6 @@ class OverPatches(Record):
         return self._part({index: row for index, row in rows.items() if len(row)})
 
     def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
-        """Take rows of some buckets."""
         return self.replace(patches=self._templates._part(rows), buckets=_taken(self, rows))
 
     def faults(self) -> Faults:

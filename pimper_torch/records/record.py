@@ -207,7 +207,6 @@ def _arrays(cls: type[Record]) -> dict[str, Any]:
 
 
 def _choices(hint: object) -> tuple[object, ...]:
-    """Return the types of a union, or the one type."""
     blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
     return typing.get_args(hint) if blend else (hint,)
 

@@ -25,7 +25,6 @@ from pimper_torch.method.coarse.oriented import (
 )
 from pimper_torch.method.coarse.trim import (
     ViewCounts,
-    fringes,
     near_points,
     supported_components,
     without_small_holes,
@@ -86,25 +85,6 @@ def test_small_holes_are_closed_and_large_ones_and_small_components_are_not():
     crumbs = (centre[:, 2] < 0) | (centre[:, 2] > 0.97)
     pieces = supported_components(vertices, faces[crumbs], whole[crumbs], 0.05)
     assert (pieces == (centre[crumbs][:, 2] < 0)).all()
-
-
-def test_narrow_strips_along_a_border_go_unless_they_are_long_and_supported():
-    sheet = table(half_side=20.0, cells=40)
-    vertices, faces = sheet.vertices_world, sheet.faces
-    x, y, _ = vertices[faces].mean(dim=1).unbind(dim=1)
-    land = x < 0
-    known, unknown = (x > 0) & (x < 12) & (y.abs() < 2), (x > 0) & (x < 12) & ((y - 10).abs() < 2)
-    spur = (x > 0) & (x < 2) & ((y + 7).abs() < 1)
-    cape = (x > 0) & (x < 12) & (y < -10)  # as wide as it is long: no strip, supported or not
-    supported = ~unknown & ~cape
-    kept = land | known | unknown | spur | cape
-    found = fringes(vertices, faces, kept, supported, 5.0, 3)
-    assert bool(found[spur].all())
-    assert float(found[unknown].double().mean()) > 0.8  # a little stays in its corners
-    assert not bool(found[known].any())
-    assert float(found[cape].double().mean()) < 0.05
-    assert not bool(found[land & (x < -4)].any())
-    assert not bool(fringes(vertices, faces, kept, supported, 5.0, 0).any())
 
 
 def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it():

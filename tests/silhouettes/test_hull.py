@@ -83,6 +83,33 @@ def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
     assert voted.occupied.sum() * voted.spacing**3 >= 0.99 * volume  # one vote less holds it
 
 
+@pytest.mark.parametrize(("doubt", "held"), [(0.3, True), (0.2, False)])
+def test_words_add_up_and_a_tie_is_the_objects(cameras, doubt, held):
+    """Of 20 views a tenth may disagree: 5 that count 0.4 each are as much as 2."""
+    silhouettes = of_ball(cameras)
+    wrong = silhouettes.inside.clone()
+    wrong[:10:2] = doubt
+    hull = visual_hull(
+        silhouettes.replace(inside=wrong, source="found"),
+        cameras,
+        BOX,
+        num_voxels=32**3,
+        disagreeing=0.1,
+    )
+    assert (hull is not None) == held
+
+
+def test_views_abstain_where_their_pixels_show_the_object_or_not(cameras):
+    silhouettes = of_ball(cameras)
+    wrong = silhouettes.inside.clone()
+    wrong[:9] = 0.5
+    hull = visual_hull(
+        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=48**3, disagreeing=0.0
+    )
+    assert hull is not None
+    assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
+
+
 def test_views_abstain_outside_their_photographs(cameras):
     """Photographs that show half of the ball do not cut the other half off."""
     silhouettes = of_ball(cameras)

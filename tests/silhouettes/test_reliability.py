@@ -15,49 +15,55 @@ def disc(center=(50.0, 40.0), radius=25.0):
     return radius - away.norm(dim=-1)
 
 
-def cuts_of(changed, on_plane=True, margin=None):
-    """Cuts that agree with the projection of a disc, the first ones replaced."""
+def cuts_of(changed, on_plane=True, margin=None, dark=None):
+    """Cuts that agree with the projection of a disc, the first ones replaced.
+
+    What is ``dark`` has a twentieth of the radiance.
+    """
     margins = (disc() if margin is None else margin).expand(VIEWS, 80, 100)
     masks = margins > 0
     masks = torch.cat([torch.stack(changed), masks[len(changed) :]])
-    return shapes.cuts_of(masks, margins, on_plane)
+    grey = torch.zeros(80, 100) if dark is None else -3.0 * dark
+    return shapes.cuts_of(masks, margins, on_plane, grey.expand(VIEWS, 80, 100))
+
+
+CAST = disc((72.0, 52.0), 9.0) > 0
 
 
 def shadowed():
     """The disc, and what it casts on the ground beside it."""
-    return (disc() > 0) | (disc((72.0, 52.0), 9.0) > 0)
+    return (disc() > 0) | CAST
 
 
-def test_what_one_view_cuts_and_the_hull_denies_is_taken_from_it():
-    cuts = cuts_of([shadowed()])
+@pytest.mark.parametrize("count", [1, 5])
+def test_shadows_that_the_hull_denies_are_taken_from_cuts(count):
+    """From one, or from most of them, as under a hard lamp."""
+    cuts = cuts_of([shadowed()] * count, dark=CAST)
     found = repaired(cuts).masks
     # Half of _FAR times 100 pixels stays along the border of what is taken.
-    assert torch.equal(found[0] & (disc() < -0.25), torch.zeros(80, 100, dtype=torch.bool))
-    assert torch.equal(found[0] & (disc() > 0), disc() > 0)
-    assert torch.equal(found[1:], cuts.masks[1:])
+    assert not (found[:count] & (disc() < -0.25)).any()
+    assert (found | ~(disc() > 0)).all()
+    assert torch.equal(found[count:], cuts.masks[count:])
 
 
-def test_what_lies_apart_from_the_excess_keeps_its_border():
-    """A pixel too wide on the far side is no shadow."""
-    wide = (disc() > -0.4) | shadowed()
-    found = repaired(cuts_of([wide])).masks[0]
-    far_side = torch.zeros(80, 100, dtype=torch.bool)
-    far_side[:, :40] = True
-    far_side &= disc() > -0.25
-    assert (found & far_side).sum() == far_side.sum()
+def test_the_dark_side_of_the_object_stays():
+    """It is inside the hull, and dark pixels all round the silhouette are a pixel wide."""
+    wide = disc() > -0.4
+    cuts = cuts_of([wide], dark=pixel_centers(100, 80, like=torch.ones(()))[..., 0] < 50)
+    assert torch.equal(repaired(cuts).masks, cuts.masks)
 
 
 @pytest.mark.parametrize(
-    ("changed", "on_plane"),
+    ("changed", "on_plane", "dark"),
     [
-        ([shadowed()], False),  # no plane for a shadow to fall on
-        ([shadowed()] * 5, True),  # most views see it: the hull has lost it
-        ([disc((53.0, 40.0)) > 0], True),  # a misplaced camera
-        ([disc((50.0, 40.0), 32.0) > 0], True),  # has little to do with the projection
+        ([shadowed()], False, CAST),  # no plane for a shadow to fall on
+        ([shadowed()] * 5, True, None),  # as bright as the object: the hull has lost it
+        ([disc((53.0, 40.0)) > 0], True, None),  # a misplaced camera
+        ([disc((53.0, 40.0)) < -100], True, CAST),  # a cut of nothing
     ],
 )
-def test_nothing_is_taken_where_another_cause_is_likelier(changed, on_plane):
-    cuts = cuts_of(changed, on_plane)
+def test_nothing_is_taken_where_another_cause_is_likelier(changed, on_plane, dark):
+    cuts = cuts_of(changed, on_plane, dark=dark)
     assert torch.equal(repaired(cuts).masks, cuts.masks)
 
 

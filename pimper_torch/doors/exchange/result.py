@@ -168,7 +168,6 @@ def _silhouettes(
 
 
 def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[object]:
-    """Return the names of photographs that guards left out."""
     entries = summary.get("left_out")
     return {
         name
@@ -179,6 +178,5 @@ def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[objec
 
 
 def _reference(folder: Path, summary: Mapping[str, object], names: tuple[str, ...]) -> str:
-    """Return the reference view; the first where nothing names one."""
     named = summary.get("reference") or read_reference(folder / "depth.npz")
     return str(named) if named in names else names[0]

@@ -129,7 +129,6 @@ def _header_of(path: Path) -> Header:
 
 
 def _png_chunks(path: Path) -> dict[bytes, bytes]:
-    """Return how each kind of chunk of a PNG begins."""
     chunks: dict[bytes, bytes] = {}
     with path.open("rb") as file:
         file.seek(8)

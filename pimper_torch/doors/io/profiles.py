@@ -114,7 +114,6 @@ def _printable(text: str) -> str:
 
 
 def _curve(tag: bytes) -> Response:
-    """Read a tone curve: a table, or a function."""
     if tag[:4] == b"para":
         return _function(tag)
     if tag[:4] != b"curv":

@@ -236,7 +236,6 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
 
 
 def _found_levels(whites: _Whites) -> Iterator[str]:
-    """State the levels of saturation that were found."""
     for kind, white in whites.items():
         levels = [str(round(kind.full * float(one))) for one in white]
         text = levels[0] if len({*levels}) == 1 else f"{', '.join(levels)} (red, green, blue)"

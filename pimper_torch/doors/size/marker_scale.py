@@ -171,7 +171,6 @@ def _triangulated(
 def _near(
     corners_world: Float[Tensor, "trial 4 3"], cameras: Cameras, pixels: Float[Tensor, "view 4 2"]
 ) -> Bool[Tensor, "trial view"]:
-    """Find which photographs show a marker where each trial has it."""
     found, depth = project(corners_world[:, None], cameras.cam_from_world, cameras.intrinsics)
     off = (found - pixels).norm(dim=-1).amax(dim=-1)
     within = (_OFF * cameras.sizes_px.amax(dim=1)).clamp_min(_OFF_PX)

@@ -15,12 +15,7 @@ from torch.nn.functional import conv2d, grid_sample, pad
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.kernels.arrays import as_array
-from pimper_torch.ground.kernels.signatures import (
-    FractionRows,
-    PictureRows,
-    Projection,
-    Samples,
-)
+from pimper_torch.ground.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.records import (
     AlbedoPrior,

@@ -224,7 +224,6 @@ def _pieces(
     facet_edges: Int[Tensor, "facet 3"],
     spacing: Float[Tensor, " facet"],
 ) -> Int[Tensor, "facet 3"]:
-    """Count the pieces that each facet asks for of its edges."""
     ends = vertices[edges]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
     area = face_normals(vertices, facets).norm(dim=-1) / 2

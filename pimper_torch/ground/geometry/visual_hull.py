@@ -14,7 +14,7 @@ from torch.nn.functional import grid_sample, pad
 from pimper_torch.ground.geometry.opencv import signed_distance
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through, triangulate_rays
-from pimper_torch.ground.shapes import Map, Mask, Masks, Matrix3, Scalar, Scalars, Vectors
+from pimper_torch.ground.shapes import Map, Matrix3, Scalar, Scalars, Vectors
 from pimper_torch.records import Cameras, Record, Silhouettes
 from pimper_torch.runtime.mapped import parts
 from pimper_torch.runtime.parallel import side_by_side
@@ -169,34 +169,33 @@ def visual_hull(
     num_voxels: int = 2_000_000,
     disagreeing: float = 0.03,
     min_seen: float = 0.5,
-    unknown: Masks | None = None,
 ) -> Hull | None:
-    """Build the hull by the vote of the reliable views.
+    r"""Build the hull by the vote of the reliable views.
 
-    A view votes about what is inside its photograph and known, and abstains elsewhere. Time and
+    A pixel that shows the object with a probability :math:`p` below a half counts
+    :math:`1 - 2 p` against it; at a half, and outside its photograph, a view abstains. Time and
     memory grow with the voxels.
 
     Args:
         box_world: Smallest and largest corner of the region to look in; the grid is fitted to
             what it holds.
         num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
-        disagreeing: Fraction of the views in sight of a voxel that may see it outside. What only
-            a few views cut, such as the ends of an arc, needs a small one.
+        disagreeing: Fraction of the views in sight of a voxel whose words together may say that it
+            is outside. What only a few views cut, such as the ends of an arc, needs a small one.
         min_seen: Fraction of the reliable views that a voxel must be in sight of.
-        unknown: Pixels that show the object or not; none by default.
 
     Returns:
         ``None`` where the silhouettes have nothing in common inside the box.
     """
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
-    masks = silhouettes.masks
+    inside, hard = silhouettes.inside, silhouettes.source == "masks"
 
-    def framed(view: int) -> Float[Tensor, "high wide"]:
-        other = torch.zeros_like(masks[view]) if unknown is None else unknown[view]
-        return _framed(masks[view], other, cameras.sizes_px[view].tolist())
+    def framed(view: int) -> Float[Tensor, "layer high wide"]:
+        return _framed(inside[view], hard, cameras.sizes_px[view].tolist())
 
-    sizes = [(high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
-    maps = parts(sizes, masks.device)
+    layers = 1 if hard else 2
+    sizes = [(layers, high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
+    maps = parts(sizes, inside.device)
     for whole, found in zip(maps, side_by_side(framed, views, tracked=False), strict=True):
         whole.copy_(found)
     chosen = cameras.take(views)
@@ -266,17 +265,18 @@ def _deepest(
 
 
 def _framed(
-    mask: Mask, unknown: Mask, size_px: list[int]
-) -> Float[Tensor, "high_and_2 wide_and_2"]:
-    """Measure distances to the silhouette where it is known inside the photograph."""
+    inside: Map, hard: bool, size_px: list[int]
+) -> Float[Tensor, "layer high_and_2 wide_and_2"]:
+    """Measure distances to the silhouette; unless it is a mask, with what pixels count."""
     width, height = size_px
-    known = signed_distance(mask[:height, :width])
-    known = known.masked_fill(unknown[:height, :width], _UNSEEN)
-    return pad(known, (1, 1, 1, 1), value=_UNSEEN)
+    inside = inside[:height, :width]
+    known = signed_distance(inside > 0.5).masked_fill(inside == 0.5, _UNSEEN)
+    layers = [known] if hard else [known, torch.where(inside > 0.5, 1, 1 - 2 * inside)]
+    return torch.stack([pad(one, (1, 1, 1, 1), value=_UNSEEN) for one in layers])
 
 
 def _voted(
-    maps: list[Float[Tensor, "_ _"]],
+    maps: list[Float[Tensor, "layer _ _"]],
     cameras: Cameras,
     box_world: Float[Tensor, "2 3"],
     num_voxels: int,
@@ -291,8 +291,8 @@ def _voted(
     first = from_world[..., :3] @ low + from_world[..., 3]
     steps = spacing * from_world[..., :3]
     reach = [torch.arange(count).to(low) for count in counts.tolist()]
-    # Their 256 kB stay in a core's cache.
-    slab = max(1, 2**16 // int(counts[1:].prod()))
+    # All views' distances to a slab take 8 MB.
+    slab = max(1, 2**21 // (len(maps) * int(counts[1:].prod())))
 
     def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "x y z"]:
         return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), fractions)
@@ -302,7 +302,7 @@ def _voted(
 
 
 def _vote(
-    maps: list[Float[Tensor, "_ _"]],
+    maps: list[Float[Tensor, "layer _ _"]],
     cameras: Cameras,
     projected: tuple[Float[Tensor, "view 3"], Float[Tensor, "view 3 3"]],
     reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
@@ -311,16 +311,16 @@ def _vote(
     """Return the smallest distance to a silhouette after those that may disagree.
 
     Args:
-        maps: Distances to the silhouettes in pixels, one a view.
+        maps: Distances to the silhouettes in pixels, and what they count, one a view.
         projected: Homogeneous pixels of the first voxel, and what a step along each axis adds.
         reach: Numbers of the voxels along each axis.
         fractions: Of views that may disagree, and that must look.
     """
+    from pimper_torch.ground.kernels.hull_votes import vote
+
     disagreeing, min_seen = fractions
     shape = tuple(len(axis) for axis in reach)
-    ranks = int(disagreeing * len(maps)) + 1
-    smallest = [reach[0].new_full(shape, _UNSEEN) for _ in range(ranks)]
-    seen = reach[0].new_zeros(shape)
+    distance, word = reach[0].new_ones(2, len(maps), *shape)
     focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
     for view, border in enumerate(maps):
         start, step = projected[0][view], projected[1][view]
@@ -330,30 +330,16 @@ def _vote(
             + ((step[row, 1] * reach[1])[:, None] + step[row, 2] * reach[2])
             for row in range(3)
         )
-        value = _looked_up(border, u / depth, v / depth)
+        place = torch.stack([u / depth, v / depth], dim=-1).reshape(1, 1, -1, 2)
+        height, width = border.shape[1:]
+        grid = grid_from_pixels(place + 1, width, height)
+        found = grid_sample(border[None], grid, padding_mode="border", align_corners=False)
+        value, *counted = found.reshape(-1, *shape)
+        if counted:
+            word[view] = counted[0]
         looks = (depth > 0) & (value < _UNSEEN / 1e3)
-        seen += looks
-        value = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
-        for rank in range(ranks):
-            larger = torch.maximum(smallest[rank], value)
-            torch.minimum(smallest[rank], value, out=smallest[rank])
-            value = larger
-    outvoted = (disagreeing * seen).long()
-    chosen = torch.stack(smallest).gather(0, outvoted[None])[0]
-    enough = (seen >= min_seen * len(maps)) & (seen > 0)
-    return torch.where(enough, chosen, -torch.inf)
-
-
-def _looked_up(
-    border: Float[Tensor, "high_and_2 wide_and_2"],
-    u: Float[Tensor, "x y z"],
-    v: Float[Tensor, "x y z"],
-) -> Float[Tensor, "x y z"]:
-    """Interpolate a framed map at pixels of the photograph."""
-    height, width = border.shape
-    place = torch.stack(
-        [u * (2 / width) + (2 / width - 1), v * (2 / height) + (2 / height - 1)], -1
-    )
-    grid = place.reshape(1, 1, -1, 2)
-    found = grid_sample(border[None, None], grid, padding_mode="border", align_corners=False)
-    return found.reshape(u.shape)
+        distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
+    chosen = torch.empty(shape)
+    rows = (one.flatten(1).cpu().numpy() for one in (distance, word))
+    vote(*rows, _UNSEEN, disagreeing, min_seen, chosen.view(-1).numpy())
+    return chosen.to(distance)

@@ -34,7 +34,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 # The kernels of each part of a run, in the order of need.
 SFM = ("line_matches", "patch_alignment")
-COARSE = ("window_scores",)
+COARSE = ("hull_votes", "window_scores")
 PHOTOMETRY = ("resampling", "lights_and_albedo", "factorization")
 SWEEP = ("sweep_costs",)
 SURFACE = (

@@ -343,7 +343,6 @@ def _energy(patch: Patch) -> float:
 
 @compiled(fast=True)
 def _equations(patch: Patch, lights: Floats) -> None:
-    """Assemble the samples' normal equations."""
     for i in range(10):
         total, prior_rows = patch.equations[i], patch.prior[i]
         row, column = _ROWS[i], _COLUMNS[i]

@@ -193,7 +193,6 @@ class Chain(Stage):
         return scene
 
     def _watched(self, found: "SparseScene | Step") -> None:
-        """Call ``watch``, if it is set."""
         if self.watch is not None:
             with stage("view"):
                 self.watch(found)

@@ -120,7 +120,6 @@ def load_config(
 
 
 def _built(settings: Mapping[str, object], where: str) -> Config:
-    """Make the config of the chain that settings are for."""
     chain = settings.get("chain", CoarseToFineConfig.chain)
     found = [config for config in (CoarseToFineConfig, PublishedConfig) if config.chain == chain]
     names = f"{CoarseToFineConfig.chain} or {PublishedConfig.chain}"

@@ -5,11 +5,7 @@ from pathlib import Path
 
 from torch import nn
 
-from pimper_torch.method.chains.chain_config import (
-    Config,
-    PublishedConfig,
-    load_config,
-)
+from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.chains.published import Published
 from pimper_torch.runtime.reporting import Observer

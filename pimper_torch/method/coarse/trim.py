@@ -40,9 +40,8 @@ _FACING = 0.1
 # Views that see something behind a face which is dropped: one may be wrong.
 _MIN_BEHIND = 2
 
-# Fraction of a region that views see through, from which all of it is in the air: by two views,
-# 0.56 of the lid over a mug's mouth, and at most 0.1 of regions without points that are there (mug,
-# cow, jar); by one, 0.32 of a lump before potatoes, and 0.03 of pieces that are there.
+# Fraction of a region that two views see through, from which all of it is in the air: 0.56 of the
+# lid over a mug's mouth, and at most 0.1 of regions without points that are there (mug, cow, jar).
 _MOST_THROUGH = 0.25
 
 # Without silhouettes a face without points is dropped where it is further than the first from all
@@ -148,33 +147,6 @@ def enclosed_holes(vertices: Vertices, faces: Faces, kept: FaceMask, largest: fl
     return ~kept & (on_border[label] == 0) & (areas <= largest)
 
 
-def fringes(
-    vertices: Vertices,
-    faces: Faces,
-    kept: FaceMask,
-    supported: FaceMask,
-    smallest: float,
-    rings: int,
-) -> FaceMask:
-    """Find narrow strips and spurs beside dropped faces that are small or hardly supported.
-
-    Narrow is what a morphological opening removes: erosion by some rings of faces, then
-    dilation. Its components are marked that are smaller than an area, or less than half
-    supported: a thin part with support, such as a handle seen from one side, is not.
-
-    Args:
-        kept: True for faces that are not dropped.
-        smallest: Area from which a supported component is not marked.
-        rings: Half the width of the widest narrow strip, in faces.
-    """
-    core = ~topology.dilated(faces, ~kept, rings, len(vertices))
-    narrow = kept & ~topology.dilated(faces, core, rings, len(vertices))
-    label = topology.face_components(faces, narrow)
-    area = surfaces.component_areas(vertices, faces, label)
-    known = surfaces.component_areas(vertices, faces, label, supported)
-    return narrow & ((area < smallest) | (known < area / 2))
-
-
 def supported_components(
     vertices: Vertices, faces: Faces, supported: FaceMask, fraction: float
 ) -> FaceMask:
@@ -245,8 +217,7 @@ def seen_surface(
 
     Surface without points that views see through is dropped: it closes an opening, or floats in
     the air, and all of it goes where they see through enough of it. Faces that no view sees stay
-    where they close a small hole; the back of an object seen from one side is a large one. Narrow
-    strips along the border are dropped.
+    where they close a small hole; the back of an object seen from one side is a large one.
 
     Args:
         inside: True for faces in the visual hull.
@@ -256,7 +227,9 @@ def seen_surface(
     small = (HOLE_PX * pixel) ** 2
     bare = inside & (support != Support.POINTS)
     through = bare & (counts.behind >= _MIN_BEHIND)
-    through |= regions_seen_through(faces, bare & (counts.seen > 0), through)
+    region = topology.face_components(faces, some := bare & (counts.seen > 0))
+    share = torch.bincount(region, through.double()) / torch.bincount(region)
+    through |= some & (share >= _MOST_THROUGH)[region]
     possible = without_small_holes(vertices, faces, inside & ~through, small)
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
     kept = possible & ((counts.seen > 0) | known)
@@ -265,30 +238,11 @@ def seen_surface(
     holes = enclosed_holes(vertices, faces, kept, MAX_UNSEEN * area)
     kept = kept | (holes & ~topology.connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
-    rings = int(HOLE_PX / (2 * CELL_PX))
-    floating = regions_seen_through(faces, kept, bare & (counts.behind > 0))
-    leave_out("coarse.floating", floating, at=(vertices, faces))
-    kept &= ~floating
-    strips = fringes(vertices, faces, kept, support != Support.NOTHING, small, rings)
-    leave_out("coarse.fringes", strips, at=(vertices, faces))
-    kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
     stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
     leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))
     kept[chosen[~stays]] = False
     return kept
-
-
-def regions_seen_through(faces: Faces, some: FaceMask, through: FaceMask) -> FaceMask:
-    """Find the connected regions of some faces that views see through over enough of them.
-
-    Args:
-        some: True for faces that make up the regions.
-        through: True for faces that views see through.
-    """
-    region = topology.face_components(faces, some)
-    share = torch.bincount(region, through.double()) / torch.bincount(region)
-    return some & (share >= _MOST_THROUGH)[region]
 
 
 def min_fraction(contours: Contours) -> float:

@@ -328,7 +328,6 @@ def _taper(
 
 
 def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
-    """Average the estimates of each vertex."""
     vertex, height = estimates.vertex, estimates.height
     weight = estimates.weight * _agreement(estimates, count, outlier_samples)
     seen_weight = weight * estimates.known

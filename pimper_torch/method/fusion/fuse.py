@@ -424,6 +424,5 @@ class _Made:
 
 
 def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:
-    """Collect the edges that terms tell the slope of."""
     known = [torch.zeros_like(problem.lit), *(term.sloped(problem) for term in terms)]
     return problem.replace(sloped=torch.stack(known).any(dim=0))

@@ -25,12 +25,7 @@ from pimper_torch.ground.geometry.pyramids import (
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ground.kernels.arrays import as_array, pulled_back
-from pimper_torch.ground.kernels.signatures import (
-    FractionRows,
-    PictureRows,
-    Projection,
-    Samples,
-)
+from pimper_torch.ground.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.ground.kernels.switch import compiled_for
 from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.template_priors import merged
@@ -204,7 +199,6 @@ class Warp(Stage):
         caster: RayCaster,
         templates: Templates,
     ) -> Observations:
-        """Register a bucket."""
         rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
         if sources.lights is not None:
             sources = sources.replace(lights=templates.own(sources.lights))

@@ -348,7 +348,6 @@ def _gradient(
 def _apply_mixed(
     hessian: Hessian, along_tangents: Float[Tensor, "patch tangent sample"]
 ) -> Float[Tensor, "patch view rank"]:
-    """Apply the mixed block to steps of the samples."""
     moved = combination(hessian.columns, along_tangents)
     return (
         hessian.loss_curvature * (hessian.lights @ moved)

@@ -28,12 +28,7 @@ from pimper_torch.method.photometry.factor_priors import (
     SurfaceNormals,
 )
 from pimper_torch.method.photometry.fit_light import Illumination, lights_in_patches
-from pimper_torch.method.photometry.light_field import (
-    LightField,
-    faces_light,
-    harmonics,
-    is_strong,
-)
+from pimper_torch.method.photometry.light_field import LightField, faces_light, harmonics, is_strong
 from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.sample_estimates import (
     Rows,
@@ -158,7 +153,6 @@ class Factorize(Stage):
         caster: RayCaster | None,
         part: tuple[Templates, Observations],
     ) -> Photometry:
-        """Factorize a bucket."""
         templates, registered = part
         light = light.replace(field=templates.own(light.field))
         bucket = _Bucket(

@@ -294,7 +294,6 @@ def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Scalar:
 
 
 def _median_length(square: Float[Tensor, " view"]) -> Scalar:
-    """Return the median length of the lights that are not zero, from their squares."""
     shining = square[square > 0]
     return shining.sqrt().median() if len(shining) else square.new_ones(())
 

@@ -193,7 +193,6 @@ def _curvature(
 
 
 def _with_robust_weights(problem: Bilinear, state: _State) -> _State:
-    """Update the robust weights, and evaluate the objective with them."""
     if isinstance(problem.loss, Squares):
         return state
     weight = robust_weights(problem, state.lights, state.shading)
@@ -247,7 +246,6 @@ def _eliminated(
 
 
 def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
-    """Return the damped Gauss-Newton step."""
     normal = state.curvature.double()
     diagonals = normal.diagonal(dim1=1, dim2=2)
     ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)

@@ -169,7 +169,6 @@ def _binary_points(data: bytes) -> Iterator[_Point]:
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    """List the lines of a text that are no comments."""
     text = data.decode("utf-8-sig", "surrogateescape").removesuffix("\n")
     # A name may hold what else Unicode ends lines by.
     return (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))

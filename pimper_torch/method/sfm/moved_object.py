@@ -205,7 +205,6 @@ def _contradict(
 
 
 def _total(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> Float[Tensor, " match"]:
-    """Add the votes of both ends of matches."""
     return votes[pair[0]][rows[:, 0]] + votes[pair[1]][rows[:, 1]]
 
 

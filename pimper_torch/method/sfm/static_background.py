@@ -197,7 +197,6 @@ def _keep_moving(
     rest: StaticBackground,
     geometries: Mapping[PhotographPair, Any],
 ) -> None:
-    """Drop features at rest and their matches from the database."""
     described = [stored.read_descriptors(image) for image in matched.ids]
     stored.clear_descriptors()
     for image, resting, one in zip(matched.ids, rest.features, described, strict=True):

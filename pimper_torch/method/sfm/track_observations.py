@@ -73,7 +73,6 @@ def tangents(
 def _towards(
     points_world: Points, observed: Bool[Tensor, "point view"], cameras: Cameras
 ) -> Points:
-    """Return the mean directions to the views that see points."""
     rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
     return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
 

@@ -249,7 +249,6 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:
-    """Return the region in the scene's frame."""
     low, high = torch.tensor(corners, dtype=torch.float64).reshape(2, 3)
     offset = low.new_tensor(scene.offset_world)
     box, points = torch.stack([low, high]) - offset, scene.points_world

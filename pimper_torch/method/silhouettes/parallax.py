@@ -102,7 +102,6 @@ _REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each s
 _STEP = 2.0  # working pixels at the fixation point between samples of the plane
 # The same for brightness, where there is no texture.
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
-_ROOM = 1.0  # of the picture's size beyond it: a room that shifts by more is not looked at
 _NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
 
 
@@ -256,8 +255,9 @@ def _room_raster(
     ends = (maps @ corners.mT).mT.reshape(-1, 3)
     ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
     size = maps.new_tensor([width, height])
-    low = torch.maximum(ends.amin(dim=0), -_ROOM * size).floor()
-    high = torch.minimum(ends.amax(dim=0), (1 + _ROOM) * size).ceil()
+    # A room that shifts by more than the picture's size is not looked at.
+    low = torch.maximum(ends.amin(dim=0), -size).floor()
+    high = torch.minimum(ends.amax(dim=0), 2 * size).ceil()
     shift = torch.eye(3).to(maps)
     shift[:2, 2] = low
     to_pixels = torch.full_like(maps, torch.nan)

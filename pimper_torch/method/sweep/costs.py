@@ -287,7 +287,6 @@ class _Samples(Record):
 
 
 def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
-    """List the samples that enough views have, with these."""
     templates, cameras, poses = given.templates, given.cameras, given.poses
     tested = given.photometry.observed & templates.inside
     tested = tested & (given.registered.valid.sum(dim=1) >= min_views)

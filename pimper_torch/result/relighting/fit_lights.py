@@ -19,13 +19,7 @@ from pimper_torch.ground.geometry.pixels import scale_intrinsics
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, median_deviation
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.ground.shapes import Vertices
-from pimper_torch.records import (
-    Materials,
-    Record,
-    Silhouettes,
-    SparseScene,
-    ViewLights,
-)
+from pimper_torch.records import Materials, Record, Silhouettes, SparseScene, ViewLights
 from pimper_torch.result.relighting.lit_surface import (
     LitSurface,
     SurfacePixels,
@@ -219,7 +213,6 @@ def lights_of(
 def _fit(
     surface: LitSurface, seen: Observed, material: Vertices | None, start: ViewLights | None
 ) -> ViewLights:
-    """Fit the light of one photograph."""
     if len(seen.radiance) == 0:
         none = torch.zeros(1, seen.radiance.shape[1])
         up = torch.tensor([[0.0, 0.0, 1.0]])

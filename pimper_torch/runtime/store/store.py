@@ -164,7 +164,6 @@ def kept(
 
 
 def _tell(event: str | Failure | LeftOut | StageReport) -> None:
-    """Repeat an event of an earlier run."""
     journal = current()
     if isinstance(event, str):
         caution(event)

@@ -320,7 +320,6 @@ def _chosen_by_fit(
 
 
 def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
-    """Return the best exponent of a coarse grid, and its fit."""
     trials = torch.logspace(
         math.log10(MIN_GAMMA), math.log10(MAX_GAMMA), _TRIALS, dtype=torch.float64
     )

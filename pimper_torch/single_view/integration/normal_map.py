@@ -137,7 +137,6 @@ def _weights(steps: Steps, weight: Map | None) -> Float[Tensor, " step"]:
 def _known(
     depth: Map | None, mask: Mask, steps: Steps, intrinsics: Matrix3 | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Return anchors and the unknowns there."""
     if depth is None:
         return None, None
     given = depth.isfinite() & mask

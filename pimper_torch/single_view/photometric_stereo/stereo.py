@@ -195,7 +195,6 @@ def _spread_out(
     used: Bool[Tensor, " view"],
     like: Tensor,
 ) -> PhotometricStereo:
-    """Scatter pixels to the raster, and views with samples to all views."""
     rows, (y, x) = used.nonzero(), mask.nonzero(as_tuple=True)
     valid = torch.zeros_like(mask)
     valid[y, x] = (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
